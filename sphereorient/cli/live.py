@@ -1,5 +1,6 @@
 """`sphereorient live`."""
 
+import gc
 import sys
 from collections import deque
 from collections.abc import Iterator
@@ -28,7 +29,7 @@ def live(
     source: Annotated[
         str,
         typer.Option(
-            help="movie: the experiment's, at its rate; movie-fast; -: raw pictures on standard input; camera:0."
+            help="movie: the experiment's, at its rate; movie-fast; -: raw pictures on stdin; camera:0; shared:FILE."
         ),
     ] = "movie",
     to: Annotated[
@@ -63,6 +64,8 @@ def live(
     try:
         with opened(experiment, chosen, named, learnt) as (recording, tracker, views):
             lines = FicTracLines(views[0].camera)
+            gc.collect()
+            gc.freeze()  # what is here stays: no pause looks through it
             feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"))
             try:
                 with suppress(KeyboardInterrupt):
@@ -88,23 +91,26 @@ def live(
 
 
 def _check_source(name: str) -> None:
-    kind, colon, number = name.partition(":")
-    if name not in ("movie", "movie-fast", "-") and (kind != "camera" or not colon or not number):
-        expected, do = "movie, movie-fast, - or camera:NUMBER", "choose one of these"
+    kind, _, number = name.partition(":")
+    if name not in ("movie", "movie-fast", "-") and (kind not in ("camera", "shared") or not number):
+        expected, do = "movie, movie-fast, -, camera:NUMBER or shared:FILE", "choose one of these"
         raise SettingsError(refusal("--source", expected=expected, got=name, do=do))
 
 
 def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
     from sphereorient.live.feed import camera_frames, movie_frames, rate_of, raw_frames
+    from sphereorient.live.shared import shared_frames
 
     if name in ("movie", "movie-fast"):
         return movie_frames(recording, paced=name == "movie")
     if name == "-":
         return raw_frames(sys.stdin.buffer, recording.streams, rate_of(recording))
+    kind, _, number = name.partition(":")
+    if kind == "shared":
+        return shared_frames(Path(number), recording.streams)
     if len(recording.streams) > 1:
         do = "add --cameras with one name"
         raise SettingsError(refusal("--source", expected="one camera", got=f"{len(recording.streams)}", do=do))
-    number = name.partition(":")[2]
     return camera_frames(int(number) if number.isdigit() else number, recording.streams[0])
 
 

@@ -29,6 +29,7 @@ from sphereorient.live.lines import FicTracLines, json_line
 from sphereorient.live.live import Measured, measured
 from sphereorient.live.outputs import MOST_LINES, FileOutput, TcpOutput, UdpOutput
 from sphereorient.live.prepare import opened
+from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
 from sphereorient.methods.settings import Settings
 from sphereorient.report.export_poses import fictrac_table
 from sphereorient.trajectory import Reason, Trajectory
@@ -95,6 +96,43 @@ def test_raw_bytes_are_the_pictures_of_all_cameras(recording):
         assert all(np.array_equal(a, b) for a, b in zip(one.pictures, other.pictures, strict=True))
     with pytest.raises(MovieError, match="bytes a frame"):
         list(raw_frames(io.BytesIO(content[:-5]), recording.streams, 600.0))
+
+
+def test_a_ring_in_memory_gives_each_frame_once(recording, tmp_path):
+    movies = list(movie_frames(recording, paced=False))
+    size = sum(picture.nbytes for picture in movies[0].pictures)
+    with SharedFrames(tmp_path / "ring", size, slots=8) as ring:
+        ring.write(0.5, movies[0].pictures)
+        frames = shared_frames(tmp_path / "ring", recording.streams)
+        for k in range(5):
+            found = next(frames)
+            assert (found.number, found.time_s) == (k, 0.5 + k)
+            assert all(np.array_equal(a, b) for a, b in zip(found.pictures, movies[k].pictures, strict=True))
+            ring.write(1.5 + k, movies[k + 1].pictures)
+        for k in range(20):
+            ring.write(10.0 + k, movies[k].pictures)
+        assert next(frames).number == 26 - 8 + 1  # 26 were written; the oldest slot may be written at any time
+        frames.close()
+    assert not (tmp_path / "ring").exists()
+
+
+def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):
+    path = tmp_path / "ring"
+    with pytest.raises(MovieError, match="expected a ring of frames"):
+        next(shared_frames(path, recording.streams))
+    with SharedFrames(path, 77), pytest.raises(MovieError, match="77 bytes a frame"):
+        next(shared_frames(path, recording.streams))
+    path.write_bytes(b"x" * 200)
+    with pytest.raises(MovieError, match="another file"):
+        next(shared_frames(path, recording.streams))
+    path.unlink()
+    pictures = next(movie_frames(recording, paced=False)).pictures
+    with SharedFrames(path, sum(picture.nbytes for picture in pictures)) as ring:
+        ring.write(0.0, pictures)
+        frames = shared_frames(path, recording.streams)
+        next(frames)
+        ring._words[ENDED] = 1
+        assert list(frames) == []
 
 
 class FakeDevice:

@@ -1,0 +1,120 @@
+"""A ring of frames in a file that two programs map into memory: one writes pictures, the other reads the newest.
+
+Bytes, little-endian: "SPHEREO1"; then uint64: slots, bytes a frame, frames written so far, 1 at the end; then float64
+times (s) of the slots; then the slots, each the pictures of all cameras, row by row. Frame n lies in slot n % slots. A
+writer writes time and pictures first, then the number of frames.
+"""
+
+import mmap
+import struct
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.errors import MovieError, refusal
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.live.feed import Arrival
+
+MAGIC = b"SPHEREO1"
+SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # places of the numbers behind MAGIC
+HEAD = 5  # words of 8 bytes
+WORD = 8
+NEXT_S = 0.0002  # between looks for a new frame
+MOST_SLOTS = 1 << 16
+Kind = tuple[tuple[int, int], np.dtype[np.generic]]  # shape (H, W) and type of a camera's pictures
+
+
+class SharedFrames:
+    """Writes frames of `size` bytes into a ring of `slots`; the file is removed at the end."""
+
+    def __init__(self, path: Path, size: int, slots: int = 16) -> None:
+        length = WORD * (HEAD + slots) + slots * size
+        with path.open("xb") as file:
+            file.truncate(length)
+        self._path, self._slots, self._size = path, slots, size
+        self._file = path.open("r+b")
+        self._map = mmap.mmap(self._file.fileno(), length)
+        self._words = np.frombuffer(self._map, np.uint64, HEAD)
+        self._times = np.frombuffer(self._map, np.float64, slots, WORD * HEAD)
+        self._frames = np.frombuffer(self._map, np.uint8, slots * size, WORD * (HEAD + slots)).reshape(slots, size)
+        self._words[SLOTS], self._words[SIZE] = slots, size
+        self._map[:WORD] = MAGIC  # last: now it can be read
+
+    def write(self, time_s: float, pictures: Sequence[NDArray[np.generic]]) -> None:
+        """Write the pictures of all cameras at one instant."""
+        number = int(self._words[WRITTEN])
+        slot, begin = number % self._slots, 0
+        self._times[slot] = time_s
+        for picture in pictures:
+            content = np.ascontiguousarray(picture).reshape(-1).view(np.uint8)
+            self._frames[slot, begin : begin + len(content)] = content
+            begin += len(content)
+        self._words[WRITTEN] = number + 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._words[ENDED] = 1
+        del self._words, self._times, self._frames
+        self._map.close()
+        self._file.close()
+        self._path.unlink(missing_ok=True)
+
+
+def shared_frames(path: Path, streams: Sequence[CameraStream]) -> Iterator[Arrival]:
+    """Yield the frames of a ring, each once; of those that were written over before they were read the numbers are left
+    out.
+
+    Raises:
+        MovieError: no such ring, or one of frames of another size.
+    """
+    kinds = [(stream.movie.frame_shape, stream.movie.dtype) for stream in streams]
+    sizes = [shape[0] * shape[1] * dtype.itemsize for shape, dtype in kinds]
+    ends = np.cumsum([0, *sizes])
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory:
+            yield from _read(memory, path, kinds, ends)
+    except (OSError, ValueError):  # ValueError: an empty file
+        do = "begin the program that writes it (docs/live.md)"
+        raise MovieError(refusal(str(path), expected="a ring of frames", got="none", do=do)) from None
+
+
+def _read(memory: mmap.mmap, path: Path, kinds: Sequence[Kind], ends: NDArray[np.int64]) -> Iterator[Arrival]:
+    def word(place: int) -> int:
+        return int.from_bytes(memory[WORD * place : WORD * (place + 1)], "little")
+
+    slots, size = word(SLOTS), word(SIZE)
+    first = WORD * (HEAD + slots)  # of the frames
+    right = memory[:WORD] == MAGIC and 0 < slots <= MOST_SLOTS and len(memory) == first + slots * size
+    if not right or size != ends[-1]:
+        got = f"{size} bytes a frame" if right else "another file"
+        do = "write the pictures of all cameras, of the size and type of the experiment's movies"
+        raise MovieError(refusal(str(path), expected=f"a ring of {ends[-1]} bytes a frame", got=got, do=do))
+    number = max(0, word(WRITTEN) - 1)
+    while True:
+        written = word(WRITTEN)
+        if number >= written:
+            if word(ENDED):
+                return
+            time.sleep(NEXT_S)
+            continue
+        number = max(number, written - slots + 1)
+        slot, arrived_s = number % slots, time.perf_counter()
+        content = np.frombuffer(memory[first + slot * size : first + (slot + 1) * size], np.uint8)
+        (time_s,) = struct.unpack_from("<d", memory, WORD * (HEAD + slot))
+        if word(WRITTEN) - number >= slots:  # written over meanwhile
+            continue
+        pictures = [
+            content[begin:end].view(dtype).reshape(shape)
+            for (shape, dtype), begin, end in zip(kinds, ends[:-1], ends[1:], strict=True)
+        ]
+        yield Arrival(number=number, time_s=time_s, pictures=pictures, arrived_s=arrived_s)
+        number += 1
