@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sphereorient.cli.app import Commands, app, check_writable, print_table, progress_bar
-from sphereorient.cli.options import Quiet, TrackPath, names_in
+from sphereorient.cli.options import Cameras, ExperimentPath, Quiet, TrackPath, cameras_of, names_in
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.whole_file import write_text, writing
 
@@ -151,6 +151,25 @@ def robustness(
         typer.echo(f"Wrote {out}: results.json, results.csv, robustness.png, .pdf")
     if older is not None:
         _print_changes(found, older, quiet)
+
+
+@bench.command("live")
+def live_delay(
+    experiment: ExperimentPath,
+    rate: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 200.0,
+    seconds: Annotated[float, typer.Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0,
+    learnt: Annotated[Path | None, typer.Option(help="As of `live`.")] = None,
+    cameras: Cameras = None,
+) -> None:
+    """Time `live`: from a picture in memory to its line on a socket, by another process."""
+    from sphereorient.live.bench import delays
+
+    options = [] if learnt is None else ["--learnt", str(learnt)]
+    found = delays(experiment, rate, seconds, options, cameras_of(cameras))
+    middle, slow, slowest = (f"{1e3 * found.at(share):.1f}" for share in (0.5, 0.99, 0.999))
+    came = len(found.delay_s)
+    typer.echo(f"{came} lines of {found.written} frames, {found.written - came} dropped, {found.lost} without a pose")
+    typer.echo(f"delay: {middle} ms (median), {slow} ms (99 %), {slowest} ms (99.9 %)")
 
 
 @bench.command("compare")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -340,3 +341,13 @@ def test_what_live_does_not_know_is_refused(options, message, monkeypatch):
     run = CliRunner().invoke(app, ["live", str(EXCERPT / "experiment.yaml"), *options])
     assert run.exit_code != 0
     assert message in str(run.exception)
+
+
+@pytest.mark.slow  # two programs
+def test_the_bench_times_each_line(tmp_path):
+    run = CliRunner().invoke(app, ["bench", "live", str(EXCERPT / "experiment.yaml"), "--rate", "20", "--seconds", "2"])
+    assert run.exit_code == 0, run.output
+    came, written = (int(number) for number in re.findall(r"(\d+) lines of (\d+) frames", run.output)[0])
+    assert came > 20
+    assert came <= written
+    assert 0 < float(re.findall(r"delay: ([0-9.]+) ms", run.output)[0]) < 5000
