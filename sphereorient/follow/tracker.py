@@ -171,20 +171,26 @@ class ChunkTracker:
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {
-            chunk.first: chunk.expected(chunk.first + k, self.fitter.radius_mm, self.exposure_s) for chunk in chunks
-        }
+        expected = {chunk.first: self._ahead(chunk, chunk.first + k) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
-        if self.centre is not None:
-            X, spread = self.centre.position_lab_mm, self.centre.spread_mm2
-            ahead = {n: replace(pose, position_lab_mm=X, place_spread=spread) for n, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         if lost := [chunk.first for chunk in chunks if followed.get(chunk.first) is None]:
             followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
         for chunk in chunks:
             poses = followed[chunk.first]
             assert poses is not None  # a search returns one that may be empty
-            yield poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
+            yield self._stated(poses)
+
+    def _ahead(self, chunk: _Chunk, frame: int) -> _Expected | None:
+        """Return what the frames before say of a frame of a chunk."""
+        pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
+        if pose is None or self.centre is None:
+            return pose
+        return replace(pose, position_lab_mm=self.centre.position_lab_mm, place_spread=self.centre.spread_mm2)
+
+    def _stated(self, poses: Poses) -> Poses:
+        """Return poses with the errors of a fixed centre."""
+        return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
     def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
@@ -408,14 +414,22 @@ class OnlineTracker:
         self._chunk = _Chunk(0, 0, self._time_s)
         self._number = 0
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> Poses:
-        """Return the poses of the frame of a time, later than that of the one before; a frame of each view."""
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the poses of the frame of a time, later than that of the one before, and whether they were searched
+        for: the frames before say nothing of it, or another thing. `shots`: a frame of each view.
+        """
         number, self._number = self._number, self._number + 1
         self._time_s[number] = time_s
         self._time_s.pop(number - 4, None)
-        (poses,) = self._tracker._step([self._chunk], number, {0: shots})
-        self._chunk.saw(number, poses, self._tracker._turns([self._chunk], [poses])[0])
-        return poses
+        tracker = self._tracker
+        ahead = tracker._ahead(self._chunk, number)
+        (followed,) = [None] if ahead is None else tracker._follow([ahead], [shots])
+        poses = tracker._stated(tracker._search(shots) if followed is None else followed)
+        if followed is None:  # what was before says nothing of the motion from here
+            self._chunk.past.clear()
+            self._chunk.turns.clear()
+        self._chunk.saw(number, poses, tracker._turns([self._chunk], [poses])[0])
+        return poses, followed is None
 
 
 def _usable(shots: Sequence[Frame]) -> Tensor:

@@ -29,7 +29,7 @@ class Measured:
     R_lab_body: Floats  # (3, 3)
     covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm)
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
-    found: bool  # whether the frame before gave no prediction: the first one, or found again
+    found: bool  # whether it was searched for: the first one, found again, or not where it was expected
     dropped: int  # frames since the one before that came too late
     latency_s: float  # from the picture's arrival to here
 
@@ -47,16 +47,16 @@ class Measured:
 def measured(tracker: OnlineTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
     """Yield the pose of each frame; frames of one source, in order."""
     before: Sequence[Frame] | None = None
-    number, known = -1, False
+    number = -1
     for arrival in frames:
         shots = [
             _shot(picture, None if before is None else before[c], view)
             for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
         ]
-        poses = tracker.next(arrival.time_s, shots)
-        there = supported(poses)
-        yield _told(arrival, poses if there else None, poses.reason, not known, arrival.number - number - 1)
-        before, number, known = shots, arrival.number, there
+        poses, searched = tracker.next(arrival.time_s, shots)
+        there = poses if supported(poses) else None
+        yield _told(arrival, there, poses.reason, searched, arrival.number - number - 1)
+        before, number = shots, arrival.number
 
 
 def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: CameraView) -> Frame:

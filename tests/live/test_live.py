@@ -313,6 +313,21 @@ def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told():
             assert now.error_rad < math.radians(0.2)
 
 
+def test_a_jump_is_found_and_told(tmp_path):
+    """From one frame to the next the ball turns by some tens of degrees, forty times as fast as before."""
+    order = [*range(12), *range(39, 29, -1)]
+    truth = torch.from_numpy(true_track().orientation)
+    assert float(so3.geodesic_distance(truth[11], truth[39])) > math.radians(20)
+    with opened(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, views):
+        frames = list(movie_frames(recording, paced=False))
+        times = recording.timeline.time_s
+        shown = [replace(frames[k], number=n, time_s=float(times[n])) for n, k in enumerate(order)]
+        found = list(measured(tracker, views, shown))
+    assert [n for n, now in enumerate(found) if now.found] == [0, 12]
+    for now, k in zip(found, order, strict=True):
+        assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+
+
 def test_the_command_writes_and_sends_each_frame(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
         reader.bind(("127.0.0.1", 0))
