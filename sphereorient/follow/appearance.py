@@ -67,6 +67,7 @@ BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which
 CLEAR = 3.0  # times the variance that the typical right pose leaves
 LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
 MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured
+MORE_LEFT = 0.05  # of the variance: by as much more is left where the exposure is certainly another one
 APART_BLURS, MOST_INSTANTS = 3.0, 8  # between neighbouring instants of the exposure, and of these
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
 
@@ -83,6 +84,7 @@ class Appearance:
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see the sphere at one position
     second_ball: bool = False  # whether another sphere with this texture is in view
+    sharper: bool = False  # whether the pictures are clearly sharper than the exposure allows
     worn: Tensor | None = None  # where the paint differs from the map and is not used, see `worn_cells`; None: nowhere
 
     def of(self, camera: int) -> "Appearance":
@@ -180,16 +182,17 @@ def estimate_appearance(
         if worn is not None:  # the blur, too, was found with it
             given, paint = settings.blur_px is not None, without(base, worn)
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
-    blurred, moved = fitter.optics, None
+    blurred, moved, sharper = fitter.optics, None, False
     if following is not None and looked is found:
         open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following)
     if moved is not None:
         smeared, known = open_.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         open_, there = _light_and_blur(open_, paint, smeared, fit, known, given=False)
-        if open_.left(smeared, there, known) < fitter.left(pixels, fit, known):
+        more = open_.left(smeared, there, known) - fitter.left(pixels, fit, known)
+        if more < 0:
             fitter, fit, pixels, use = open_, there, smeared, known
         else:  # sharper than the exposure allows: it is not that of these pictures
-            moved = None
+            moved, sharper = None, more > MORE_LEFT
     fitter, fit, rivals = fitter.lit_in_the_lab(pixels, fit, use)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
@@ -222,6 +225,7 @@ def estimate_appearance(
         right_score=right,
         usual_apart_rad=_usual_apart(fit, use),
         together=together,
+        sharper=sharper,
         second_ball=claimed >= max(2, RIVALS * len(frames)),
         worn=worn,
     )

@@ -32,7 +32,7 @@ from sphereorient.trajectory import Trajectory
 
 SCHEMA = "sphereorient-learnt/1"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
-WHETHER = ("together", "second_ball")
+WHETHER = ("together", "second_ball", "sharper")
 LASTING = ("covariance", "own_rad2")
 NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
@@ -55,6 +55,7 @@ class Learnt:
     usual_apart_rad: float
     together: bool
     second_ball: bool = False
+    sharper: bool = False
     worn: torch.Tensor | None = None  # see `Appearance`
     process: ProcessNoise | None = None  # None: no track yet, or too short a one
     acceleration_rad_s2: float | None = None  # that the path was chosen with
@@ -221,6 +222,8 @@ def _read(file: h5py.File) -> Learnt:
     if "lasting" in file:
         lasting = Lasting(**{part: torch.from_numpy(file["lasting"][part][()]) for part in LASTING})
     acceleration = file.attrs.get("acceleration_rad_s2")
+    told: dict[str, Any] = {name: bool(file.attrs.get(name, False)) for name in WHETHER}
+    told |= {name: float(file.attrs[name]) for name in NUMBERS}
     return Learnt(
         scenes=scenes,
         still_blur_px=float(file.attrs.get("still_blur_px", file.attrs["blur_px"])),
@@ -229,12 +232,10 @@ def _read(file: h5py.File) -> Learnt:
         light=light_of(parts, bool(light.attrs["known"])),
         limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
         lasting=lasting,
-        together=bool(file.attrs["together"]),
-        second_ball=bool(file.attrs.get("second_ball", False)),
         worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,
         process=_process(file["process"]) if "process" in file else None,
         acceleration_rad_s2=None if acceleration is None else float(acceleration),
-        **{name: float(file.attrs[name]) for name in NUMBERS},
+        **told,
     )
 
 

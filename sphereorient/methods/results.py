@@ -33,6 +33,10 @@ TWO_BALLS = (
     "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "
     "hide one by `masks:`"
 )
+SHARPER = (
+    "the pictures are sharper than the ball's motion in the exposure allows: it is taken for unknown; "
+    "correct `exposure:`, or the frame rate"
+)
 WORN = (
     "the paint differs from the texture map on about {share:.0f} % of the ball: it is not used; "
     "learn it anew with `sphereorient map --init`"
@@ -148,7 +152,8 @@ def precise_track(
     missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
     flags = chosen.flags | _fit_flags(table, chosen, picked, learnt, np.any(missed, axis=0))
     flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
-    told: dict[str, Any] = {"remarks": [TWO_BALLS] if learnt.second_ball else []}
+    noticed = ((learnt.second_ball, TWO_BALLS), (learnt.sharper, SHARPER))
+    told: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)

@@ -32,6 +32,7 @@ def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
     assert learnt.blur_px == pytest.approx(0.62, rel=0.1)
     assert learnt.still_blur_px > 1.3 * learnt.blur_px
     assert learnt.instants > 2
+    assert not learnt.sharper
     off = off_deg(track, experiment)
     assert np.median(off) < 0.04
     sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
@@ -57,6 +58,8 @@ def test_an_exposure_that_is_not_that_of_the_pictures_smears_nothing(tmp_path):
     experiment, known = write_synthetic_experiment(tmp_path, settings), tmp_path / "learnt.h5"
     track = run(Request(experiment=experiment, save_learnt=known), MemoryStore())
     assert Learnt.load(known).instants == 1
+    assert Learnt.load(known).sharper
+    assert any("sharper than the ball's motion" in remark for remark in track.provenance["remarks"])
     off = off_deg(track, experiment)
     assert np.median(off) < 0.03
     sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
