@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sphereorient.live.feed import Arrival
     from sphereorient.live.outputs import Output
 
-WAITING = 100  # frames of a camera that wait at most
+WAITING = 16  # frames of a camera that wait at most
 KEPT = 1000  # latencies
 
 
@@ -59,6 +59,7 @@ def live(
     chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
     _check_source(source)
     outputs = [_output(name) for name in to or []]
+    table = any(kind != "jsonl" for kind, _ in outputs)
     count = lost = 0
     latency_ms: deque[float] = deque(maxlen=KEPT)
     try:
@@ -70,9 +71,9 @@ def live(
             try:
                 with suppress(KeyboardInterrupt):
                     for now in measured(tracker, views, feed):
-                        line, other = lines.line(now), json_line(now)
+                        line = lines.line(now) if table else ""
                         for kind, output in outputs:
-                            output.send({"dat": line, "jsonl": other}.get(kind, f"FT, {line}"))
+                            output.send(json_line(now) if kind == "jsonl" else line if kind == "dat" else f"FT, {line}")
                         count, lost = count + 1, lost + (not now.valid)
                         latency_ms.append(1e3 * now.latency_s)
             finally:

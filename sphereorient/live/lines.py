@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.live.live import Measured
 from sphereorient.trajectory import quaternions_wxyz
-from sphereorient.trajectory.walk import rotation_vectors, walk_of
+from sphereorient.trajectory.walk import arcs, rotation_vectors, turned
 
 Floats = NDArray[np.float64]
 DIGITS = 14
@@ -32,24 +32,21 @@ class FicTracLines:
         before, self._before = self._before, now
         step_ms = math.nan if before is None else 1e3 * (now.time_s - before.time_s)
         begins = before is None or not before.valid
-        turn, ahead, right = np.full(3, np.nan), math.nan, math.nan
         if now.valid and begins:
             self._first, self._sequence = now.R_lab_body, 0
             self._heading, self._path, self._sums = 0.0, np.zeros(2), np.zeros(2)
-            turn, ahead, right = np.zeros(3), 0.0, 0.0
-        elif now.valid and before is not None:
-            times = np.array([before.time_s, now.time_s])
-            walk = walk_of(times, np.stack([before.R_lab_body, now.R_lab_body]))
-            turn = walk.turn_rad[1]
-            ahead, right = (1e-3 * step_ms * rate[1] for rate in (walk.forward_rad_s, walk.side_rad_s))
-            cosine, sine = math.cos(self._heading), math.sin(self._heading)
-            self._path = self._path + np.array([[cosine, -sine], [sine, cosine]]) @ walk.path[1]
-            self._heading = (self._heading + walk.heading_rad[1]) % (2 * math.pi)
+        R_before = now.R_lab_body if before is None or begins else before.R_lab_body
+        R_cam = self._R_cam_lab @ now.R_lab_body @ self._first.T @ self._R_cam_lab.T
+        rotations = np.stack([now.R_lab_body @ R_before.T, R_cam, self._R_cam_lab.T @ R_cam])
+        turn, *absolute = rotation_vectors(rotations)
+        *rates, step = arcs(turn[None])
+        ahead, right, about = (float(part[0]) for part in rates)
+        if now.valid:
+            self._path = self._path + turned(step, np.array([self._heading]))[0]
+            self._heading = (self._heading + about) % (2 * math.pi)
             self._sums = self._sums + np.array([ahead, right])
         self._sequence += 1
         nothing = np.nan if not now.valid else 0.0
-        R_cam = self._R_cam_lab @ now.R_lab_body @ self._first.T @ self._R_cam_lab.T
-        absolute = rotation_vectors(np.stack([R_cam, self._R_cam_lab.T @ R_cam]))
         direction = math.nan if begins else math.atan2(right, ahead) % (2 * math.pi)
         return np.array(
             [
@@ -57,7 +54,8 @@ class FicTracLines:
                 *(turn @ self._R_cam_lab.T),
                 now.error_rad,
                 *turn,
-                *absolute.ravel(),
+                *absolute[0],
+                *absolute[1],
                 *(self._path + nothing),
                 self._heading + nothing,
                 *((0.0, 0.0) if begins and now.valid else (direction, math.hypot(ahead, right))),

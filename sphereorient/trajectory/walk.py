@@ -37,19 +37,12 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
     turn = np.full((len(R), 3), np.nan)
     turn[1:] = so3.log(R[1:] @ R[:-1].mT).numpy()
     turn[~linked] = np.nan
-    ahead, right, about = turn[:, 1], -turn[:, 0], -turn[:, 2]
-    # A step along an arc: chord and its direction relative to the heading before the step.
-    half = np.nan_to_num(about) / 2
-    chord = np.sinc(half / np.pi)
+    ahead, right, about, across = arcs(turn)
     heading, path = np.full(len(R), np.nan), np.full((len(R), 2), np.nan)
     for first, last in _stretches(known):
         some = slice(first + 1, last)
         heading[first:last] = np.concatenate([[0.0], np.cumsum(about[some])])
-        direction = heading[first : last - 1] + half[some]
-        cosine, sine = np.cos(direction), np.sin(direction)
-        steps = chord[some, None] * np.stack(
-            [cosine * ahead[some] - sine * right[some], sine * ahead[some] + cosine * right[some]], axis=1
-        )
+        steps = turned(across[some], heading[first : last - 1])
         path[first:last] = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     step_s = np.concatenate([[np.nan], np.diff(time_s)])
     return Walk(
@@ -61,6 +54,23 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
         turn_rad_s=about / step_s,
         start=known & ~linked,
     )
+
+
+def arcs(turn_rad: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return what turns (N, 3) of the ball, rad, lab, mean: ahead and to the right (N,), radii, the heading's change (N,),
+    rad, and the step (N, 2) in the animal's axes before it, the chord of an arc.
+    """
+    ahead, right, about = turn_rad[:, 1], -turn_rad[:, 0], -turn_rad[:, 2]
+    half = np.nan_to_num(about) / 2
+    chord = np.sinc(half / np.pi)
+    return ahead, right, about, chord[:, None] * turned(np.stack([ahead, right], axis=1), half)
+
+
+def turned(steps: Floats, heading_rad: Floats) -> Floats:
+    """Return steps (N, 2) of who faces headings (N,) on the plane."""
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    x, y = steps[:, 0], steps[:, 1]
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
 
 
 def rotation_vectors(R: Floats) -> Floats:
