@@ -57,8 +57,8 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
 
 
 def arcs(turn_rad: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return what turns (N, 3) of the ball, rad, lab, mean: ahead and to the right (N,), radii, the heading's change (N,),
-    rad, and the step (N, 2) in the animal's axes before it, the chord of an arc.
+    """Return what turns (N, 3) of the ball, rad, lab, mean: ahead and to the right (N,), radii, change of the heading
+    (N,), rad, and the step (N, 2) in the animal's axes before it, the chord of an arc.
     """
     ahead, right, about = turn_rad[:, 1], -turn_rad[:, 0], -turn_rad[:, 2]
     half = np.nan_to_num(about) / 2
