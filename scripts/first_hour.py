@@ -55,7 +55,8 @@ def run(folder: Path, *words: str, wrong: bool = False) -> None:
     last = f"{done.returncode}: " + " / ".join(lines) if wrong else ""
     shown = shlex.join(word if len(word) <= SHOWN else f"{word[:SHOWN]} .." for word in words)
     print(f"| `{shown}` | {wall:.1f} | {cpu:.1f} | {last.replace('|', ' ')} |", flush=True)
-    if done.returncode and not wrong:
+    warned = words[0] == "check" and done.returncode == 1
+    if done.returncode and not wrong and not warned:
         raise SystemExit(f"{shlex.join(words)}: status {done.returncode}\n{done.stderr}")
 
 
