@@ -54,7 +54,7 @@ def live(
     from sphereorient.live.lines import FicTracLines, json_line
     from sphereorient.live.live import measured
     from sphereorient.live.outputs import FileOutput
-    from sphereorient.live.prepare import opened
+    from sphereorient.live.prepare import open_live
 
     chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
     _check_source(source)
@@ -63,7 +63,7 @@ def live(
     count = lost = 0
     latency_ms: deque[float] = deque(maxlen=KEPT)
     try:
-        with opened(experiment, chosen, named, learnt) as (recording, tracker, views):
+        with open_live(experiment, chosen, named, learnt) as (recording, tracker, views):
             lines = FicTracLines(views[0].camera)
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it

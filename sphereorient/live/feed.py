@@ -45,26 +45,37 @@ def rate_of(recording: Recording) -> float:
     return float(1 / np.median(np.diff(recording.timeline.time_s)))
 
 
+class FrameBytes:
+    """How the pictures of all cameras lie in the bytes of one frame: row by row, of the movies' size and type."""
+
+    def __init__(self, streams: Sequence[CameraStream]) -> None:
+        self._kinds = [(stream.movie.frame_shape, stream.movie.dtype) for stream in streams]
+        sizes = [shape[0] * shape[1] * dtype.itemsize for shape, dtype in self._kinds]
+        self._ends = np.cumsum([0, *sizes]).tolist()
+        self.size = int(self._ends[-1])
+
+    def pictures(self, content: bytes) -> list[Picture]:
+        """Return the pictures of `size` bytes."""
+        return [
+            np.frombuffer(content, dtype, shape[0] * shape[1], begin).reshape(shape)
+            for (shape, dtype), begin in zip(self._kinds, self._ends[:-1], strict=True)
+        ]
+
+
 def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float) -> Iterator[Arrival]:
-    """Yield frames of bytes without a header: the pictures of all cameras, row by row, of the movies' size and type.
+    """Yield frames of bytes without a header, see `FrameBytes`.
 
     Raises:
         MovieError: the source ends within a frame.
     """
-    kinds = [(stream.movie.frame_shape, stream.movie.dtype) for stream in streams]
-    sizes = [shape[0] * shape[1] * dtype.itemsize for shape, dtype in kinds]
-    number = 0
-    while content := source.read(sum(sizes)):
+    layout, number = FrameBytes(streams), 0
+    while content := source.read(layout.size):
         arrived_s = time.perf_counter()
-        if len(content) < sum(sizes):
-            expected, got = f"{sum(sizes)} bytes a frame", f"{len(content)} bytes at the end"
+        if len(content) < layout.size:
+            expected, got = f"{layout.size} bytes a frame", f"{len(content)} bytes at the end"
             do = "write whole pictures of the size and type of the experiment's movies"
             raise MovieError(refusal(f"frame {number}", expected=expected, got=got, do=do))
-        ends = np.cumsum([0, *sizes])
-        pictures = [
-            np.frombuffer(content, dtype, size // dtype.itemsize, int(begin)).reshape(shape)
-            for (shape, dtype), size, begin in zip(kinds, sizes, ends, strict=False)
-        ]
+        pictures = layout.pictures(content)
         yield Arrival(number=number, time_s=number / rate_hz, pictures=pictures, arrived_s=arrived_s)
         number += 1
 

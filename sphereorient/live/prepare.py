@@ -16,7 +16,7 @@ from sphereorient.pose import CameraView
 
 
 @contextmanager
-def opened(
+def open_live(
     experiment: Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
 ) -> Iterator[tuple[Recording, OnlineTracker, Sequence[CameraView]]]:
     """Yield an experiment's recording, who follows its ball, and its views.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment.stream import CameraStream
-from sphereorient.live.feed import Arrival
+from sphereorient.live.feed import Arrival, FrameBytes
 
 MAGIC = b"SPHEREO1"
 SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # places of the numbers behind MAGIC
@@ -26,7 +26,6 @@ HEAD = 5  # words of 8 bytes
 WORD = 8
 NEXT_S = 0.0002  # between looks for a new frame
 MOST_SLOTS = 1 << 16
-Kind = tuple[tuple[int, int], np.dtype[np.generic]]  # shape (H, W) and type of a camera's pictures
 
 
 class SharedFrames:
@@ -76,28 +75,25 @@ def shared_frames(path: Path, streams: Sequence[CameraStream]) -> Iterator[Arriv
     Raises:
         MovieError: no such ring, or one of frames of another size.
     """
-    kinds = [(stream.movie.frame_shape, stream.movie.dtype) for stream in streams]
-    sizes = [shape[0] * shape[1] * dtype.itemsize for shape, dtype in kinds]
-    ends = np.cumsum([0, *sizes])
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory:
-            yield from _read(memory, path, kinds, ends)
+            yield from _read(memory, path, FrameBytes(streams))
     except (OSError, ValueError):  # ValueError: an empty file
         do = "begin the program that writes it (docs/live.md)"
         raise MovieError(refusal(str(path), expected="a ring of frames", got="none", do=do)) from None
 
 
-def _read(memory: mmap.mmap, path: Path, kinds: Sequence[Kind], ends: NDArray[np.int64]) -> Iterator[Arrival]:
+def _read(memory: mmap.mmap, path: Path, layout: FrameBytes) -> Iterator[Arrival]:
     def word(place: int) -> int:
         return int.from_bytes(memory[WORD * place : WORD * (place + 1)], "little")
 
     slots, size = word(SLOTS), word(SIZE)
     first = WORD * (HEAD + slots)  # of the frames
     right = memory[:WORD] == MAGIC and 0 < slots <= MOST_SLOTS and len(memory) == first + slots * size
-    if not right or size != ends[-1]:
+    if not right or size != layout.size:
         got = f"{size} bytes a frame" if right else "another file"
         do = "write the pictures of all cameras, of the size and type of the experiment's movies"
-        raise MovieError(refusal(str(path), expected=f"a ring of {ends[-1]} bytes a frame", got=got, do=do))
+        raise MovieError(refusal(str(path), expected=f"a ring of {layout.size} bytes a frame", got=got, do=do))
     number = max(0, word(WRITTEN) - 1)
     while True:
         written = word(WRITTEN)
@@ -108,13 +104,10 @@ def _read(memory: mmap.mmap, path: Path, kinds: Sequence[Kind], ends: NDArray[np
             continue
         number = max(number, written - slots + 1)
         slot, arrived_s = number % slots, time.perf_counter()
-        content = np.frombuffer(memory[first + slot * size : first + (slot + 1) * size], np.uint8)
+        content = memory[first + slot * size : first + (slot + 1) * size]
         (time_s,) = struct.unpack_from("<d", memory, WORD * (HEAD + slot))
         if word(WRITTEN) - number >= slots:  # written over meanwhile
             continue
-        pictures = [
-            content[begin:end].view(dtype).reshape(shape)
-            for (shape, dtype), begin, end in zip(kinds, ends[:-1], ends[1:], strict=True)
-        ]
+        pictures = layout.pictures(content)
         yield Arrival(number=number, time_s=time_s, pictures=pictures, arrived_s=arrived_s)
         number += 1

@@ -33,12 +33,10 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
     """
     known = np.asarray(np.isfinite(R_lab_body).all(axis=(1, 2)))
     linked = known & np.concatenate([[False], known[:-1]])
-    R = torch.from_numpy(np.where(known[:, None, None], R_lab_body, np.eye(3)))
-    turn = np.full((len(R), 3), np.nan)
-    turn[1:] = so3.log(R[1:] @ R[:-1].mT).numpy()
-    turn[~linked] = np.nan
+    turn = np.full((len(R_lab_body), 3), np.nan)
+    turn[1:] = rotation_vectors(R_lab_body[1:] @ R_lab_body[:-1].transpose(0, 2, 1))
     ahead, right, about, across = arcs(turn)
-    heading, path = np.full(len(R), np.nan), np.full((len(R), 2), np.nan)
+    heading, path = np.full(len(turn), np.nan), np.full((len(turn), 2), np.nan)
     for first, last in _stretches(known):
         some = slice(first + 1, last)
         heading[first:last] = np.concatenate([[0.0], np.cumsum(about[some])])

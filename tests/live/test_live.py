@@ -29,7 +29,7 @@ from sphereorient.live.feed import Arrival, Feed, camera_frames, movie_frames, r
 from sphereorient.live.lines import FicTracLines, json_line
 from sphereorient.live.live import Measured, measured
 from sphereorient.live.outputs import MOST_LINES, FileOutput, TcpOutput, UdpOutput
-from sphereorient.live.prepare import opened
+from sphereorient.live.prepare import open_live
 from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
 from sphereorient.methods.settings import Settings
 from sphereorient.report.export_poses import fictrac_table
@@ -296,7 +296,7 @@ def test_a_full_disk_is_told_and_does_not_stop(tmp_path):
 
 def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told():
     hidden = range(15, 19)
-    with opened(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, views):
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, views):
         frames = [
             replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in hidden else one
             for k, one in enumerate(movie_frames(recording, paced=False))
@@ -318,7 +318,7 @@ def test_a_jump_is_found_and_told(tmp_path):
     order = [*range(12), *range(39, 29, -1)]
     truth = torch.from_numpy(true_track().orientation)
     assert float(so3.geodesic_distance(truth[11], truth[39])) > math.radians(20)
-    with opened(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, views):
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, views):
         frames = list(movie_frames(recording, paced=False))
         times = recording.timeline.time_s
         shown = [replace(frames[k], number=n, time_s=float(times[n])) for n, k in enumerate(order)]
