@@ -414,6 +414,13 @@ class OnlineTracker:
         self._chunk = _Chunk(0, 0, self._time_s)
         self._number = 0
 
+    def resume(self, seen: Sequence[tuple[float, Poses]]) -> None:
+        """Take the poses of the last frames, with their times, s, from who followed the ball before."""
+        for time_s, poses in seen:
+            self._time_s[self._number] = time_s
+            self._chunk.saw(self._number, poses, self._tracker._turns([self._chunk], [poses])[0])
+            self._number += 1
+
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of the frame of a time, later than that of the one before, and whether they were searched
         for: the frames before say nothing of it, or another thing. `shots`: a frame of each view.

@@ -139,8 +139,7 @@ def _candidates(disks: Disks, R_lab_body: Tensor, settings: MapSettings) -> tupl
 
 def sight_cosines(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:
     """Return the cosine between the nearest lines of sight in the body for all pairs of instants (K,), (K, K)."""
-    sight = -disks.R_lab_view[rows, :, :, 2].double()  # from the ball to the camera
-    in_body = (R_lab_body[rows].mT[:, None] @ sight[..., None])[..., 0]
+    in_body = (R_lab_body[rows].mT[:, None] @ disks.sight_lab[rows][..., None])[..., 0]
     cosine = torch.einsum("acx,bdx->abcd", in_body, in_body)
     both = disks.seen[rows][:, None, :, None] & disks.seen[rows][None, :, None, :]
     return torch.where(both, cosine, -1.0).flatten(2).amax(2)

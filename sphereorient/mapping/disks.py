@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.experiment.stream import given_scene
+from sphereorient.experiment.stream import CameraStream, given_scene
 from sphereorient.locate import (
     CameraScene,
     Found,
@@ -30,12 +30,14 @@ from sphereorient.locate import (
     screened_frames,
     sightings_of,
 )
+from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fitter import CameraView, Fitter
 from sphereorient.pose.pixels import Pixels, stacked
 from sphereorient.search.normalisation import Blur, crop_disk, rim_share
 from sphereorient.sphere.view import perspective_view
+from sphereorient.trajectory import Reason
 
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
@@ -106,12 +108,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
     for stream in recording.streams:
         outline = None
         if experiment.fixed:  # what changes in the pictures is the ball
-            pictures = stream.spread(4 * settings.background_frames)
-            empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
-            outline, background = fixed_ball(pictures, locating, empty, stream.shown)
-            scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
-            each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
-            _check_still([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], stream.name)
+            outline, scene = _fixed_scene(recording, stream, settings, locating)
         else:
             scene = find_scene(recording, stream, settings.background_frames, locating)
         found: list[Found] = []
@@ -150,6 +147,39 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
     )
 
 
+def _fixed_scene(
+    recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings
+) -> tuple[Outline, CameraScene]:
+    """Return outline and scene of a ball that stays in its place: what changes in the pictures is the ball."""
+    pictures = stream.spread(4 * settings.background_frames)
+    empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
+    outline, background = fixed_ball(pictures, locating, empty, stream.shown)
+    scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
+    each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
+    _check_still([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], stream.name)
+    return outline, scene
+
+
+def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSettings) -> Crops:
+    """Return an empty record with the views and the one position (1, 3) of a ball that stays in its place; raise as
+    `take_crops` does.
+    """
+    views, sightings = [], {}
+    for stream in recording.streams:
+        outline, scene = _fixed_scene(recording, stream, settings, locating)
+        views.append(CameraView.of(stream.name, stream.camera, scene))
+        sightings[stream.name] = sightings_of([(outline, Reason.OK)])
+    cameras = {view.name: view.camera for view in views}
+    return Crops(
+        views=views,
+        crops=[[] for _ in views],
+        position_lab_mm=find_positions(sightings, cameras, recording.experiment.diameter_mm).position_lab_mm,
+        seen=torch.zeros(0, len(views), dtype=torch.bool),
+        radius_mm=recording.experiment.radius_mm,
+        fixed=True,
+    )
+
+
 def _check_still(outlines: list[tuple[float, float, float]], name: str) -> None:
     """Raise PaintError if a fixed ball's outlines (u, v, radius), px, scatter far more in place than in size."""
     if len(outlines) < OUTLINES_MIN:
@@ -175,6 +205,16 @@ def _cut(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
     top, left = max(0, round(v_px) - reach), max(0, round(u_px) - reach)
     grey = picture[top : round(v_px) + reach + 1, left : round(u_px) + reach + 1].copy()
     return Crop(grey=grey, top=top, left=left)
+
+
+def cut_out(place: Crops, pictures: Sequence[Picture]) -> list[Crop]:
+    """Cut a ball in a known place, position (1, 3), out of a picture of each camera."""
+    X = place.position_lab_mm
+    found = []
+    for view, picture in zip(place.views, pictures, strict=True):
+        (u, v), radius_px = view.camera.project(X)[0].tolist(), float(view.radius_px(X, place.radius_mm))
+        found.append(_cut(picture, u, v, radius_px))
+    return found
 
 
 def pixels_of(crops: Crops, fitter: Fitter, frames: Tensor, wanted: int, extra_px: float = 0.0) -> Pixels:
@@ -237,6 +277,18 @@ class Disks:
     def size_px(self) -> int:
         """Side of the pictures, px."""
         return self.layers.shape[-1]
+
+    @property
+    def sight_lab(self) -> Tensor:
+        """Unit vectors from the ball to the cameras, (N, C, 3) float64."""
+        return -self.R_lab_view[..., 2].double()
+
+    @classmethod
+    def joined(cls, parts: Sequence["Disks"]) -> "Disks":
+        """Join instants of the same cameras."""
+        first, names = parts[0], ("layers", "R_lab_view", "distance_radii", "seen")
+        shown = None if first.shown is None else torch.cat([one.shown for one in parts if one.shown is not None])
+        return cls(share=first.share, shown=shown, **{k: torch.cat([getattr(one, k) for one in parts]) for k in names})
 
 
 def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:

@@ -252,7 +252,7 @@ def _finished(
     state = replace(state, R_lab_body=so3.nearest_rotation(state.R_lab_body))
     all_R = interpolated(chain.R_lab_body, rows, state.R_lab_body)
     Q = all_R[0].clone()  # R_new = R Q^T, and new directions are Q times the old
-    texture, seen, sigma = _final_map(state, Q)
+    texture, seen, sigma = final_map(state, Q)
 
     def spread(values: Tensor, at: Tensor) -> Tensor:
         whole = torch.full((len(crops), *values.shape[1:]), torch.nan, dtype=torch.float64)
@@ -318,7 +318,7 @@ def _scores(fit: FittedPoses, use: Tensor) -> Tensor:
     return torch.where(use, fit.score, torch.nan).nanmean(1)
 
 
-def _final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sharpen the map and rotate it by Q: texture, counts and sigma, (H, 2 H) each."""
     height = FINER * len(state.texture)
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel

@@ -1,6 +1,7 @@
 """The grey search: normalised views over all rotations, distinct peaks, a coarse-to-fine fit from each."""
 
 import math
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ class GreySearch(DiskSearch):
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
-        bank: (K, P) int8, that of another search with the same arguments; None: made here.
+        bank: (K, P) int8, that of another search with the same arguments; None: made when it is needed.
 
     `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the `bank`.
     """
@@ -62,7 +63,14 @@ class GreySearch(DiskSearch):
         self._grid = grid[compact_groups(grid, GROUP).T]
         self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
-        self.bank = self._templates(paint) if bank is None else bank
+        self._paint = paint
+        if bank is not None:
+            vars(self)["bank"] = bank
+
+    @cached_property
+    def bank(self) -> Tensor:
+        """Normalised views of all rotations, (K, P) int8."""
+        return self._templates(self._paint)
 
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""

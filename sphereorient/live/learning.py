@@ -1,0 +1,197 @@
+"""No map at the start: relative orientations, a map learnt meanwhile in a second process, then orientations by it."""
+
+import math
+import multiprocessing
+import pickle
+import threading
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from multiprocessing.queues import Queue
+from queue import Empty
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.errors import PaintError, refusal
+from sphereorient.files.threads import limit_cores
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses
+from sphereorient.follow.tracker import ChunkTracker, OnlineTracker, supported
+from sphereorient.live.growing_map import GrowingMap, LiveMap
+from sphereorient.live.relative import RelativeTracker
+from sphereorient.locate import Frame
+from sphereorient.mapping.disks import Crop, Crops, cut_out
+from sphereorient.mapping.settings import MapSettings
+from sphereorient.methods.settings import Settings
+
+HANDED_RAD = 0.025  # turn from one frame that is handed over to the next
+HANDED = 400  # frames that are handed over at most; the ball has shown its sides by then
+FIRST = 2  # iterations before the first map
+STEADY_RAD = math.radians(0.05)  # the last iteration before a later one moves orientations by less
+LAST = 3  # poses from which following goes on with another map
+FEWEST = 6  # iterations of a map that is kept
+IDLE_S = 0.1
+SAVED_S = 120.0  # in which a map is finished
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Handed:
+    crops: Sequence[Crop]  # one of each camera
+    R_lab_body: Tensor  # (3, 3)
+    number: int  # of the map that it came from; 0: none
+
+
+class MapLearner:
+    """Learns the map of the frames handed over, in a process of its own; `newest` is its last one, None: none yet."""
+
+    def __init__(self, place: Crops, settings: MapSettings) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.newest: LiveMap | None = None
+        self._place = place
+        self._last: Tensor | None = None
+        self._count = 0
+        self._frames: Queue[bytes] = context.Queue()
+        self._maps: Queue[bytes] = context.Queue()
+        work = (pickle.dumps((place, settings)), self._frames, self._maps)
+        self._process = context.Process(target=_learn, args=work, daemon=True)
+        self._process.start()
+        self._frames.cancel_join_thread()  # what a process that has ended does not take must hold nobody up
+        self._paint: tuple[Tensor, Tensor] | None = None
+        self._finished = threading.Event()
+        threading.Thread(target=self._receive, name="maps", daemon=True).start()
+
+    def hand(self, shots: Sequence[Frame], R_lab_body: Tensor, number: int) -> None:
+        """Hand over a frame, with its orientation by map `number`, where all cameras see a ball that has turned."""
+        still = self._last is not None and float(so3.geodesic_distance(self._last, R_lab_body)) < HANDED_RAD
+        if still or self._count >= HANDED or not all(shot.usable for shot in shots):
+            return
+        self._last, self._count = R_lab_body, self._count + 1
+        crops = cut_out(self._place, [shot.picture for shot in shots])
+        self._frames.put(pickle.dumps(_Handed(crops=crops, R_lab_body=R_lab_body, number=number)))
+
+    def finish(self) -> tuple[Tensor, Tensor]:
+        """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H); the body frame
+        is that of the orientations handed over. PaintError without a map.
+        """
+        self._frames.put(pickle.dumps(None))
+        self._finished.wait(SAVED_S)
+        if self._paint is None:
+            do = "let the ball turn longer, or learn it with `sphereorient map`"
+            raise PaintError(refusal("map", expected="one learnt meanwhile", got="none yet", do=do))
+        return self._paint
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+
+    def _receive(self) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                found = pickle.loads(self._maps.get())
+                if isinstance(found, LiveMap):
+                    self.newest = found
+                else:
+                    self._paint = found
+                    self._finished.set()
+
+
+def _learn(work: bytes, frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
+    """Take frames and give maps; after None instead of a frame, give the finished map, and end."""
+    torch.set_num_threads(1)
+    limit_cores(1)
+    growing, done = GrowingMap(*pickle.loads(work)), 0
+    while True:
+        for one in _waiting(frames):
+            if one is None:
+                while growing.ready() and done < FEWEST and not growing.arrived:
+                    growing.iterate()
+                    done += 1
+                maps.put(pickle.dumps(growing.paint() if done else None))
+                return
+            growing.add(one.crops, one.R_lab_body, one.number)
+        if not growing.ready() or growing.arrived:
+            continue
+        growing.iterate()
+        done += 1
+        if (done == FIRST or growing.moved_rad < STEADY_RAD) and (found := growing.live_map()).trusted:
+            maps.put(pickle.dumps(found))
+
+
+def _waiting(frames: "Queue[bytes]") -> list[_Handed | None]:
+    """Return what waits; wait a little for the first."""
+    found: list[_Handed | None] = []
+    with suppress(Empty):
+        found.append(pickle.loads(frames.get(timeout=IDLE_S)))
+        while True:
+            found.append(pickle.loads(frames.get_nowait()))
+    return found
+
+
+class LearningTracker:
+    """Follows a ball without a map: relative orientations at first, then by the newest map that is learnt meanwhile.
+
+    `number` is that of the map in use, 0: none. The body frame goes on: where another map begins, the orientation of
+    the frame is that without it.
+    """
+
+    def __init__(self, place: Crops, settings: Settings, learner: MapLearner) -> None:
+        self.number = 0
+        self._settings, self._learner = settings, learner
+        self._relative = RelativeTracker(place, settings.paint)
+        self._online: OnlineTracker | None = None
+        self._R_map_body = torch.eye(3, dtype=torch.float64)
+        self._tried = 0
+        self._past: deque[tuple[float, Poses]] = deque(maxlen=LAST)  # in the body frame
+
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the poses of a frame, in the body frame, and whether they were searched for; see `OnlineTracker`."""
+        found, changed = self._learner.newest, None
+        if found is not None and found.number > self._tried and len(self._past) == LAST:
+            self._tried = found.number
+            changed = self._changed(found, time_s, shots)
+        poses, searched = self._measured(time_s, shots) if changed is None else (changed, False)
+        if supported(poses):
+            self._past.append((time_s, poses))
+            self._learner.hand(shots, poses.R_lab_body[0], self.number)
+        else:
+            self._past.clear()
+        return poses, searched
+
+    def _measured(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        if self._online is None:
+            return self._relative.next(time_s, shots)
+        poses, searched = self._online.next(time_s, shots)
+        return _turned(poses, self._R_map_body), searched
+
+    def _changed(self, found: LiveMap, time_s: float, shots: Sequence[Frame]) -> Poses | None:
+        """Go over to another map where the ball is found with it: None, and nothing measured, where it is not."""
+        online, R_map_body = _follower(found, self._settings), found.R_map_body
+        online.resume([(then, _turned(poses, R_map_body.mT)) for then, poses in self._past])
+        poses, searched = online.next(time_s, shots)
+        if searched or not supported(poses):
+            return None
+        before, _ = self._measured(time_s, shots)
+        if not supported(before):
+            return before
+        self._online, self.number = online, found.number
+        self._R_map_body = poses.R_lab_body[0].mT @ before.R_lab_body[0]
+        return _turned(poses, self._R_map_body)
+
+
+def _turned(poses: Poses, R: Tensor) -> Poses:
+    """Return poses whose body frame is turned: R_lab_body times R (3, 3)."""
+    return replace(poses, R_lab_body=poses.R_lab_body @ R)
+
+
+def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
+    begin = Initialiser(
+        fitter=found.appearance.still,
+        proposers={view.name: found.search for view in found.appearance.fitter.views},
+        locating=settings.locate,
+        candidates=settings.refine.candidates,
+    )
+    refine = settings.refine.model_copy(update={"chunks": 1})
+    return OnlineTracker(ChunkTracker(found.appearance, begin, refine, centre=found.centre))

@@ -1,0 +1,105 @@
+"""Rotation since the first frame without a map, of a ball that stays in its place: pictures against those before."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.locate import Frame
+from sphereorient.mapping.chain import EVERY, ITERATIONS, OVERLAP_MIN, SCALE_RAD, SEARCH_EVERY, SEARCH_STEP_DEG, SMALLER
+from sphereorient.mapping.disks import Crop, Crops, Disks, disks_of, reduced
+from sphereorient.mapping.pairs import RelativeRotations, refine_pairs, search_pairs
+from sphereorient.mapping.settings import MapSettings
+from sphereorient.pose.fit import blank_parts
+from sphereorient.trajectory import Reason
+
+NEAREST = 3  # keyframes that a picture is compared with, beside the one before
+KEYFRAMES = 200  # at most: a ball has shown its sides by then
+ROUNDS = 2  # of the mean of rotations
+ONE = torch.zeros(1, dtype=torch.int64)
+
+
+class RelativeTracker:
+    """Compares each picture with the one before and with the keyframes that show most of the same side.
+
+    `place` is an empty record of crops, with the views and one position of the ball. Orientations begin with the
+    identity at the first frame; their error grows to about a degree.
+    """
+
+    def __init__(self, place: Crops, settings: MapSettings) -> None:
+        self._place, self._settings = place, settings
+        self._keys: list[tuple[Disks, Tensor]] = []  # with R_lab_body (3, 3)
+        self._last: tuple[Disks, Tensor] | None = None
+        self._last_s = 0.0
+        self._rate = torch.zeros(3, dtype=torch.float64)  # rad/s, lab
+
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the pose of the frame of a time, and whether it was searched for; no pose where nothing agrees."""
+        reason = [shot.reason for shot in shots]
+        use = torch.tensor([shot.usable for shot in shots])
+        if not bool(use.any()):
+            return no_pose(len(shots), reason), False
+        now = disks_of(crops_of(self._place, shots), ONE, self._settings)
+        searched, R = True, torch.eye(3, dtype=torch.float64)
+        if self._last is not None:
+            found, searched = self._compared(now, so3.exp((time_s - self._last_s) * self._rate) @ self._last[1])
+            if found is None:
+                return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason]), True
+            R = found
+            self._rate = so3.log(R @ self._last[1].mT) / (time_s - self._last_s) * (not searched)
+        self._last, self._last_s = (now, R), time_s
+        self._keep(now, R)
+        parts = blank_parts(len(shots), 1)
+        parts |= {"R_lab_body": R[None], "position_lab_mm": self._place.position_lab_mm[:1]}
+        parts["covariance"][..., :3, :3] = SCALE_RAD**2 / 3 * torch.eye(3)
+        return Poses(**parts, use=use, reason=tuple(reason)), searched
+
+    def _compared(self, now: Disks, expected: Tensor) -> tuple[Tensor | None, bool]:
+        """Return the orientation (3, 3) near the one expected, or else near that of the frame before; and which."""
+        assert self._last is not None
+        members = [*self._nearest(now, expected), self._last]
+        disks, R = Disks.joined([*(one for one, _ in members), now]), torch.stack([R for _, R in members])
+        first, second = torch.arange(len(R)), torch.full((len(R),), len(R))
+        pairs = self._good(refine_pairs(disks, first, second, expected @ R.mT, ITERATIONS, EVERY))
+        searched = not len(pairs)
+        if searched:
+            grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), math.radians(self._settings.turn_max_deg))
+            start = search_pairs(reduced(disks, SMALLER), first, second, R[-1] @ R.mT, grid, SEARCH_EVERY)
+            pairs = self._good(refine_pairs(disks, first, second, start, ITERATIONS, EVERY))
+        if not len(pairs):
+            return None, True
+        found = (pairs.R_ji @ R[pairs.first])[int(pairs.score.argmax())]
+        for _ in range(ROUNDS):
+            off = so3.log(pairs.R_ji @ R[pairs.first] @ found.mT)
+            weight = pairs.information / (1 + (off.norm(dim=1) / SCALE_RAD).square()).square()[:, None, None]
+            turn = torch.linalg.solve(weight.sum(0), (weight @ off[..., None]).sum(0))[:, 0]
+            found = so3.exp(turn) @ found
+        return so3.nearest_rotation(found), searched
+
+    def _good(self, pairs: RelativeRotations) -> RelativeRotations:
+        return pairs.where((pairs.score > self._settings.score_min) & (pairs.overlap > OVERLAP_MIN))
+
+    def _nearest(self, now: Disks, R: Tensor) -> list[tuple[Disks, Tensor]]:
+        """Return the keyframes that show most of what an orientation shows."""
+        here = (R.mT @ now.sight_lab[0][..., None])[..., 0]
+        there = torch.stack([(key.mT @ disks.sight_lab[0][..., None])[..., 0] for disks, key in self._keys])
+        cosine = (here @ there.mT).flatten(1).amax(1)
+        return [self._keys[k] for k in cosine.topk(min(NEAREST, len(self._keys))).indices.tolist()]
+
+    def _keep(self, now: Disks, R: Tensor) -> None:
+        """Take a frame as a keyframe where it is far from all of them."""
+        keys = torch.stack([key for _, key in self._keys]) if self._keys else R[None][:0]
+        near = so3.geodesic_distance(keys, R) < math.radians(self._settings.keyframe_deg)
+        if not bool(near.any()) and len(self._keys) < KEYFRAMES:
+            self._keys.append((now, R))
+
+
+def crops_of(place: Crops, shots: Sequence[Frame]) -> Crops:
+    """Return the record of one frame of a ball in a known place."""
+    crops = [[Crop(grey=shot.picture, top=0, left=0)] for shot in shots]
+    seen = torch.tensor([[shot.usable for shot in shots]])
+    return replace(place, crops=crops, seen=seen)
