@@ -33,6 +33,15 @@ function fromEvent(event) {
   const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
   return [((event.clientX - box.left) * scale - left) / zoom - .5, ((event.clientY - box.top) * scale - up) / zoom - .5];
 }
+canvas.onwheel = event => {  // zooms about the place under the mouse
+  event.preventDefault();
+  if (!shown) return;
+  const [u, v] = fromEvent(event), least = Math.min(canvas.width / shown.width, canvas.height / shown.height);
+  const next = Math.min(zoom * 1.2 ** -Math.sign(event.deltaY), 40 * least);
+  if (next <= least) { fit(); return; }
+  left += (zoom - next) * (u + .5); up += (zoom - next) * (v + .5); zoom = next;
+  draw();
+};
 const place = () => [left, up, zoom * shown.width, zoom * shown.height];
 function clear() {
   context.setTransform(1, 0, 0, 1, 0, 0);
