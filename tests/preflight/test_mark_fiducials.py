@@ -13,11 +13,14 @@ import pytest
 import yaml
 from mark_examples import ask, opened, place, served
 from plate_drawing import PLATE, SIZE, Scene
+from typer.testing import CliRunner
 
 from sphereorient.calibration import load_calibration
 from sphereorient.calibration.plates import see_pictures
+from sphereorient.cli import app
 from sphereorient.errors import CameraError
 from sphereorient.preflight.mark_fiducials import FiducialMarking
+from sphereorient.preflight.mark_masks import MaskMarking
 
 pytest_plugins = ["browser_examples"]
 SCENES = (Scene(tilt_deg=20, about_deg=30, spin_deg=15), Scene(tilt_deg=25, about_deg=40, spin_deg=200))
@@ -174,3 +177,16 @@ def test_a_person_clicks_the_fiducials(marking, address, browser: Any, tmp_path:
     assert (
         np.abs(np.array(saved) - clicks(*PLATE.fiducials)).max() < 1
     )  # the mouse stands on whole pixels of the screen
+
+
+@pytest.mark.parametrize(("name", "kind"), [("calibration.yaml", FiducialMarking), ("experiment.yaml", MaskMarking)])
+def test_the_command_tells_the_files_apart(marking, name, kind, monkeypatch):
+    seen = []
+    monkeypatch.setattr(kind, "__init__", lambda self, path: seen.append(path))
+    monkeypatch.setattr("sphereorient.preflight.mark.serve", lambda *_: (_ for _ in ()).throw(OSError("in use")))
+    path = marking.path.with_name(name)
+    if kind is MaskMarking:
+        path.write_text("schema: sphereorient-experiment/1\n")
+    said = CliRunner().invoke(app, ["mark", str(path), "--no-browser"])
+    assert seen == [path]
+    assert "expected a free port" in str(said.exception)
