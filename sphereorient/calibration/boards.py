@@ -17,8 +17,15 @@ WINDOW = 0.3  # half a window of the sub-pixel step, in distances to the nearest
 SHARP = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 
-def see_plate(picture: NDArray[np.generic], plate: targets.CalibrationTarget, name: str = "plate picture") -> PlateView:
-    """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable."""
+def see_plate(
+    picture: NDArray[np.generic],
+    plate: targets.CalibrationTarget,
+    name: str = "plate picture",
+    clicked: Floats | None = None,
+) -> PlateView:
+    """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable.
+    `clicked`: about where the fiducials of a plate of dots are, see `index_dots`.
+    """
     if isinstance(plate, targets.Chessboard):
         return _chessboard(picture, plate, name)
     if isinstance(plate, targets.CharucoBoard):
@@ -26,7 +33,7 @@ def see_plate(picture: NDArray[np.generic], plate: targets.CalibrationTarget, na
     if isinstance(plate, targets.CircleGrid):
         return _circles(picture, plate, name)
     assert isinstance(plate, targets.DotPlate)
-    return index_dots(find_dots(picture, dark=plate.dark), plate, name)
+    return index_dots(find_dots(picture, dark=plate.dark), plate, name, clicked)
 
 
 def _chessboard(picture: NDArray[np.generic], board: targets.Chessboard, name: str) -> PlateView:

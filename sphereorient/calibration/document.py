@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, FiniteFloat, PositiveInt, StrictInt
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.targets import CalibrationTarget, missing_keys, plate_from_entry
+from sphereorient.calibration.targets import FIDUCIALS, CalibrationTarget, DotPlate, missing_keys, plate_from_entry
 from sphereorient.cameras import Port
 from sphereorient.cameras.checks import camera_error, check_known, named
 from sphereorient.cameras.io.cameras_yaml import Entry, PortEntry
@@ -41,10 +41,11 @@ class SurveyedKeys(Entry):
 
 
 class PictureKeys(BaseModel, frozen=True, extra="allow"):
-    """One pose: its number, and the picture of each camera."""
+    """One pose: its number, the picture of each camera, and where its fiducials were clicked."""
 
     __pydantic_extra__: dict[str, str]
     pose: StrictInt
+    clicked: dict[str, list[tuple[FiniteFloat, FiniteFloat]]] = {}  # camera -> px, see `checked_clicks`
 
 
 class CalibrationKeys(BaseModel, frozen=True, extra="forbid"):
@@ -68,6 +69,7 @@ class Picture:
     camera: str
     row: int  # of the pose
     path: Path
+    clicked_px: NDArray[np.float64] | None = None  # (2 or 3, 2), about where the fiducials are, in the plate's order
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,11 +101,14 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
         raise camera_error(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
+    plate = plate_from_entry(keys.plate, f"{path}, plate") if keys.pictures else None
+    if not isinstance(plate, DotPlate) and any(picture.clicked_px is not None for picture in pictures):
+        raise camera_error(f"{path}, clicked", "a plate with fiducials, of type dots", "another one", "remove the key")
     cameras = tuple(dict.fromkeys([*(picture.camera for picture in pictures), *keys.points]))
     return CalibrationDocument(
         path=path,
         keys=keys,
-        plate=plate_from_entry(keys.plate, f"{path}, plate") if keys.pictures else None,
+        plate=plate,
         poses=numbers,
         surveyed=_surveyed(keys, path, numbers) if keys.pictures else IN_THE_LAB,
         pictures=pictures,
@@ -167,8 +172,32 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tu
                 got, do = f"a second one of pose {entry.pose}", "give every pose its own number"
                 raise camera_error(f"{path}, pictures, {k}, {name}", "one picture of a pose", got, do)
             seen.add((row, name))
-            pictures.append(Picture(camera=name, row=row, path=path.parent / file))
+            points, where = entry.clicked.get(name), f"{path}, pictures, {k}, clicked, {name}"
+            clicked = None if points is None else checked_clicks(points, keys.image_size, where)
+            pictures.append(Picture(camera=name, row=row, path=path.parent / file, clicked_px=clicked))
+        for name in set(entry.clicked) - set(files):
+            do = "name one of them, or remove the points"
+            raise camera_error(f"{path}, pictures, {k}, clicked", f"one of {', '.join(files)}", short(name), do)
     return tuple(pictures)
+
+
+def checked_clicks(points: Any, image_size: tuple[int, int], where: str) -> NDArray[np.float64]:
+    """Return clicked fiducials, two or three pairs u, v, px, of the origin, on +x and on +y, as an array (2 or 3, 2);
+    CameraError for another number of them or places outside a picture of `image_size` (W, H).
+    """
+    do = "click them again, or remove the points"
+    try:
+        clicked = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError):
+        clicked = np.zeros(0)
+    if clicked.shape not in ((2, 2), (3, 2)):
+        expected = f"two or three pairs u, v: {', '.join(FIDUCIALS)}"
+        raise camera_error(where, expected, short(points), do)
+    for name, uv_px in zip(FIDUCIALS, clicked, strict=False):
+        if not ((uv_px >= -0.5) & (uv_px <= np.array(image_size) - 0.5)).all():
+            expected, got = f"a place inside {image_size[0]} x {image_size[1]} px", f"{uv_px.tolist()}"
+            raise camera_error(f"{where}, {name}", expected, got, do)
+    return clicked
 
 
 def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> dict[int, tuple[Tensor, Tensor]]:

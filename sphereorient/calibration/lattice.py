@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from sphereorient.calibration import targets
 from sphereorient.calibration.dots import Dots
-from sphereorient.calibration.targets import DotPlate, Floats, Ints, PlateView, refused_view
+from sphereorient.calibration.targets import FIDUCIALS, DotPlate, Floats, Ints, PlateView, refused_view
 from sphereorient.errors import refusal
 
 NEIGHBOURS = 24  # of each dot: at 75 degrees of tilt the next column is about the 12th nearest
@@ -20,6 +20,9 @@ SEEDS = 12  # starting dots tried
 LEAST_DOTS = 12  # fewer hardly test a homography (8 numbers)
 WIDTH_MISS = 0.25  # relative difference between a dot's width and that of calibration.yaml
 MIRROR = np.array([1, -1])
+NEAR = 0.5  # pitches within which a clicked place belongs to a dot
+CLICK = "click them with `sphereorient mark calibration.yaml`"
+AGAIN = "click the fiducials again with `sphereorient mark calibration.yaml`"
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
 
@@ -30,6 +33,7 @@ class Lattice:
     which: Ints  # (n,), indices of these dots in `Dots`
     index: Ints  # (n, 2), grid indices up to quarter turns and a shift
     width: Floats  # (n,), diameters of the dots, in pitches
+    steps: Floats  # (n, 2, 2), px: at each dot the steps to the next column (first column) and to the next row (second)
 
 
 def find_lattice(dots: Dots) -> Lattice | None:
@@ -189,9 +193,9 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     which, index, lattice_map = _agreeing(dots, which, index)
     if lattice_map is None:
         return None
-    cell = np.abs(np.linalg.det(lattice_map.steps(index)))
-    width = np.sqrt(4 / np.pi * dots.area_px[which] / cell)
-    return Lattice(which=which, index=index, width=width)
+    steps = lattice_map.steps(index)
+    width = np.sqrt(4 / np.pi * dots.area_px[which] / np.abs(np.linalg.det(steps)))
+    return Lattice(which=which, index=index, width=width, steps=steps)
 
 
 def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | None]:
@@ -208,9 +212,12 @@ def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | 
         which, index = which[kept], index[kept]
 
 
-def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> PlateView:
+def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture", clicked: Floats | None = None) -> PlateView:
     """Identify the dots of a picture on the plate by trying quarter turns and shifts; `name` appears in the reason.
     The larger dots must be exactly the visible fiducials. One placement: `tied`; several: `floating`; none: `refused`.
+    `clicked` (2 or 3, 2), px: about where the fiducials are, in the plate's order. They place the lattice instead of
+    the larger dots: `tied`, or `refused` where they contradict the plate. Dots that are not as wide as those of their
+    places are dropped.
     """
     lattice = find_lattice(dots)
     if lattice is None or len(lattice.index) < LEAST_DOTS:
@@ -230,12 +237,47 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
         expected, got = f"at most {plate.columns} x {plate.rows} dots", f"a lattice of {across} x {up}"
         return refused_view(name, expected, got, "correct columns and rows of the plate")
     placements = _placements(index, large, plate)
+    if clicked is not None:
+        found = _clicked_placement(dots, lattice, clicked, plate, name)
+        if isinstance(found, PlateView):
+            return found
+        there = targets.quarter_turned(index, int(found[0])) + found[1:]
+        if not plate.holds(there).all():
+            expected, got = f"an origin with all dots on {plate.columns} x {plate.rows}", "dots beyond the plate's edge"
+            return refused_view(f"{name}, clicked", expected, got, AGAIN)
+        if large.sum() >= 2 and len(placements) == 1 and (placements[0] != found).any():
+            return refused_view(f"{name}, clicked", "the larger dots that are found", "other dots", AGAIN)
+        kept = plate.is_fiducial(there) == large
+        which, index, placements = which[kept], index[kept], found[None]
     if len(placements) == 0:
         return _misplaced(index, large, plate, name)
     got = f"{int(large.sum())}, which leave {len(placements)} places of its dots on the plate"
-    do = "show the fiducials, or have the other camera see them at the same instant"
+    do = f"show the fiducials, have the other camera see them at the same instant, or {CLICK}"
     view = targets.seen(plate, index, dots.uv_px[which], dots.sigma_px[which])
     return view.settled(plate, placements, refusal(name, expected="3 larger dots in view", got=got, do=do))
+
+
+def _clicked_placement(dots: Dots, lattice: Lattice, clicked: Floats, plate: DotPlate, name: str) -> Ints | PlateView:
+    """Return the placement (3,) of a lattice by which the clicked places are the fiducials; or the refusal."""
+    at = np.zeros((len(clicked), 2), dtype=np.int64)
+    for k, uv_px in enumerate(clicked):
+        away = uv_px - dots.uv_px[lattice.which]
+        near = int(np.argmin((away**2).sum(axis=1)))
+        pitches = np.linalg.solve(lattice.steps[near], away[near])
+        step = np.rint(pitches)  # not zero: the place of a dot beside, which is covered
+        if np.abs(step).max() > 1 or np.hypot(*(pitches - step)) > NEAR:
+            got = f"none at {uv_px.round(1).tolist()}"
+            return refused_view(f"{name}, clicked {FIDUCIALS[k]}", "a dot of the lattice there", got, AGAIN)
+        at[k] = lattice.index[near] + step.astype(np.int64)
+    marks = np.array(plate.fiducials)[: len(at)]
+    for mirror in (1, MIRROR):
+        for quarters in range(4):
+            turned = targets.quarter_turned(at * mirror, quarters)
+            shift = marks[0] - turned[0]
+            if (turned + shift == marks).all():
+                return _mirrored(name) if mirror is MIRROR else np.array([quarters, *shift])
+    expected, got = f"{marks.tolist()}, columns and rows up to a rotation", f"{(at - at[0]).tolist()}"
+    return refused_view(f"{name}, clicked", expected, got, AGAIN)
 
 
 def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
@@ -259,9 +301,13 @@ def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
 
 def _misplaced(index: Ints, large: NDArray[np.bool_], plate: DotPlate, name: str) -> PlateView:
     if len(_placements(index * MIRROR, large, plate)):
-        expected, got = "the plate from its front, z towards the camera", "its mirror image"
-        do = "mirror the picture back, or correct the fiducials: x to the right of the origin, y above it"
-        return refused_view(name, expected, got, do)
+        return _mirrored(name)
     expected = f"larger dots at the grid indices {[list(f) for f in plate.fiducials]}"
     got = f"{int(large.sum())} larger dots that fit there nowhere on {plate.columns} x {plate.rows}"
-    return refused_view(name, expected, got, "correct columns, rows and fiducials of the plate")
+    return refused_view(name, expected, got, f"correct columns, rows and fiducials of the plate, or {CLICK}")
+
+
+def _mirrored(name: str) -> PlateView:
+    expected, got = "the plate from its front, z towards the camera", "its mirror image"
+    do = "mirror the picture back, or correct the fiducials: x to the right of the origin, y above it"
+    return refused_view(name, expected, got, do)

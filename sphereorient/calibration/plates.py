@@ -77,10 +77,10 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     assert document.plate is not None
     plate = document.plate
     # Read all files first, to report a faulty one before the long computation.
-    grey = [_read_grey(picture.path, document.keys.image_size) for picture in document.pictures]
+    grey = [read_plate_picture(picture.path, document.keys.image_size) for picture in document.pictures]
     views = {}
     with ThreadPoolExecutor(2) as pool:
-        seen = pool.map(lambda one, picture: see_plate(one, plate, picture.path.name), grey, document.pictures)
+        seen = pool.map(lambda one, it: see_plate(one, plate, it.path.name, it.clicked_px), grey, document.pictures)
         progress("pictures", 0, len(grey))
         for picture, view in zip(document.pictures, seen, strict=True):
             views[picture] = view
@@ -88,23 +88,20 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     return views
 
 
-def read_plate_picture(path: Path) -> NDArray[Any]:
-    """Return the grey levels (H, W) of a picture of a plate; CameraError for a file that is no picture or too large."""
+def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Return the grey levels (H, W) of a picture of a plate; CameraError for a file that is no picture or too large, or
+    not of `image_size` (W, H).
+    """
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
     # Do not decode a file that claims more pixels than any camera has.
     picture = decoded_grey(content) if pixels is not None and pixels <= LARGEST_PIXELS else None
     if picture is None:
         raise camera_error(str(path), "a picture", "a file that is no picture or too large", "save it as PNG")
-    return np.asarray(picture)
-
-
-def _read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
-    picture = read_plate_picture(path)
-    if picture.shape != image_size[::-1]:
+    if image_size is not None and picture.shape != image_size[::-1]:
         expected, got = (f"{w} x {h} px" for w, h in (image_size, picture.shape[::-1]))
         raise camera_error(str(path), expected, got, "correct image_size, or leave the picture out")
-    return picture
+    return np.asarray(picture)
 
 
 def _check_seen(

@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 MOST = 1000  # columns or rows: arrays of all points are made, and no camera resolves more
 LONGEST_MM = 1e5
+FIDUCIALS = ("origin", "+x", "+y")  # their names, in the order of `DotPlate.fiducials`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ class DotPlate(CalibrationTarget):
 
     dot_diameter_mm: float
     fiducial_diameter_mm: float
-    fiducials: tuple[tuple[int, int], ...]  # grid indices: origin, on +x, on +y
+    fiducials: tuple[tuple[int, int], ...]  # grid indices, in the order of FIDUCIALS
     dark: bool = True  # dark dots on a bright plate; False: bright dots on a dark plate
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""`sphereorient init` and `mark`: the first files of an experiment, and the masks that people draw."""
+"""`sphereorient init` and `mark`: the first files of an experiment, and what people mark in its pictures."""
 
 import sys
 from collections.abc import Sequence
@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
-from sphereorient.cli.options import ExperimentPath, Quiet
-from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
+from sphereorient.cli.options import Quiet
+from sphereorient.errors import ExperimentError, SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.draft import DraftKey, draft_yaml, given, open_keys
 from sphereorient.files.whole_file import check_ending, relative_path, write_text
+from sphereorient.files.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,17 +67,23 @@ def init(
 
 @app.command()
 def mark(
-    experiment: ExperimentPath,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="experiment.yaml: masks; calibration.yaml: fiducials of the plate.")
+    ],
     port: Annotated[
         int,
         typer.Option(min=0, max=65535, help="Of this machine; 0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT."),
     ] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
 ) -> None:
-    """Draw masks, what hides the ball, on the movies in the browser; they are saved beside the experiment."""
-    from sphereorient.preflight.mark import HOST, Marking, serve
+    """Mark in the browser what hides the ball in the movies, or the fiducials where `calibrate` does not find them."""
+    from sphereorient.preflight.mark import HOST, serve
+    from sphereorient.preflight.mark_fiducials import FiducialMarking
+    from sphereorient.preflight.mark_masks import MaskMarking
 
-    marking = Marking(experiment)
+    content = read_yaml(file, ExperimentError)
+    schema = str(content.get("schema")) if isinstance(content, dict) else ""
+    marking = (FiducialMarking if schema.startswith("sphereorient-calibration/") else MaskMarking)(file)
     try:
         server = serve(marking, port)
     except OSError as error:
@@ -117,7 +124,7 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
     from sphereorient.preflight.draft import camera_keys
-    from sphereorient.preflight.mark import drawn_mask
+    from sphereorient.preflight.mark_masks import drawn_mask
 
     said = read_fictrac_config(config)
     mask, cameras = target.parent / "cam1_mask.png", target.parent / "cameras.yaml"

@@ -1,6 +1,7 @@
 """Reading and writing bounded YAML files of plain values; every fault is one line with file and key."""
 
 import difflib
+import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -107,6 +108,63 @@ def parse_yaml(text: str) -> Any:
         OverflowError: a number to the base 60 that is too large.
     """
     return _BoundedLoader(text).get_single_data()
+
+
+def with_value(text: str, place: Sequence[str | int], value: Mapping[str, Any]) -> str | None:
+    """Return a YAML text with the mapping at `place`, keys and numbers of list entries, written in one line there; all
+    else, comments included, stays. An absent last key is added, in the place of one that is commented out. None where
+    that could lose something: an old value in several lines, or a form that is not understood.
+    """
+    line = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=1 << 20).strip()
+    *above, key = place
+    try:
+        wanted = _changed(parse_yaml(text), place, value)
+        new = _spliced(text, _node_at(_BoundedLoader(text).get_single_node(), above), str(key), line)
+        return new if new is not None and parse_yaml(new) == wanted else None
+    except (*FAULTS, LookupError, TypeError):
+        return None
+
+
+def _changed(data: Any, place: Sequence[str | int], value: Any) -> Any:
+    step, *rest = place
+    new: Any = list(data) if isinstance(data, list) else dict(data)
+    new[step] = _changed(data[step], rest, value) if rest else value
+    return new
+
+
+def _node_at(node: yaml.Node | None, place: Iterable[str | int]) -> yaml.Node:
+    for step in place:
+        if isinstance(node, yaml.SequenceNode):
+            node = node.value[int(step)]
+        elif isinstance(node, yaml.MappingNode):
+            node = next((value for name, value in node.value if name.value == step), None)
+    if node is None:
+        raise LookupError(place)
+    return node
+
+
+def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
+    """Return a text whose mapping `node` has a key with this line as value; None where the old value has more lines."""
+    if not isinstance(node, yaml.MappingNode) or not node.value:
+        return None
+    for name, old in node.value:
+        if name.value == key:
+            start, end = old.start_mark, old.end_mark
+            one_line = start.line == end.line and (isinstance(old, yaml.ScalarNode) or old.flow_style)
+            return text[: start.index] + line + text[end.index :] if one_line else None
+    last = node.value[-1][1]
+    if node.flow_style:
+        return f"{text[: last.end_mark.index]}, {key}: {line}{text[last.end_mark.index :]}"
+    indent = " " * node.start_mark.column
+    commented = re.compile(rf"^{indent}# {re.escape(key)}:.*$", re.MULTILINE)
+    if not indent and commented.search(text):
+        return commented.sub(lambda _: f"{key}: {line}", text, count=1)
+    while isinstance(last, yaml.CollectionNode) and not last.flow_style:  # the end of a block is vague
+        last = last.value[-1] if isinstance(last, yaml.SequenceNode) else last.value[-1][1]
+    end = last.end_mark.index
+    end += len(text[end:].partition("\n")[0].rstrip("\r"))
+    rest = text[end:] or "\n"
+    return f"{text[:end]}\n{indent}{key}: {line}{rest}"
 
 
 class _BoundedLoader(yaml.SafeLoader):

@@ -50,6 +50,12 @@ def surveyed(**changes):
 
 MIRROR = [[1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]]
 TWICE = [{"pose": 0, "cam1": "a.png"}, {"pose": 0, "cam1": "b.png"}]
+
+
+def clicked(points, name="cam1"):
+    return {"pictures": [{"pose": 0, "cam1": "a.png", "clicked": {name: points}}]}
+
+
 FAULTS = [
     ({"surveyed": None}, r"surveyed: expected a pose that defines the lab frame, got none; write the plate's pose"),
     (surveyed(pose=77), r"surveyed: expected a pose with a picture, got pose 77, without a picture; name"),
@@ -64,6 +70,15 @@ FAULTS = [
     ({"pictures": [{"pose": 0}]}, r"pictures, 0: expected a picture, got none"),
     ({"pictures": [{"pose": 0, "cam1": 7}]}, r"pictures.0.cam1: expected a valid string, got 7"),
     ({"pictures": TWICE}, r"pictures, 1, cam1: expected one picture of a pose, got a second one of pose 0"),
+    (clicked([[1, 2]]), r"clicked, cam1: expected two or three pairs u, v: origin, \+x, \+y, got \["),
+    (clicked([[1, 2], [3, 4, 5]]), r"pictures.0.clicked.cam1.1"),
+    (clicked([[1, 2], [3, float("nan")]]), r"pictures.0.clicked.cam1.1.1.*finite number"),
+    (clicked([[1, 2], [480.0, 4]]), r"0, clicked, cam1, \+x: expected a place inside 480 x 400 px, got \[480.0, 4.0\]"),
+    (clicked([[1, 2], [3, 4]], "cam2"), r"pictures, 0, clicked: expected one of cam1, got 'cam2'"),
+    (
+        clicked([[1, 2], [3, 4]]) | {"plate": {"type": "chessboard", "columns": 9, "rows": 6, "pitch": 8.0}},
+        r"clicked: expected a plate with fiducials, of type dots, got another one",
+    ),
     ({"image_size": [0, 400]}, r"image_size.0.*greater than 0, got 0"),
     ({"pixel_pitch": [0.02, float("nan")]}, r"pixel_pitch.1"),
     ({"pixel_pitch": [0.02, -0.02]}, r"pixel_pitch.1.*greater than 0"),

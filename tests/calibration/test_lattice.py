@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from plate_drawing import PLATE, Scene
 
 from sphereorient.calibration import DotPlate, PlateView, placed, plate_from_entry, see_plate
-from sphereorient.calibration.dots import Dots
+from sphereorient.calibration.dots import Dots, find_dots
 from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.targets import quarter_turned
 from sphereorient.errors import CameraError
@@ -288,3 +289,72 @@ def test_pictures_of_a_laboratory_are_told_right_to_the_last_dot(folder: str) ->
     miss = np.concatenate(misses)
     assert np.abs(miss).max() < 0.2
     assert np.sqrt(np.mean(miss**2)) < 0.04
+
+
+def clicks(scene: Scene, *index: tuple[int, int], off_px: float = 3.0) -> np.ndarray:
+    """Where a person clicks on dots: near them."""
+    return scene.centres_px(np.array(index)) + np.array([off_px, -off_px])
+
+
+# Covered on both halves, so that the gaps do not give them away.
+BADLY_SEEN = {"small": PLATE.fiducials, "without": (*PLATE.fiducials, (-3, 0), (0, -2))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("badly", BADLY_SEEN)
+@pytest.mark.parametrize("count", [2, 3])
+def test_clicked_fiducials_tie_a_picture_in_which_they_are_too_small_or_covered(badly: str, count: int) -> None:
+    scene = Scene(tilt_deg=25, about_deg=40, spin_deg=200)
+    dots = find_dots(scene.picture(**{badly: BADLY_SEEN[badly]}), dark=True)
+    assert index_dots(dots, PLATE).state != "tied"
+    view = index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials[:count]))
+    assert_told_right(view, scene, len(scene.whole(0.15)) - len(BADLY_SEEN[badly]))
+    assert not PLATE.is_fiducial(view.index).any()  # a dot that is too small is not measured as a fiducial
+    # A click names a dot: how far beside it does not matter, and no centre moves.
+    other = index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials[:count], off_px=-5.0))
+    assert np.array_equal(other.uv_px, view.uv_px)
+    assert np.array_equal(other.index, view.index)
+
+
+@pytest.mark.parametrize(
+    ("index", "words"),
+    [
+        (
+            ((0, 0), (2, 0), (0, 2)),
+            r"\[\[0, 0\], \[3, 0\], \[0, 2\]\], columns and rows up to a rotation, got \[\[0, 0\],",
+        ),
+        (((0, 0), (0, 0)), "columns and rows up to a rotation"),
+        (((0, 0), (3, 0), (0, -2)), "expected the plate from its front, z towards the camera, got its mirror image"),
+        (((1, 0), (4, 0), (1, 2)), "an origin with all dots on 11 x 9, got dots beyond the plate's edge"),
+    ],
+)
+def test_clicks_that_contradict_the_plate_are_refused(index, words: str) -> None:
+    scene = Scene(tilt_deg=20, spin_deg=30, distance_mm=280)
+    view = index_dots(dots_at(scene, without=PLATE.fiducials), PLATE, "cam1_03.png", clicks(scene, *index))
+    assert view.state == "refused"
+    assert view.reason.startswith("cam1_03.png")
+    assert re.search(words, view.reason)
+    assert "\n" not in view.reason
+
+
+def test_a_click_between_the_dots_or_beside_the_plate_is_refused_by_name() -> None:
+    scene = Scene(tilt_deg=20)
+    dots = dots_at(scene)
+    at = clicks(scene, *PLATE.fiducials)
+    at[1] = scene.centres_px(np.array([[3, 0], [4, 1]])).mean(axis=0)
+    assert "clicked +x: expected a dot of the lattice there" in index_dots(dots, PLATE, "a.png", at).reason
+    at[1], at[2] = clicks(scene, (3, 0))[0], [3.0, 3.0]
+    assert (
+        "clicked +y: expected a dot of the lattice there, got none at [3.0, 3.0]"
+        in index_dots(dots, PLATE, "a.png", at).reason
+    )
+
+
+def test_clicks_beside_larger_dots_that_are_found_are_refused() -> None:
+    scene = Scene(spin_deg=180, at_mm=(60.0, 0.0))  # the plate's left is out of the picture
+    dots = dots_at(scene)
+    assert index_dots(dots, PLATE).state == "tied"
+    assert index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials)).state == "tied"
+    view = index_dots(dots, PLATE, clicked=clicks(scene, (1, 0), (4, 0), (1, 2)))
+    assert view.state == "refused"
+    assert "expected the larger dots that are found, got other dots" in view.reason

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import threading
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,12 +12,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from mark_examples import ask, opened, place, served
 from preflight_examples import PAINTED, Example, clean_example, write
 
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.stream import given_mask
-from sphereorient.preflight.mark import HOST, Marking, drawn_mask, serve, with_key
+from sphereorient.preflight.mark_masks import MaskMarking, drawn_mask
 
 pytest_plugins = ["browser_examples"]
 TRIANGLE = {"kind": "hide", "points": [[10, 10], [60, 10], [10, 60]]}
@@ -33,28 +31,14 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
 
 
 @pytest.fixture
-def marking(clean: Example, tmp_path: Path) -> Marking:
-    return Marking(write(clean, tmp_path / "experiment", sphere=PAINTED))
+def marking(clean: Example, tmp_path: Path) -> MaskMarking:
+    return MaskMarking(write(clean, tmp_path / "experiment", sphere=PAINTED))
 
 
 @pytest.fixture
-def address(marking: Marking) -> Iterator[str]:
-    server = serve(marking)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield f"http://{HOST}:{server.server_address[1]}"
-    server.shutdown()
-    server.server_close()
-    thread.join()
-
-
-def ask(url: str, content: object = None, **headers: str) -> tuple[int, bytes]:
-    data = None if content is None else json.dumps(content).encode()
-    try:
-        with urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=60) as answer:
-            return answer.status, answer.read()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read()
+def address(marking: MaskMarking) -> Iterator[str]:
+    with served(marking) as found:
+        yield found
 
 
 def test_a_shape_hides_or_is_all_that_is_shown():
@@ -103,7 +87,7 @@ def test_the_mask_is_saved_and_named(marking):
 
 
 def test_a_mirrored_movie_keeps_its_mask_where_it_was_drawn(clean, tmp_path):
-    marking = Marking(write(clean, tmp_path / "experiment", flip={"cam1": "vertical"}))
+    marking = MaskMarking(write(clean, tmp_path / "experiment", flip={"cam1": "vertical"}))
     marking.save("cam1", [TRIANGLE], keep=True)
     experiment = load_experiment(marking.path)
     file = cv2.imread(str(experiment.mask_paths["cam1"]), cv2.IMREAD_GRAYSCALE)
@@ -129,11 +113,6 @@ def test_a_key_of_several_lines_is_left_alone(marking):
     with pytest.raises(ExperimentError, match=r"write masks: \{cam1: cam1_mask.png\} there"):
         marking.save("cam1", [TRIANGLE], keep=True)
     assert marking.path.read_text() == text
-
-
-def test_a_key_is_put_in_once():
-    assert with_key("a: 1\n", "masks", {"cam1": "m.png"}) == "a: 1\nmasks: {cam1: m.png}\n"
-    assert with_key("masks: {}\nb: 2\n", "masks", {"c": "d"}) == "masks: {c: d}\nb: 2\n"
 
 
 def test_the_server_answers_who_knows_the_token(marking, address):
@@ -193,41 +172,27 @@ def test_a_wrong_request_is_told_and_changes_nothing(marking, address, path, con
 
 
 @pytest.mark.slow  # a browser
-def test_a_person_draws_a_mask(marking, address, browser: Any, tmp_path: Path, request):
-    page = browser.new_page(viewport={"width": 1280, "height": 800})
-    wrong: list[str] = []
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
-    page.goto(f"{address}/{marking.token}/")
-    page.wait_for_function("picture !== null")
-    page.get_by_label("frame number").fill("7")
-    page.get_by_label("frame number").press("Tab")
-
-    def place(u: float, v: float) -> tuple[float, float]:
-        code = """([u, v]) => { const box = canvas.getBoundingClientRect(), [x, y] = toPage(u, v);
-            const scale = canvas.width / box.width; return [box.left + x / scale, box.top + y / scale]; }"""
-        x, y = page.evaluate(code, [u, v])
-        return x, y
-
-    for corner in TRIANGLE["points"]:
-        page.mouse.click(*place(*corner))
-    page.get_by_role("button", name="close polygon").click()
-    page.get_by_role("button", name="show only").click()
-    page.get_by_role("button", name="circle", exact=True).click()
-    page.mouse.move(*place(120, 120))
-    page.mouse.down()
-    page.mouse.move(*place(220, 120))
-    page.mouse.up()
-    page.get_by_text("show only circle, 200 px across").wait_for()
-    page.get_by_role("button", name="find the ball").click()
-    page.get_by_text("which moves").wait_for()
-    page.get_by_role("button", name="lay the map on it").click()
-    page.get_by_text("The map explains").wait_for()
-    page.screenshot(path=str(tmp_path / "mark.png"))
-    page.get_by_role("button", name="save mask").click()
-    page.get_by_text("of the picture is hidden").wait_for()
-    page.close()
-    assert wrong == []
+def test_a_person_draws_a_mask(marking, address, browser: Any, tmp_path: Path):
+    with opened(browser, f"{address}/{marking.token}/") as page:
+        page.get_by_label("frame number").fill("7")
+        page.get_by_label("frame number").press("Tab")
+        for corner in TRIANGLE["points"]:
+            page.mouse.click(*place(page, *corner))
+        page.get_by_role("button", name="close polygon").click()
+        page.get_by_role("button", name="show only").click()
+        page.get_by_role("button", name="circle", exact=True).click()
+        page.mouse.move(*place(page, 120, 120))
+        page.mouse.down()
+        page.mouse.move(*place(page, 220, 120))
+        page.mouse.up()
+        page.get_by_text("show only circle, 200 px across").wait_for()
+        page.get_by_role("button", name="find the ball").click()
+        page.get_by_text("which moves").wait_for()
+        page.get_by_role("button", name="lay the map on it").click()
+        page.get_by_text("The map explains").wait_for()
+        page.screenshot(path=str(tmp_path / "mark.png"))
+        page.get_by_role("button", name="save mask").click()
+        page.get_by_text("of the picture is hidden").wait_for()
     drawn = given_mask(load_experiment(marking.path), "cam1", (240, 240))
     expected = drawn_mask((240, 240), [TRIANGLE, {"kind": "show", "u": 120, "v": 120, "radius": 100}], None)
     assert np.mean(drawn != expected) < 0.01  # the mouse stands on whole pixels of the screen

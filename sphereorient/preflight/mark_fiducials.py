@@ -1,0 +1,138 @@
+"""Fiducials of a plate that people click in the browser, where `calibrate` does not find them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.calibration import DotPlate, PlateView, load_calibration
+from sphereorient.calibration.document import Picture, checked_clicks
+from sphereorient.calibration.dots import Dots, find_dots
+from sphereorient.calibration.lattice import index_dots
+from sphereorient.calibration.plates import read_plate_picture
+from sphereorient.calibration.targets import FIDUCIALS
+from sphereorient.errors import CameraError, refusal
+from sphereorient.preflight.mark import Json, Marking, eight_bits, png
+
+
+class FiducialMarking(Marking):
+    """A calibration.yaml with pictures of a plate of dots."""
+
+    page = "mark_fiducials.html"
+    error = CameraError
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.document = load_calibration(self.path)
+        if not isinstance(self.document.plate, DotPlate):
+            expected, do = "pictures of a plate with fiducials, of type dots", "nothing needs to be clicked here"
+            raise CameraError(refusal(str(self.path), expected=expected, got="other points", do=do))
+        self.plate = self.document.plate
+        self.clicked = {it: it.clicked_px for it in self.document.pictures}
+        self.dots: dict[Picture, Dots] = {}
+
+    def shown(self, steps: Sequence[str]) -> bytes | Json | None:
+        """Return the state, a picture, or what is found in it."""
+        match steps:
+            case ["state"]:
+                return self.state()
+            case ["picture", number] if number.isdigit():
+                return png(eight_bits(self._grey(self._picture(int(number[:9])))))
+            case ["view", number] if number.isdigit():
+                k = int(number[:9])
+                return self.view(k, self.clicked.get(self._picture(k)))
+        return None
+
+    def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
+        """Try or save the clicked `points` of a picture."""
+        match steps:
+            case ["try", number] if number.isdigit():
+                k = int(number[:9])
+                return self.view(k, self._checked(self._picture(k), asked.get("points")))
+            case ["save", number] if number.isdigit():
+                return self.save(int(number[:9]), asked.get("points"))
+        return None
+
+    def state(self) -> Json:
+        """Return what the page begins with."""
+        width, height = self.document.keys.image_size
+        return {
+            "file": str(self.path),
+            "width": width,
+            "height": height,
+            "fiducials": dict(zip(FIDUCIALS, self.plate.fiducials, strict=True)),
+            "pictures": [
+                {"name": picture.path.name, "camera": picture.camera, "pose": self.document.poses[picture.row]}
+                for picture in self.document.pictures
+            ],
+        }
+
+    def view(self, number: int, clicked: NDArray[np.float64] | None) -> Json:
+        """Return what a picture shows with these clicked places, None or (2 or 3, 2) px: all dots with their radii,
+        those that are identified, the fiducials among them, and why it is not tied.
+        """
+        picture = self._picture(number)
+        with self.lock:
+            if picture not in self.dots:
+                self.dots[picture] = find_dots(self._grey(picture), dark=self.plate.dark)
+            dots = self.dots[picture]
+        view = index_dots(dots, self.plate, picture.path.name, clicked)
+        return {
+            "tied": view.state == "tied",
+            "reason": view.reason,
+            "dots": np.column_stack([dots.uv_px, np.sqrt(dots.area_px / np.pi)]).round(2).tolist(),
+            "points": view.uv_px.round(2).tolist() if view.state == "tied" else [],
+            "fiducials": self._fiducials(view),
+            "clicked": None if clicked is None else clicked.tolist(),
+        }
+
+    def save(self, number: int, points: Any) -> Json:
+        """Write clicked places into the file; return the view with them.
+
+        Raises:
+            CameraError: impossible places, places that do not tie the picture, or a file that cannot be changed safely.
+            OutputError: the file cannot be written.
+        """
+        picture = self._picture(number)
+        clicked = self._checked(picture, points).round(1)
+        view = self.view(number, clicked)
+        if not view["tied"]:
+            raise CameraError(view["reason"])
+        pose, camera = self.document.poses[picture.row], picture.camera
+        with self.lock:
+            entries = self._entries()
+            here = [k for k, entry in enumerate(entries) if entry.get("pose") == pose and camera in entry]
+            by_hand = f"write clicked: {{{camera}: {clicked.tolist()}}} into the entry of pose {pose}"
+            if len(here) != 1:
+                expected = f"one entry with pose {pose} and {camera}"
+                raise CameraError(refusal(f"{self.path}, pictures", expected=expected, got=f"{len(here)}", do=by_hand))
+            old = entries[here[0]].get("clicked") or {}
+            self.write(["pictures", here[0], "clicked"], old | {camera: clicked.tolist()}, by_hand)
+            self.clicked[picture] = clicked
+        return view
+
+    def _entries(self) -> list[Mapping[str, Any]]:
+        content = self.read()  # a person may have changed it since
+        entries = content.get("pictures") if isinstance(content, dict) else None
+        return [entry if isinstance(entry, dict) else {} for entry in entries] if isinstance(entries, list) else []
+
+    def _fiducials(self, view: PlateView) -> list[list[float] | None]:
+        if view.state != "tied":
+            return [None] * len(FIDUCIALS)
+        at = [np.flatnonzero((view.index == mark).all(axis=1)) for mark in self.plate.fiducials]
+        return [view.uv_px[k[0]].round(2).tolist() if len(k) else None for k in at]
+
+    def _grey(self, picture: Picture) -> NDArray[Any]:
+        return read_plate_picture(picture.path, self.document.keys.image_size)
+
+    def _checked(self, picture: Picture, points: Any) -> NDArray[np.float64]:
+        return checked_clicks(points, self.document.keys.image_size, f"{picture.path.name}, clicked")
+
+    def _picture(self, number: int) -> Picture:
+        count = len(self.document.pictures)
+        if number >= count:
+            expected = f"0 .. {count - 1}"
+            raise CameraError(refusal(f"picture {number}", expected=expected, got=str(number), do="choose another"))
+        return self.document.pictures[number]

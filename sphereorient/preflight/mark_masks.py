@@ -1,0 +1,235 @@
+"""Masks that people draw in the browser: what hides the ball; saved beside the experiment."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient.errors import ExperimentError, MovieError, refusal
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.experiment import Experiment, open_movies
+from sphereorient.experiment.stream import given_mask
+from sphereorient.files.picture import write_picture
+from sphereorient.movies import Movie, flipped_picture
+from sphereorient.preflight.first_look import FirstLook, look_at_movie
+from sphereorient.preflight.mark import Json, Marking, eight_bits, png
+from sphereorient.search import GreySearch, crop_disk
+from sphereorient.sphere import load_texture, orthographic_view
+
+MOST_SHAPES = 200
+FAR_PX = 1e5
+
+
+class MaskMarking(Marking):
+    """An experiment whose masks are drawn."""
+
+    page = "mark_masks.html"
+    error = ExperimentError
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.experiment: Experiment = load_experiment(self.path)
+        self.movies: dict[str, Movie] = open_movies(self.experiment)
+        self.masks = {name: given_mask(self.experiment, name, movie.frame_shape) for name, movie in self.movies.items()}
+
+    @cached_property
+    def looks(self) -> dict[str, FirstLook]:
+        """What each movie shows without any mask drawn here."""
+        return {name: look_at_movie(name, movie, self.masks[name]) for name, movie in self.movies.items()}
+
+    def shown(self, steps: Sequence[str]) -> bytes | Json | None:
+        """Return the state, a frame, a mask, an outline or a rendered ball."""
+        match steps:
+            case ["state"]:
+                return self.state()
+            case ["frame", name, number] if number.isdigit():
+                return self.frame(name, int(number[:9]))
+            case ["mask", name]:
+                return self.mask(name)
+            case ["outline", name]:
+                return self.outline(name)
+            case ["rendered", name]:
+                return self.rendered(name)
+        return None
+
+    def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
+        """Save the mask of a camera, of `shapes` and `keep`."""
+        match steps:
+            case ["save", name]:
+                if not {"shapes", "keep"} <= set(asked):
+                    raise _refused("request", "shapes and keep, as JSON", "another thing")
+                return self.save(name, asked["shapes"], keep=bool(asked["keep"]))
+        return None
+
+    def state(self) -> Json:
+        """Return what the page begins with."""
+        return {
+            "experiment": str(self.path),
+            "cameras": [
+                {
+                    "name": name,
+                    "movie": Path(movie.path).name,
+                    "frames": len(movie),
+                    "height": movie.frame_shape[0],
+                    "width": movie.frame_shape[1],
+                }
+                for name, movie in self.movies.items()
+            ],
+        }
+
+    def frame(self, name: str, number: int) -> bytes:
+        """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
+        movie = self._movie(name)
+        if not 0 <= number < len(movie):
+            raise MovieError(
+                refusal(f"frame {number}", expected=f"0 .. {len(movie) - 1}", got=str(number), do="choose another")
+            )
+        with self.lock:
+            picture = movie.sample([number])[0]
+        return png(eight_bits(picture))
+
+    def mask(self, name: str) -> bytes:
+        """Return what is hidden now as PNG: red, half transparent, where the mask is black."""
+        height, width = self._movie(name).frame_shape
+        shown = self.masks[name]
+        picture = np.zeros((height, width, 4), np.uint8)
+        if shown is not None:
+            picture[~shown] = (0, 0, 255, 110)
+        return png(picture)
+
+    def outline(self, name: str) -> Json:
+        """Return the ball as a first look finds it in this movie: where, how large, and whether it stays."""
+        self._movie(name)
+        with self.lock:
+            look = self.looks[name]
+        if look.outline is None:
+            return {"found": False}
+        u, v, radius = look.outline.u_px, look.outline.v_px, look.outline.radius_px
+        return {"found": True, "u": u, "v": v, "radius": radius, "stays": look.stays, "frame": look.frame}
+
+    def rendered(self, name: str) -> Json:
+        """Return the ball of `outline` as the texture map says it looks: a picture, and how much of it is explained.
+
+        Raises:
+            ExperimentError: no map, no ball, or none that the map explains.
+            TextureError: the map cannot be read.
+        """
+        ball = self.outline(name)
+        if not ball["found"]:
+            do = "draw what hides it, or choose another camera"
+            raise ExperimentError(refusal(name, expected="a ball", got="none in this movie", do=do))
+        with self.lock:
+            look, search = self.looks[name], self._search
+            u, v, radius = ball["u"], ball["v"], ball["radius"]
+            disk = torch.from_numpy(crop_disk(look.picture, u, v, radius, search.size_px))
+            found = search.propose(disk[None])
+            if not len(found.score):
+                do = "another ball, or the map of another one, looks like this"
+                raise ExperimentError(refusal(name, expected="a ball that the map explains", got="none", do=do))
+            size = max(2, round(2 * radius))
+            view = orthographic_view(size)
+            grey = view.render(self._texture, found.R_view_body[0].float()).clamp(0, 1).numpy()
+        height, width = look.movie.frame_shape
+        left, top = round(u - size / 2 + 0.5), round(v - size / 2 + 0.5)
+        picture = np.zeros((height + 2 * size, width + 2 * size, 4), np.uint8)  # wider: the ball may leave the picture
+        place = picture[top + size : top + 2 * size, left + size : left + 2 * size]
+        place[..., :3] = (255 * grey[..., None]).astype(np.uint8)
+        place[..., 3] = 255 * view.inside.numpy()
+        inside = picture[size : size + height, size : size + width]
+        content = base64.b64encode(png(np.ascontiguousarray(inside))).decode()
+        return ball | {"explained": 100 * float(found.score[0]), "picture": f"data:image/png;base64,{content}"}
+
+    @cached_property
+    def _texture(self) -> torch.Tensor:
+        path = self.experiment.texture_path
+        if path is None or not path.exists():
+            do = f"learn it: `sphereorient map {self.path.name} --out texture.png`"
+            raise ExperimentError(refusal("sphere.texture", expected="a texture map", got=f"{path or 'none'}", do=do))
+        return load_texture(path)
+
+    @cached_property
+    def _search(self) -> GreySearch:
+        return GreySearch(self._texture)
+
+    def save(self, name: str, shapes: Sequence[Mapping[str, Any]], *, keep: bool) -> Json:
+        """Write the mask of a camera and name it in experiment.yaml; return what was done.
+        Shapes hide (`hide`) or are all that is shown (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px.
+        `keep`: what the old mask hides stays hidden.
+
+        Raises:
+            ExperimentError: impossible shapes, or nothing would be shown.
+            OutputError: a file cannot be written.
+        """
+        height, width = self._movie(name).frame_shape
+        old = self.masks[name] if keep else None
+        shown = drawn_mask((height, width), shapes, old)
+        flip = self.experiment.flip.get(name, "none")
+        file = self.path.parent / f"{name}_mask.png"
+        with self.lock:
+            write_picture(file, flipped_picture(np.where(shown, 255, 0).astype(np.uint8), flip))
+            self._name_mask(name, file.name)
+            self.masks[name] = shown
+            vars(self).pop("looks", None)
+        return {"file": str(file), "hidden": 100 * float(np.mean(~shown))}
+
+    def _name_mask(self, name: str, file: str) -> None:
+        masks = dict((self.read() or {}).get("masks") or {})
+        if masks.get(name) != file:
+            self.write(["masks"], masks | {name: file}, f"write masks: {{{name}: {file}}} there")
+
+    def _movie(self, name: str) -> Movie:
+        if name not in self.movies:
+            expected, do = ", ".join(self.movies), "choose one of these"
+            raise ExperimentError(refusal("camera", expected=expected, got=repr(name)[:40], do=do))
+        return self.movies[name]
+
+
+def drawn_mask(
+    size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """Return what a mask (H, W) shows after shapes are drawn, see `MaskMarking.save`; ExperimentError for others."""
+    if not isinstance(shapes, list | tuple) or len(shapes) > MOST_SHAPES:
+        raise _refused("shapes", f"at most {MOST_SHAPES} of them", "another thing")
+    hidden = np.zeros(size, np.uint8)
+    region = np.zeros(size, np.uint8)
+    for shape in shapes:
+        kind = shape.get("kind") if isinstance(shape, Mapping) else None
+        if kind not in ("hide", "show"):
+            raise _refused("kind", "hide or show", repr(kind)[:40])
+        target = hidden if kind == "hide" else region
+        if "points" in shape:
+            points = _numbers(shape["points"], "points")
+            if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+                raise _refused("points", "three pairs u, v or more", str(points.shape))
+            cv2.fillPoly(target, [np.rint(points).astype(np.int32)], 255)
+        else:
+            u, v, radius = _numbers([shape.get(key) for key in ("u", "v", "radius")], "circle")
+            cv2.circle(target, (round(u), round(v)), max(round(radius), 1), 255, cv2.FILLED)
+    shown = hidden == 0
+    if any(shape["kind"] == "show" for shape in shapes):
+        shown &= region > 0
+    if old is not None:
+        shown &= old
+    if not shown.any():
+        raise _refused("mask", "a part of the picture that is shown", "all of it hidden")
+    return np.asarray(shown)
+
+
+def _numbers(values: object, name: str) -> NDArray[np.float64]:
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise _refused(name, "numbers, px", repr(values)[:40]) from None
+    if not (np.isfinite(array).all() and (np.abs(array) < FAR_PX).all()):
+        raise _refused(name, f"numbers below {FAR_PX:g} px", repr(values)[:40])
+    return array
+
+
+def _refused(name: str, expected: str, got: str) -> ExperimentError:
+    return ExperimentError(refusal(name, expected=expected, got=got, do="draw it again"))
