@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, echo_lines
+from sphereorient.cli.app import app, command_line
 from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import SettingsError, refusal
 
 if TYPE_CHECKING:
     from sphereorient.experiment.recording import Recording
     from sphereorient.live.feed import Arrival
+    from sphereorient.live.live import Measured
     from sphereorient.live.outputs import Output
 
 WAITING = 16  # frames of a camera that wait at most
@@ -35,7 +36,7 @@ def live(
     to: Annotated[
         list[str] | None,
         typer.Option(
-            help="FicTrac's line to tcp:PORT (a server), udp:PORT, a new .dat file; JSON to a new .jsonl; repeatable."
+            help="FicTrac's line to tcp:PORT (a server), udp:PORT, .dat; JSON to .jsonl; track.h5. Repeatable."
         ),
     ] = None,
     learnt: Annotated[
@@ -51,20 +52,26 @@ def live(
     The experiment's movies, of the same set-up, show the empty scene and the light.
     """
     from sphereorient.live.feed import Feed
-    from sphereorient.live.lines import FicTracLines, json_line
+    from sphereorient.live.lines import FicTracLines
     from sphereorient.live.live import measured
-    from sphereorient.live.outputs import FileOutput
     from sphereorient.live.prepare import open_live
+    from sphereorient.live.track import TrackBlocks, TrackOutput
 
     chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
     _check_source(source)
     outputs = [_output(name) for name in to or []]
-    table = any(kind != "jsonl" for kind, _ in outputs)
+    table = any(kind not in ("jsonl", "h5") for kind, _ in outputs)
     count = lost = 0
     latency_ms: deque[float] = deque(maxlen=KEPT)
     try:
-        with open_live(experiment, chosen, named, learnt) as (recording, tracker, views):
+        with open_live(experiment, chosen, named, learnt) as (recording, tracker, appearance):
+            views = appearance.fitter.views
             lines = FicTracLines(views[0].camera)
+            for _, output in outputs:
+                if isinstance(output, TrackOutput):
+                    even = source.startswith(("movie", "-"))
+                    blocks = TrackBlocks(recording=recording, appearance=appearance, even=even)
+                    output.begin(blocks, blocks.head(chosen, command_line()))
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
             feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"))
@@ -73,7 +80,7 @@ def live(
                     for now in measured(tracker, views, feed):
                         line = lines.line(now) if table else ""
                         for kind, output in outputs:
-                            output.send(json_line(now) if kind == "jsonl" else line if kind == "dat" else f"FT, {line}")
+                            output.send(_worded(kind, now, line))
                         count, lost = count + 1, lost + (not now.valid)
                         latency_ms.append(1e3 * now.latency_s)
             finally:
@@ -81,14 +88,24 @@ def live(
     finally:
         for _, output in outputs:
             output.close()
-    faults = [output.fault for _, output in outputs if isinstance(output, FileOutput) and output.fault]
-    echo_lines(f"note: {fault}" for fault in faults)
     if quiet:
         return
     order = sorted(latency_ms) or [0.0]
     middle, slow = (order[int(share * (len(order) - 1))] for share in (0.5, 0.99))
     typer.echo(f"{count} frames, {lost} without a pose, {feed.dropped} dropped")
     typer.echo(f"latency of the last {len(order)}: {middle:.1f} ms (median), {slow:.1f} ms (99 %)")
+
+
+def _tell(line: str) -> None:
+    typer.echo(f"note: {line}", err=True)
+
+
+def _worded(kind: str, now: "Measured", line: str) -> object:
+    from sphereorient.live.lines import json_line
+
+    if kind == "h5":
+        return now
+    return json_line(now) if kind == "jsonl" else line if kind == "dat" else f"FT, {line}"
 
 
 def _check_source(name: str) -> None:
@@ -117,6 +134,7 @@ def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
 
 def _output(name: str) -> "tuple[str, Output]":
     from sphereorient.live.outputs import HOST, FileOutput, TcpOutput, UdpOutput
+    from sphereorient.live.track import TrackOutput
 
     kind, colon, address = name.partition(":")
     if kind in ("tcp", "udp") and colon:
@@ -126,6 +144,10 @@ def _output(name: str) -> "tuple[str, Output]":
             return kind, (TcpOutput if kind == "tcp" else UdpOutput)(where, int(port))
     suffix = Path(name).suffix.removeprefix(".")
     if suffix in ("dat", "jsonl"):
-        return suffix, FileOutput(Path(name))
-    do = "choose one of these; another machine is tcp:HOST:PORT"
-    raise SettingsError(refusal("--to", expected="tcp:PORT, udp:PORT, NAME.dat or NAME.jsonl", got=name, do=do))
+        return suffix, FileOutput(Path(name), _tell)
+    if suffix == "h5":
+        return suffix, TrackOutput(Path(name), _tell)
+    expected = "tcp:PORT, udp:PORT, NAME.dat, NAME.jsonl or NAME.h5"
+    raise SettingsError(
+        refusal("--to", expected=expected, got=name, do="choose one of these; another machine is tcp:HOST:PORT")
+    )
