@@ -5,6 +5,7 @@ import sys
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -74,7 +75,7 @@ def live(
                     output.begin(blocks, blocks.head(chosen, command_line()))
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
-            feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"))
+            feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"), tell=_tell)
             try:
                 with suppress(KeyboardInterrupt):
                     for now in measured(tracker, views, feed):
@@ -116,7 +117,7 @@ def _check_source(name: str) -> None:
 
 
 def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
-    from sphereorient.live.feed import camera_frames, movie_frames, rate_of, raw_frames
+    from sphereorient.live.feed import camera_pictures, device_frames, movie_frames, rate_of, raw_frames
     from sphereorient.live.shared import shared_frames
 
     if name in ("movie", "movie-fast"):
@@ -129,7 +130,9 @@ def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
     if len(recording.streams) > 1:
         do = "add --cameras with one name"
         raise SettingsError(refusal("--source", expected="one camera", got=f"{len(recording.streams)}", do=do))
-    return camera_frames(int(number) if number.isdigit() else number, recording.streams[0])
+    device = int(number) if number.isdigit() else number
+    again = None if Path(number).is_file() else _tell  # a movie ends
+    return device_frames(f"camera {number}", partial(camera_pictures, device), recording.streams[0], again)
 
 
 def _output(name: str) -> "tuple[str, Output]":

@@ -10,12 +10,12 @@ from threading import Condition, Thread
 from typing import IO, Any, Protocol
 
 from sphereorient.errors import OutputError, error_words, refusal
+from sphereorient.live.feed import Tell
 
 HOST = "127.0.0.1"
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
 MOST_ROWS = 100_000  # likewise, for a disk: minutes
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
-Tell = Callable[[str], object]  # gets what went wrong, in one line
 
 
 class Output(Protocol):

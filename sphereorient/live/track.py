@@ -16,8 +16,9 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
 from sphereorient.follow import Appearance
 from sphereorient.follow.poses import Poses, no_pose, pose_table
+from sphereorient.live.feed import Tell
 from sphereorient.live.live import Measured
-from sphereorient.live.outputs import DISK_S, MOST_ROWS, Spool, Tell, check_new
+from sphereorient.live.outputs import DISK_S, MOST_ROWS, Spool, check_new
 from sphereorient.methods.results import measured_track, with_lasting_errors, with_systematic_errors
 from sphereorient.methods.settings import Settings, settings_yaml
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory, journal

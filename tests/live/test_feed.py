@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import io
+import re
+import time
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
 from threading import Event
 
 import numpy as np
@@ -12,7 +16,7 @@ from live_examples import EXCERPT, LIMIT_S, arrivals
 
 from sphereorient.errors import MovieError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.live.feed import Arrival, Feed, camera_frames, movie_frames, raw_frames
+from sphereorient.live.feed import Arrival, Feed, camera_pictures, device_frames, movie_frames, raw_frames
 from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
 
 
@@ -116,15 +120,93 @@ class FakeDevice:
         self.released = True
 
 
-def test_a_camera_gives_grey_pictures_of_the_size_of_the_movie(recording):
-    stream = recording.streams[0]
-    height, width = stream.movie.frame_shape
-    colour = np.dstack([np.full((height, width), value, np.uint8) for value in (10, 20, 30)])  # blue, green, red
+@pytest.fixture
+def stream(recording):
+    return recording.streams[0]
+
+
+def grey(stream, value: int = 7) -> np.ndarray:
+    return np.full(stream.movie.frame_shape, value, np.uint8)
+
+
+def frames_of(stream, *devices: FakeDevice, tell=None) -> Iterator[Arrival]:
+    waiting = list(devices)
+    return device_frames("camera 0", lambda: camera_pictures(0, lambda number: waiting.pop(0)), stream, tell)
+
+
+def test_a_camera_gives_grey_pictures_of_the_size_of_the_movie(stream):
+    colour = np.dstack([grey(stream, value) for value in (10, 20, 30)])  # blue, green, red
     device = FakeDevice([colour, colour[..., 0]])
-    first, second = camera_frames(0, stream, lambda number: device)
+    first, second = frames_of(stream, device)
     assert (int(first.pictures[0][0, 0]), int(second.pictures[0][0, 0])) == (22, 10)
     assert device.released
     with pytest.raises(MovieError, match="px"):
-        list(camera_frames(0, stream, lambda number: FakeDevice([colour[:-1]])))
+        list(frames_of(stream, FakeDevice([colour[:-1]])))
     with pytest.raises(MovieError, match="none that opens"):
-        list(camera_frames(0, stream, lambda number: FakeDevice([], opens=False)))
+        list(frames_of(stream, FakeDevice([], opens=False)))
+
+
+def test_a_camera_that_ends_or_changes_its_pictures_is_told_once_and_taken_up_again(stream, monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.AGAIN_S", 0.001)
+    told: list[str] = []
+    devices = [
+        FakeDevice([grey(stream), grey(stream)]),
+        FakeDevice([], opens=False),
+        FakeDevice([], opens=False),
+        FakeDevice([grey(stream)]),
+        FakeDevice([grey(stream)[:-1]]),
+        FakeDevice([grey(stream)]),
+    ]
+    frames = frames_of(stream, *devices, tell=told.append)
+    found = [next(frames) for _ in range(4)]
+    assert [one.number for one in found] == [0, 1, 2, 3]
+    assert all(a.time_s < b.time_s for a, b in pairwise(found))
+    assert [line.split(";")[0] for line in told] == [
+        "camera 0: no picture comes any more. It is opened again each second.",
+        "camera 0: pictures come again.",
+        "camera 0: no picture comes any more. It is opened again each second.",
+        "camera 0: pictures come again.",
+    ]
+    assert all(device.released for device in devices[:5])
+
+
+def test_a_camera_that_changes_its_size_is_told(stream, monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.AGAIN_S", 0.001)
+    told: list[str] = []
+    devices = [FakeDevice([grey(stream), grey(stream)[:-1]]), FakeDevice([grey(stream)])]
+    frames = frames_of(stream, *devices, tell=told.append)
+    assert [next(frames).number for _ in range(2)] == [0, 1]
+    assert "px, got" in told[0]
+    assert told[1] == "camera 0: pictures come again."
+
+
+def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.STALLED_S", 0.02)
+    told: list[str] = []
+    goes_on = Event()
+
+    def source() -> Iterator[Arrival]:
+        yield from arrivals(3)
+        goes_on.wait(LIMIT_S)
+        yield from arrivals(3)
+
+    found = []
+    for arrival in Feed(source(), 10, wait=True, tell=lambda line: (told.append(line), goes_on.set())):
+        found.append(arrival.number)
+    assert found == [0, 1, 2, 0, 1, 2]
+    assert re.fullmatch(r"source: no frame for 0\.\d s; tracking waits\.", told[0])
+    assert re.fullmatch(r"source: frames come again, after 0\.\d s\.", told[1])
+    assert len(told) == 2
+
+
+def test_a_slow_source_does_not_stall(monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.STALLED_S", 0.005)
+    told: list[str] = []
+
+    def source() -> Iterator[Arrival]:
+        for arrival in arrivals(8):
+            time.sleep(0.02)
+            yield replace(arrival, arrived_s=time.perf_counter())
+
+    list(Feed(source(), 10, wait=True, tell=told.append))
+    assert len(told) <= 4  # before the second frame nothing is known of the rate
