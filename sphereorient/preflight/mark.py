@@ -6,26 +6,25 @@ The server answers this machine alone, to who knows the random token of its addr
 import base64
 import json
 import re
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
 from typing import Any
-from urllib.parse import unquote
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.errors import ExperimentError, MovieError, SphereOrientError, refusal
+from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import Experiment, open_movies
 from sphereorient.experiment.stream import given_mask
+from sphereorient.files.page_server import HOST, PageHandler, new_token
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import read_text, write_text, writing
 from sphereorient.files.yaml_file import FAULTS, parse_yaml
@@ -34,7 +33,6 @@ from sphereorient.preflight.first_look import FirstLook, look_at_movie
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
-HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("mark.html")
 MOST_BYTES, MOST_SHAPES = 1_000_000, 200
 FAR_PX = 1e5
@@ -46,7 +44,7 @@ class Marking:
     """An experiment whose masks are drawn; the handler of requests calls it from several threads."""
 
     path: Path
-    token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
+    token: str = field(default_factory=new_token)
     lock: Lock = field(default_factory=Lock)
 
     def __post_init__(self) -> None:
@@ -257,8 +255,8 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
     """Return a server of the page on this machine; call `serve_forever`. Port 0: any free one."""
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
+    class Handler(PageHandler):
+        token = marking.token
 
         def do_GET(self) -> None:
             match self._steps():
@@ -297,40 +295,5 @@ def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
             except (ValueError, TypeError, KeyError):
                 raise _refused("request", "shapes and keep, as JSON", "another thing") from None
             return marking.save(name, shapes, keep=keep)
-
-        def _steps(self) -> list[str] | None:
-            """Return the parts of the path behind the token; None for who does not know it, or another host's page."""
-            host = self.headers.get("Host", "").rpartition(":")[0]
-            first, *steps = self.path.partition("?")[0].lstrip("/").split("/")
-            known = secrets.compare_digest(first.encode(), marking.token.encode())
-            return [unquote(step) for step in steps] if known and host in (HOST, "localhost") else None
-
-        def _picture(self, make: Any) -> None:
-            try:
-                self._send(make(), "image/png")
-            except SphereOrientError as error:
-                self._fail(error)
-
-        def _json(self, make: Any) -> None:
-            try:
-                self._send(json.dumps(make()).encode(), "application/json")
-            except SphereOrientError as error:
-                self._fail(error)
-
-        def _fail(self, error: SphereOrientError) -> None:
-            content = json.dumps({"error": str(error)}).encode()
-            self._send(content, "application/json", HTTPStatus.BAD_REQUEST)
-
-        def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, form: str, *values: object) -> None:
-            """Print nothing: the page tells what happens."""
 
     return ThreadingHTTPServer((HOST, port), Handler)
