@@ -2,7 +2,6 @@
 
 import gc
 import sys
-from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, command_line
+from sphereorient.cli.app import app, command_line, echo_lines
 from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import SettingsError, refusal
 
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from sphereorient.live.outputs import Output
 
 WAITING = 16  # frames of a camera that wait at most
-KEPT = 1000  # latencies
 
 
 @app.command()
@@ -43,6 +41,10 @@ def live(
     learnt: Annotated[
         Path | None, typer.Option(help="What `track --save-learnt` kept of this set-up: begins without looking again.")
     ] = None,
+    page: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port of a page that shows all this in a browser; 0: any free one."),
+    ] = None,
     cameras: Cameras = None,
     settings: SettingsPath = None,
     set_: Overrides = None,
@@ -53,8 +55,10 @@ def live(
     The experiment's movies, of the same set-up, show the empty scene and the light.
     """
     from sphereorient.live.feed import Feed
-    from sphereorient.live.lines import FicTracLines
+    from sphereorient.live.lines import FicTracLines, fictrac_line
     from sphereorient.live.live import measured
+    from sphereorient.live.monitor import Monitor
+    from sphereorient.live.page import LivePage, address, open_page
     from sphereorient.live.prepare import open_live
     from sphereorient.live.track import TrackBlocks, TrackOutput
 
@@ -62,8 +66,10 @@ def live(
     _check_source(source)
     outputs = [_output(name) for name in to or []]
     table = any(kind not in ("jsonl", "h5") for kind, _ in outputs)
-    count = lost = 0
-    latency_ms: deque[float] = deque(maxlen=KEPT)
+    shown = LivePage()
+    server = None if page is None else open_page(shown, page)
+    if server is not None:
+        typer.echo(f"page: {address(shown, server)}", err=True)
     try:
         with open_live(experiment, chosen, named, learnt) as (recording, tracker, appearance):
             views = appearance.fitter.views
@@ -76,25 +82,26 @@ def live(
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
             feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"), tell=_tell)
+            monitor = Monitor(feed)
+            shown.views, shown.radius_mm, shown.monitor = views, recording.experiment.radius_mm, monitor
             try:
                 with suppress(KeyboardInterrupt):
-                    for now in measured(tracker, views, feed):
-                        line = lines.line(now) if table else ""
+                    for now in measured(tracker, views, monitor):
+                        columns = lines.columns(now) if table or server is not None else None
+                        line = fictrac_line(columns) if table and columns is not None else ""
                         for kind, output in outputs:
                             output.send(_worded(kind, now, line))
-                        count, lost = count + 1, lost + (not now.valid)
-                        latency_ms.append(1e3 * now.latency_s)
+                        monitor.saw(now, columns)
             finally:
                 feed.close()
     finally:
         for _, output in outputs:
             output.close()
-    if quiet:
-        return
-    order = sorted(latency_ms) or [0.0]
-    middle, slow = (order[int(share * (len(order) - 1))] for share in (0.5, 0.99))
-    typer.echo(f"{count} frames, {lost} without a pose, {feed.dropped} dropped")
-    typer.echo(f"latency of the last {len(order)}: {middle:.1f} ms (median), {slow:.1f} ms (99 %)")
+        if server is not None:
+            server.shutdown()
+            server.server_close()
+    if not quiet:
+        echo_lines(monitor.summary())
 
 
 def _tell(line: str) -> None:

@@ -14,7 +14,7 @@ from overlay_examples import true_track
 
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera
-from sphereorient.live.lines import FicTracLines, json_line
+from sphereorient.live.lines import FicTracLines, fictrac_line, json_line
 from sphereorient.report.export_poses import fictrac_table
 from sphereorient.trajectory import Trajectory
 
@@ -39,7 +39,7 @@ def test_lines_are_the_rows_of_the_exported_table(track):
         T_cam_lab_mm=torch.zeros(3),
     )
     table, lines = fictrac_table(track, camera), FicTracLines(camera)
-    found = np.array([[float(part) for part in lines.line(now).split(", ")] for now in rows(track)])
+    found = np.array([[float(part) for part in fictrac_line(lines.columns(now)).split(", ")] for now in rows(track)])
     assert found.shape == (len(track), 25)
     rest = [k for k in range(25) if k != 4]  # the stated error is another one here
     np.testing.assert_allclose(found[:, rest], table[:, rest], atol=1e-9)
