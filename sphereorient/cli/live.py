@@ -2,7 +2,7 @@
 
 import gc
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -29,13 +29,13 @@ def live(
     source: Annotated[
         str,
         typer.Option(
-            help="movie: the experiment's, at its rate; movie-fast; -: raw pictures on stdin; camera:0; shared:FILE."
+            help="movie: the experiment's, at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE."
         ),
     ] = "movie",
     to: Annotated[
         list[str] | None,
         typer.Option(
-            help="FicTrac's line to tcp:PORT (a server), udp:PORT, .dat; JSON to .jsonl; track.h5. Repeatable."
+            help="FicTrac's line to tcp:PORT, udp:PORT, .dat; JSON to zmq:PORT, .jsonl; a track to .h5. Repeatable."
         ),
     ] = None,
     learnt: Annotated[
@@ -65,7 +65,7 @@ def live(
     chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
     _check_source(source)
     outputs = [_output(name) for name in to or []]
-    table = any(kind not in ("jsonl", "h5") for kind, _ in outputs)
+    table = any(kind not in ("jsonl", "zmq", "h5") for kind, _ in outputs)
     shown = LivePage()
     server = None if page is None else open_page(shown, page)
     if server is not None:
@@ -113,51 +113,55 @@ def _worded(kind: str, now: "Measured", line: str) -> object:
 
     if kind == "h5":
         return now
-    return json_line(now) if kind == "jsonl" else line if kind == "dat" else f"FT, {line}"
+    return json_line(now) if kind in ("jsonl", "zmq") else line if kind == "dat" else f"FT, {line}"
 
 
 def _check_source(name: str) -> None:
-    kind, _, number = name.partition(":")
-    if name not in ("movie", "movie-fast", "-") and (kind not in ("camera", "shared") or not number):
-        expected, do = "movie, movie-fast, -, camera:NUMBER or shared:FILE", "choose one of these"
+    kind, _, where = name.partition(":")
+    if name not in ("movie", "movie-fast", "-") and (kind not in ("camera", "genicam", "shared") or not where):
+        expected = "movie, movie-fast, -, camera:NUMBER, genicam:PRODUCER.cti or shared:FILE"
+        do = "choose one of these"
         raise SettingsError(refusal("--source", expected=expected, got=name, do=do))
 
 
 def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
     from sphereorient.live.feed import camera_pictures, device_frames, movie_frames, rate_of, raw_frames
+    from sphereorient.live.genicam import genicam_pictures
     from sphereorient.live.shared import shared_frames
 
     if name in ("movie", "movie-fast"):
         return movie_frames(recording, paced=name == "movie")
     if name == "-":
         return raw_frames(sys.stdin.buffer, recording.streams, rate_of(recording))
-    kind, _, number = name.partition(":")
+    kind, _, where = name.partition(":")
     if kind == "shared":
-        return shared_frames(Path(number), recording.streams)
+        return shared_frames(Path(where), recording.streams)
     if len(recording.streams) > 1:
         do = "add --cameras with one name"
         raise SettingsError(refusal("--source", expected="one camera", got=f"{len(recording.streams)}", do=do))
-    device = int(number) if number.isdigit() else number
-    again = None if Path(number).is_file() else _tell  # a movie ends
-    return device_frames(f"camera {number}", partial(camera_pictures, device), recording.streams[0], again)
+    if kind == "genicam":
+        return device_frames(name, partial(genicam_pictures, where), recording.streams[0], _tell)
+    device = int(where) if where.isdigit() else where
+    again = None if Path(where).is_file() else _tell  # a movie ends
+    return device_frames(f"camera {where}", partial(camera_pictures, device), recording.streams[0], again)
 
 
 def _output(name: str) -> "tuple[str, Output]":
-    from sphereorient.live.outputs import HOST, FileOutput, TcpOutput, UdpOutput
+    from sphereorient.live.outputs import HOST, FileOutput, TcpOutput, UdpOutput, ZmqOutput
     from sphereorient.live.track import TrackOutput
 
     kind, colon, address = name.partition(":")
-    if kind in ("tcp", "udp") and colon:
+    sockets: dict[str, Callable[[str, int], Output]] = {"tcp": TcpOutput, "udp": UdpOutput, "zmq": ZmqOutput}
+    if kind in sockets and colon:
         host, between, port = address.rpartition(":")
         if port.isdigit() and int(port) < 1 << 16:
-            where = host if between else HOST
-            return kind, (TcpOutput if kind == "tcp" else UdpOutput)(where, int(port))
+            return kind, sockets[kind](host if between else HOST, int(port))
     suffix = Path(name).suffix.removeprefix(".")
     if suffix in ("dat", "jsonl"):
         return suffix, FileOutput(Path(name), _tell)
     if suffix == "h5":
         return suffix, TrackOutput(Path(name), _tell)
-    expected = "tcp:PORT, udp:PORT, NAME.dat, NAME.jsonl or NAME.h5"
+    expected = "tcp:PORT, udp:PORT, zmq:PORT, NAME.dat, NAME.jsonl or NAME.h5"
     raise SettingsError(
         refusal("--to", expected=expected, got=name, do="choose one of these; another machine is tcp:HOST:PORT")
     )

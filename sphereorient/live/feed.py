@@ -113,19 +113,19 @@ def device_frames(
     camera that ends, fails or changes its pictures after its first frame is opened again, each second.
 
     Raises:
-        MovieError: no camera, or pictures of another size than the experiment's movie.
+        MovieError: no camera, or pictures of another size or type than the experiment's movie.
     """
-    height, width = stream.movie.frame_shape
+    (height, width), kind = stream.movie.frame_shape, stream.movie.dtype
     begun, number, fault = time.perf_counter(), 0, ""
     while True:
         found = f"{name}: no picture comes any more."
         try:
             for picture in open_pictures():
                 arrived_s = time.perf_counter()
-                if picture.shape != (height, width):
-                    got = f"{picture.shape[1]} x {picture.shape[0]} px"
-                    do = "set the camera to the size of the movie that the experiment names"
-                    raise MovieError(refusal(name, expected=f"{width} x {height} px", got=got, do=do))
+                if (*picture.shape, picture.dtype) != (height, width, kind):
+                    got = f"{picture.shape[1]} x {picture.shape[0]} px {picture.dtype}"
+                    do = "set the camera to the size and depth of the movie that the experiment names"
+                    raise MovieError(refusal(name, expected=f"{width} x {height} px {kind}", got=got, do=do))
                 if fault and tell is not None:
                     tell(f"{name}: pictures come again.")
                 fault = ""

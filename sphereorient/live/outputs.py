@@ -1,4 +1,4 @@
-"""Where lines go: TCP, UDP, a file. A slow or dead reader loses lines; it never holds up who writes."""
+"""Where lines go: TCP, UDP, ZeroMQ, a file. A slow or dead reader loses lines; it never holds up who writes."""
 
 import socket
 from collections import deque
@@ -105,6 +105,43 @@ class UdpOutput:
     def close(self) -> None:
         """End."""
         self._socket.close()
+
+
+class ZmqOutput:
+    """A PUB socket of ZeroMQ: each program that subscribes gets all further lines, less those that it is too slow for.
+
+    Raises:
+        OutputError: the package pyzmq is missing, or the port is in use.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        name = f"zmq:{host}:{port}"
+        try:
+            import zmq
+        except ImportError:
+            do = "install it with `pip install 'sphereorient[live]'`"
+            raise OutputError(refusal(name, expected="the package pyzmq", got="none", do=do)) from None
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PUB)
+        self._socket.set_hwm(MOST_LINES)
+        self._socket.set(zmq.LINGER, round(1e3 * SOON_S))
+        try:
+            self.port = port or self._socket.bind_to_random_port(f"tcp://{host}")
+            if port:
+                self._socket.bind(f"tcp://{host}:{port}")
+        except zmq.ZMQError as error:
+            self._context.destroy(0)
+            do = "choose another port, or end the program that has it"
+            raise OutputError(refusal(name, expected="a free port", got=error_words(error), do=do)) from None
+
+    def send(self, line: str) -> None:
+        """Publish a line."""
+        self._socket.send_string(line)  # a PUB socket never waits
+
+    def close(self) -> None:
+        """Send what waits, and end."""
+        self._socket.close()
+        self._context.term()
 
 
 class TcpOutput:

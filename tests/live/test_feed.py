@@ -176,7 +176,7 @@ def test_a_camera_that_changes_its_size_is_told(stream, monkeypatch):
     devices = [FakeDevice([grey(stream), grey(stream)[:-1]]), FakeDevice([grey(stream)])]
     frames = frames_of(stream, *devices, tell=told.append)
     assert [next(frames).number for _ in range(2)] == [0, 1]
-    assert "px, got" in told[0]
+    assert "got 650 x 649 px" in told[0]
     assert told[1] == "camera 0: pictures come again."
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import socket
+import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 
@@ -11,7 +13,7 @@ import pytest
 from live_examples import LIMIT_S, until
 
 from sphereorient.errors import OutputError
-from sphereorient.live.outputs import MOST_LINES, FileOutput, Spool, TcpOutput, UdpOutput
+from sphereorient.live.outputs import MOST_LINES, FileOutput, Spool, TcpOutput, UdpOutput, ZmqOutput
 
 
 def test_a_tcp_reader_gets_lines_and_one_that_went_away_holds_nothing_up():
@@ -106,3 +108,66 @@ def test_a_disk_that_hangs_holds_nobody_up_and_what_is_lost_is_counted():
     going.set()
     spool.close()
     assert written == [0, 8, 9, 10]
+
+
+# --- ZeroMQ ---
+
+
+@pytest.fixture
+def published():
+    pytest.importorskip("zmq", reason="the extra `live`")
+    output = ZmqOutput("127.0.0.1", 0)
+    yield output
+    output.close()
+
+
+@contextmanager
+def subscribed(output: ZmqOutput, most: int = 0):
+    """A subscriber whose subscription has arrived."""
+    import zmq
+
+    with zmq.Context() as context, context.socket(zmq.SUB) as reader:
+        reader.set_hwm(most)
+        reader.set(zmq.RCVTIMEO, round(1e3 * LIMIT_S))
+        reader.connect(f"tcp://127.0.0.1:{output.port}")
+        reader.subscribe("")
+
+        def there() -> bool:
+            output.send("hello")
+            return bool(reader.poll(20))
+
+        until(there)
+        yield reader
+
+
+def test_zmq_subscribers_get_lines(published):
+    with subscribed(published) as one, subscribed(published) as two:
+        published.send('{"frame": 7}')
+        for reader in (one, two):
+            while (line := reader.recv_string()) == "hello":
+                pass
+            assert line == '{"frame": 7}'
+
+
+def test_a_zmq_subscriber_that_does_not_read_loses_lines_and_takes_no_time(published):
+    with subscribed(published, most=10) as reader:
+        begun = time.monotonic()
+        for k in range(50_000):
+            published.send(f"{k} {'x' * 1000}")
+        assert time.monotonic() - begun < LIMIT_S
+        count = 0
+        while reader.poll(200):
+            reader.recv_string()
+            count += 1
+        assert 0 < count < 50_000
+
+
+def test_a_zmq_port_in_use_is_told(published):
+    with pytest.raises(OutputError, match="expected a free port"):
+        ZmqOutput("127.0.0.1", published.port)
+
+
+def test_without_zeromq_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zmq", None)
+    with pytest.raises(OutputError, match=r"pip install 'sphereorient\[live\]'"):
+        ZmqOutput("127.0.0.1", 5555)
