@@ -17,6 +17,10 @@ from sphereorient.experiment.stream import CameraStream
 from sphereorient.movies.movie import luma
 
 Picture = NDArray[np.generic]
+Tell = Callable[[str], object]  # gets what is wrong, in one line
+AGAIN_S = 1.0  # between attempts to open a camera
+STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
+USUAL_FRAMES = 16  # over which the interval is averaged
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,44 +84,74 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
         number += 1
 
 
-def camera_frames(
-    device: int | str, stream: CameraStream, open_device: Callable[..., cv2.VideoCapture] = cv2.VideoCapture
-) -> Iterator[Arrival]:
-    """Yield frames of a camera that OpenCV knows by number or address, with the time of their arrival.
+def camera_pictures(
+    device: int | str, open_device: Callable[..., cv2.VideoCapture] = cv2.VideoCapture
+) -> Iterator[Picture]:
+    """Yield grey pictures of a camera that OpenCV knows by number or address, until it gives none.
 
     Raises:
-        MovieError: no such camera, or pictures of another size than the experiment's movie.
+        MovieError: no such camera.
     """
     capture = open_device(device)
-    height, width = stream.movie.frame_shape
     try:
         if not capture.isOpened():
             do = "connect it, or name another number"
             raise MovieError(refusal(f"camera {device}", expected="a camera", got="none that opens", do=do))
-        begun, number = time.perf_counter(), 0
         while True:
             there, picture = capture.read()
-            arrived_s = time.perf_counter()
             if not there:
                 return
-            if picture.shape[:2] != (height, width):
-                got = f"{picture.shape[1]} x {picture.shape[0]} px"
-                do = "set the camera to the size of the movie that the experiment names"
-                raise MovieError(refusal(f"camera {device}", expected=f"{width} x {height} px", got=got, do=do))
-            grey = picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
-            yield Arrival(number=number, time_s=arrived_s - begun, pictures=[grey], arrived_s=arrived_s)
-            number += 1
+            yield picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
     finally:
         capture.release()
 
 
+def device_frames(
+    name: str, open_pictures: Callable[[], Iterator[Picture]], stream: CameraStream, tell: Tell | None
+) -> Iterator[Arrival]:
+    """Yield frames of a camera with the time of their arrival. With `tell`, which gets what is wrong in one line, a
+    camera that ends, fails or changes its pictures after its first frame is opened again, each second.
+
+    Raises:
+        MovieError: no camera, or pictures of another size or type than the experiment's movie.
+    """
+    (height, width), kind = stream.movie.frame_shape, stream.movie.dtype
+    begun, number, fault = time.perf_counter(), 0, ""
+    while True:
+        found = f"{name}: no picture comes any more."
+        try:
+            for picture in open_pictures():
+                arrived_s = time.perf_counter()
+                if (*picture.shape, picture.dtype) != (height, width, kind):
+                    got = f"{picture.shape[1]} x {picture.shape[0]} px {picture.dtype}"
+                    do = "set the camera to the size and depth of the movie that the experiment names"
+                    raise MovieError(refusal(name, expected=f"{width} x {height} px {kind}", got=got, do=do))
+                if fault and tell is not None:
+                    tell(f"{name}: pictures come again.")
+                fault = ""
+                yield Arrival(number=number, time_s=arrived_s - begun, pictures=[picture], arrived_s=arrived_s)
+                number += 1
+        except MovieError as error:
+            if tell is None or not number:
+                raise
+            found = str(error)
+        if tell is None or not number:
+            return
+        if not fault:
+            tell(f"{found} It is opened again each second.")
+        fault = found
+        time.sleep(AGAIN_S)
+
+
 class Feed:
     """Reads a source in a thread. `most` frames wait at most: then the oldest is dropped, or with `wait` the source
-    waits. Iterating yields what is there, in order, and raises what the source raised.
+    waits. Iterating yields what is there, in order, and raises what the source raised. `tell` gets a line where no
+    frame comes for ten times the usual interval, a second at least, and one where they come again.
     """
 
-    def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool) -> None:
+    def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, tell: Tell = lambda line: None) -> None:
         self.dropped = 0
+        self._tell, self._usual_s, self._last_s = tell, 0.0, 0.0
         self._source, self._most, self._wait = source, most, wait
         self._waiting: deque[Arrival] = deque()
         self._changed = Condition()
@@ -136,6 +170,10 @@ class Feed:
                         self._waiting.popleft()
                         self.dropped += 1
                     self._waiting.append(arrival)
+                    if self._last_s:
+                        step_s = arrival.arrived_s - self._last_s
+                        self._usual_s += (step_s - self._usual_s) / USUAL_FRAMES if self._usual_s else step_s
+                    self._last_s = arrival.arrived_s
                     self._changed.notify_all()
                     if self._closed:
                         return
@@ -155,8 +193,7 @@ class Feed:
     def __iter__(self) -> Iterator[Arrival]:
         while True:
             with self._changed:
-                while not self._waiting and not self._ended:
-                    self._changed.wait()
+                self._await()
                 if not self._waiting:
                     break
                 arrival = self._waiting.popleft()
@@ -164,3 +201,17 @@ class Feed:
             yield arrival
         if self._fault is not None:
             raise self._fault
+
+    def _await(self) -> None:
+        """Wait for a frame or the end."""
+
+        def is_there() -> bool:
+            return bool(self._waiting) or self._ended
+
+        since = time.perf_counter()
+        if self._changed.wait_for(is_there, max(STALLED_S, STALLED_FRAMES * self._usual_s)):
+            return
+        self._tell(f"source: no frame for {time.perf_counter() - since:.1f} s; tracking waits.")
+        self._changed.wait_for(is_there)
+        if self._waiting:
+            self._tell(f"source: frames come again, after {time.perf_counter() - since:.1f} s.")

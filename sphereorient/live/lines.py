@@ -67,9 +67,10 @@ class FicTracLines:
             ]
         )
 
-    def line(self, now: Measured) -> str:
-        """Return the next frame as FicTrac writes it to a file."""
-        return ", ".join(f"{value:.{DIGITS}g}" for value in self.columns(now))
+
+def fictrac_line(columns: Floats) -> str:
+    """Return the columns of a frame as FicTrac writes them to a file."""
+    return ", ".join(f"{value:.{DIGITS}g}" for value in columns.tolist())
 
 
 def json_line(now: Measured) -> str:
@@ -88,10 +89,11 @@ def json_line(now: Measured) -> str:
         "reason": [str(why) for why in now.reason],
         "latency_ms": 1e3 * now.latency_s,
     }
-    return json.dumps({name: _known(value) for name, value in content.items()}, allow_nan=False)
+    return json.dumps({name: without_nan(value) for name, value in content.items()}, allow_nan=False)
 
 
-def _known(value: object) -> object:
+def without_nan(value: object) -> object:
+    """Return a number, or nested lists, with None, JSON's null, for NaN and infinity."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return [_known(part) for part in value] if isinstance(value, list) else value
+    return [without_nan(part) for part in value] if isinstance(value, list) else value

@@ -29,6 +29,7 @@ class Measured:
     R_lab_body: Floats  # (3, 3)
     covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm)
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
+    poses: Poses  # all that the fit says
     found: bool  # whether it was searched for: the first one, found again, or not where it was expected
     dropped: int  # frames since the one before that came too late
     latency_s: float  # from the picture's arrival to here
@@ -54,8 +55,7 @@ def measured(tracker: OnlineTracker, views: Sequence[CameraView], frames: Iterab
             for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
         ]
         poses, searched = tracker.next(arrival.time_s, shots)
-        there = poses if supported(poses) else None
-        yield _told(arrival, there, poses.reason, searched, arrival.number - number - 1)
+        yield _told(arrival, poses, searched, arrival.number - number - 1)
         before, number = shots, arrival.number
 
 
@@ -66,15 +66,17 @@ def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: Camer
     return screened(picture, None if before is None else before.shown, view.background)
 
 
-def _told(arrival: Arrival, poses: Poses | None, reason: tuple[Reason, ...], found: bool, dropped: int) -> Measured:
+def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int) -> Measured:
+    there = supported(poses)
     return Measured(
         number=arrival.number,
         time_s=arrival.time_s,
-        position_lab_mm=np.full(3, np.nan) if poses is None else poses.position_lab_mm[0].numpy(),
-        R_lab_body=np.full((3, 3), np.nan) if poses is None else poses.R_lab_body[0].numpy(),
-        covariance=LOST_COVARIANCE if poses is None else poses.covariance[0].numpy(),
-        reason=reason,
-        found=found and poses is not None,
+        position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
+        R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
+        covariance=poses.covariance[0].numpy() if there else LOST_COVARIANCE,
+        reason=poses.reason,
+        poses=poses,
+        found=found and there,
         dropped=dropped,
         latency_s=time.perf_counter() - arrival.arrived_s,
     )

@@ -1,34 +1,99 @@
-"""Where lines go: TCP, UDP, a file. A slow or dead reader loses lines; it never holds up who writes."""
+"""Where lines go: TCP, UDP, ZeroMQ, a file. A slow or dead reader loses lines; it never holds up who writes."""
 
 import socket
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
-from typing import IO, Protocol
+from typing import IO, Any, Protocol
 
 from sphereorient.errors import OutputError, error_words, refusal
+from sphereorient.live.feed import Tell
 
 HOST = "127.0.0.1"
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
-SOON_S = 1.0  # to write what waits, at the end
+MOST_ROWS = 100_000  # likewise, for a disk: minutes
+SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
 
 
 class Output(Protocol):
-    """Takes lines."""
+    """Takes lines, or frames."""
 
-    def send(self, line: str) -> None:
-        """Take a line, and return at once."""
+    def send(self, thing: Any, /) -> None:
+        """Take one, and return at once."""
 
     def close(self) -> None:
         """Write what waits, and end."""
 
 
+class Spool:
+    """Hands things to `write` in a thread of its own; of more than `most` that wait the oldest is lost.
+    After an OSError, which `faulty` gets, nothing more is written. `pause_s`: from one write to the next, at least.
+    """
+
+    def __init__(
+        self,
+        write: Callable[[list[Any]], object],
+        faulty: Callable[[OSError], object] = lambda error: None,
+        most: int = MOST_LINES,
+        pause_s: float = 0.0,
+    ) -> None:
+        self.gone = False
+        self.lost = 0
+        self._write, self._faulty, self._pause_s = write, faulty, pause_s
+        self._waiting: deque[Any] = deque(maxlen=most)
+        self._changed = Condition()
+        self._ends = False
+        self._thread = Thread(target=self._run, name="spool", daemon=True)
+        self._thread.start()
+
+    def send(self, thing: object) -> None:
+        """Take a thing, and return at once."""
+        with self._changed:
+            self.lost += len(self._waiting) == self._waiting.maxlen
+            self._waiting.append(thing)
+            self._changed.notify()
+
+    def close(self, limit_s: float = SOON_S) -> None:
+        """Write what waits, within a limit, and end."""
+        with self._changed:
+            self._ends = True
+            self._changed.notify()
+        self._thread.join(limit_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._ends)
+                if not self._waiting:
+                    return
+                things = list(self._waiting)
+                self._waiting.clear()
+            try:
+                self._write(things)
+            except OSError as error:
+                self.gone = True
+                self._faulty(error)
+                return
+            with self._changed:
+                self._changed.wait_for(lambda: self._ends, self._pause_s)
+
+
 class UdpOutput:
-    """A datagram a line, to one address."""
+    """A datagram a line, to one address.
+
+    Raises:
+        OutputError: no such host.
+    """
 
     def __init__(self, host: str, port: int) -> None:
-        self._to = host, port
+        try:
+            self._to = socket.gethostbyname(host), port  # once: a name server may take its time
+        except OSError as error:
+            do = "correct the name of the host"
+            raise OutputError(refusal(f"udp:{host}:{port}", expected="a host", got=error_words(error), do=do)) from None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
@@ -42,43 +107,41 @@ class UdpOutput:
         self._socket.close()
 
 
-class _Reader:
-    """One connection of a TCP output, written to in a thread of its own."""
+class ZmqOutput:
+    """A PUB socket of ZeroMQ: each program that subscribes gets all further lines, less those that it is too slow for.
 
-    def __init__(self, connection: socket.socket) -> None:
-        self._connection = connection
-        self._lines: deque[bytes] = deque(maxlen=MOST_LINES)
-        self._changed = Condition()
-        self.gone = self._ends = False
-        self._thread = Thread(target=self._write, name="reader", daemon=True)
-        self._thread.start()
+    Raises:
+        OutputError: the package pyzmq is missing, or the port is in use.
+    """
 
-    def send(self, line: bytes) -> None:
-        with self._changed:
-            self._lines.append(line)
-            self._changed.notify()
+    def __init__(self, host: str, port: int) -> None:
+        name = f"zmq:{host}:{port}"
+        try:
+            import zmq
+        except ImportError:
+            do = "install it with `pip install 'sphereorient[live]'`"
+            raise OutputError(refusal(name, expected="the package pyzmq", got="none", do=do)) from None
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PUB)
+        self._socket.set_hwm(MOST_LINES)
+        self._socket.set(zmq.LINGER, round(1e3 * SOON_S))
+        try:
+            self.port = port or self._socket.bind_to_random_port(f"tcp://{host}")
+            if port:
+                self._socket.bind(f"tcp://{host}:{port}")
+        except zmq.ZMQError as error:
+            self._context.destroy(0)
+            do = "choose another port, or end the program that has it"
+            raise OutputError(refusal(name, expected="a free port", got=error_words(error), do=do)) from None
+
+    def send(self, line: str) -> None:
+        """Publish a line."""
+        self._socket.send_string(line)  # a PUB socket never waits
 
     def close(self) -> None:
-        with self._changed:
-            self._ends = True
-            self._changed.notify()
-        self._thread.join(SOON_S)
-        self._connection.close()
-
-    def _write(self) -> None:
-        while True:
-            with self._changed:
-                while not self._lines and not self._ends:
-                    self._changed.wait()
-                if not self._lines:
-                    return
-                waiting = b"".join(self._lines)
-                self._lines.clear()
-            try:
-                self._connection.sendall(waiting)
-            except OSError:  # it went away; it may come back as another one
-                self.gone = True
-                return
+        """Send what waits, and end."""
+        self._socket.close()
+        self._context.term()
 
 
 class TcpOutput:
@@ -97,7 +160,7 @@ class TcpOutput:
                 refusal(f"tcp:{host}:{port}", expected="a free port", got=error_words(error), do=do)
             ) from None
         self.port = int(self._server.getsockname()[1])
-        self._readers: list[_Reader] = []
+        self._readers: list[tuple[socket.socket, Spool]] = []
         self._thread = Thread(target=self._accept, name="tcp", daemon=True)
         self._thread.start()
 
@@ -107,51 +170,68 @@ class TcpOutput:
                 connection, _ = self._server.accept()
             except OSError:  # closed
                 return
-            self._readers = [*(reader for reader in self._readers if not reader.gone), _Reader(connection)]
+            spool = Spool(partial(_send_all, connection))
+            self._readers = [*(reader for reader in self._readers if not reader[1].gone), (connection, spool)]
 
     def send(self, line: str) -> None:
         """Hand a line to all readers."""
-        for reader in self._readers:
-            reader.send(f"{line}\n".encode())
+        for _, spool in self._readers:
+            spool.send(line)
 
     def close(self) -> None:
         """End all connections."""
         with suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
-        for reader in self._readers:
-            reader.close()
+        for connection, spool in self._readers:
+            spool.close()
+            connection.close()
+
+
+def _send_all(connection: socket.socket, lines: list[str]) -> None:
+    connection.sendall("".join(f"{line}\n" for line in lines).encode())
 
 
 class FileOutput:
     """A new text file that grows by a line a frame; what is in it survives the end of the program.
+    `tell` gets one line where the disk takes no more.
 
     Raises:
         OutputError: there is such a file, or no folder for it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.fault: OutputError | None = None  # why nothing is written any more
-        self._path = path
-        self._file: IO[str] | None = None
-        if path.exists() or not path.parent.is_dir():
-            got = "one that is there" if path.exists() else f"no folder {path.parent}"
-            raise OutputError(refusal(str(path), expected="a new file", got=got, do="name another one"))
+    def __init__(self, path: Path, tell: Tell) -> None:
+        check_new(path)
+        self._path, self._tell = path, tell
+        self._file: IO[bytes] | None = None
+        self._spool = Spool(self._write, self._full, MOST_ROWS)
 
     def send(self, line: str) -> None:
-        """Write a line; after a fault nothing more."""
-        if self.fault is not None:
-            return
-        try:
-            if self._file is None:
-                self._file = self._path.open("x", encoding="utf-8", buffering=1)
-            self._file.write(f"{line}\n")
-        except OSError as error:
-            do, got = "make room; tracking goes on without this file", error_words(error)
-            self.fault = OutputError(refusal(str(self._path), expected="a disk with room", got=got, do=do))
+        """Take a line; after a fault nothing more is written."""
+        self._spool.send(f"{line}\n".encode())
+
+    def _write(self, lines: list[bytes]) -> None:
+        if self._file is None:
+            self._file = self._path.open("xb")
+        self._file.write(b"".join(lines))
+        self._file.flush()
+
+    def _full(self, error: OSError) -> None:
+        do, got = "make room; tracking goes on without this file", error_words(error)
+        self._tell(refusal(str(self._path), expected="a disk with room", got=got, do=do))
 
     def close(self) -> None:
-        """Close the file."""
+        """Write what waits, and close the file."""
+        self._spool.close(DISK_S)
+        if self._spool.lost and not self._spool.gone:
+            self._tell(f"{self._path}: the disk was too slow for {self._spool.lost} lines.")
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
+
+
+def check_new(path: Path) -> None:
+    """Raise OutputError if there is such a file, or no folder for it."""
+    if path.exists() or not path.parent.is_dir():
+        got = "one that is there" if path.exists() else f"no folder {path.parent}"
+        raise OutputError(refusal(str(path), expected="a new file", got=got, do="name another one"))

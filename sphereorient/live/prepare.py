@@ -8,18 +8,18 @@ import torch
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.recording import Recording, open_recording, silent
+from sphereorient.follow import Appearance
 from sphereorient.follow.tracker import ChunkTracker, OnlineTracker
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Learnt, one_thread
 from sphereorient.methods.settings import Settings
-from sphereorient.pose import CameraView
 
 
 @contextmanager
 def open_live(
     experiment: Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
-) -> Iterator[tuple[Recording, OnlineTracker, Sequence[CameraView]]]:
-    """Yield an experiment's recording, who follows its ball, and its views.
+) -> Iterator[tuple[Recording, OnlineTracker, Appearance]]:
+    """Yield an experiment's recording, who follows its ball, and how it looks.
 
     Raises:
         ExperimentError: cameras that contradict each other.
@@ -34,4 +34,4 @@ def open_live(
         if not isinstance(follower.tracker, ChunkTracker):
             do = "look with `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
-        yield recording, OnlineTracker(follower.tracker), follower.appearance.fitter.views
+        yield recording, OnlineTracker(follower.tracker), follower.appearance

@@ -131,6 +131,30 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     )
 
 
+def measured_track(
+    experiment: Experiment, clock: Tensor, table: PoseTable, choice: Tensor, learnt: Appearance
+) -> Trajectory:
+    """Collect poses as they were measured: those of a table at a choice (N,), -1 for none; no path, no smoother."""
+    picked = table.rows(choice)
+    covariance = picked["covariance"]
+    margin, angle = _margin(table, choice)
+    cameras = {view.name: precise_camera(k, table, picked, learnt) for k, view in enumerate(learnt.fitter.views)}
+    missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
+    flags = _fit_flags(table, choice, picked, learnt, np.any(missed, axis=0))
+    return replace(
+        _empty(experiment, clock, cameras),
+        valid=(choice >= 0).numpy(),
+        position=picked["position_lab_mm"].numpy(),
+        position_cov=covariance[:, 3:, 3:].numpy(),
+        orientation=picked["R_lab_body"].numpy(),
+        orientation_cov=covariance[:, :3, :3].numpy(),
+        flags=flags.numpy().astype(np.uint32),
+        margin=margin.numpy(),
+        margin_angle=angle.numpy(),
+        cameras=cameras,
+    )
+
+
 def precise_track(
     experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Appearance
 ) -> Trajectory:
@@ -143,38 +167,27 @@ def precise_track(
         R_lab_body=back @ smoothed.R_lab_body,
         R_given_path=back @ smoothed.R_given_path,
     )
-    names = [view.name for view in learnt.fitter.views]
-    empty = _empty(experiment, clock, names)
-    picked = table.rows(chosen.choice)
-    covariance = picked["covariance"]
-    margin, angle = _margin(table, chosen.choice)
-    cameras = {name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)}
-    missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
-    flags = chosen.flags | _fit_flags(table, chosen, picked, learnt, np.any(missed, axis=0))
-    flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
+    track = measured_track(experiment, clock, table, chosen.choice, learnt)
+    flags = chosen.flags | torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
     noticed = ((learnt.second_ball, TWO_BALLS), (learnt.sharper, SHARPER))
     told: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
     known = {
-        "position_cov": (covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
+        "position_cov": track.position_cov * smoothed.position_scale**2,
         "orientation_cov": smoothed.cov_given_path_rad2.numpy(),
         **datasets_of(smoothed, experiment.length_unit),
     }
     return replace(
-        empty,
-        valid=(chosen.choice >= 0).numpy(),
-        position=(picked["position_lab_mm"] - move_mm).numpy(),
+        track,
+        position=track.position - move_mm.numpy(),
         orientation=smoothed.R_given_path.numpy(),
         **known,
         segment=chosen.segment.numpy(),
-        flags=flags.numpy().astype(np.uint32),
+        flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
         confidence=chosen.probability.numpy(),
-        margin=margin.numpy(),
-        margin_angle=angle.numpy(),
-        cameras=cameras,
     )
 
 
@@ -246,7 +259,7 @@ def _missed(view: CameraView, track: CameraTrack) -> NDArray[np.bool_]:
 
 def _fit_flags(
     table: PoseTable,
-    chosen: Chosen,
+    choice: Tensor,
     picked: Mapping[str, Tensor],
     learnt: Appearance,
     missed: NDArray[np.bool_],
@@ -254,7 +267,7 @@ def _fit_flags(
     """Return flags (N,) int64 of frames that one camera alone measured, of poor fits, and of a movie of two balls.
     Where another camera should see the sphere and does not (`missed`), half of the poses are wrong.
     """
-    found = chosen.choice >= 0
+    found = choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
     # Halfway between the least and the usual score of a right pose.
     poor = 0.5 * (learnt.score_min + learnt.right_score)

@@ -4,25 +4,23 @@ It answers this machine alone, to who knows the random token of its address.
 """
 
 import json
-import secrets
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
 from typing import Any, ClassVar
-from urllib.parse import unquote
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import SphereOrientError, refusal
+from sphereorient.files.page_server import HOST, PageHandler, new_token
 from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text, writing
 from sphereorient.files.yaml_file import FAULTS, parse_yaml, with_value, yaml_words
 
-HOST = "127.0.0.1"
 SHARED = {"mark.css": "text/css; charset=utf-8", "mark.js": "text/javascript; charset=utf-8"}  # beside the pages
 MOST_BYTES = 1_000_000
 Json = dict[str, Any]
@@ -36,7 +34,7 @@ class Marking(ABC):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.token = secrets.token_urlsafe(16)
+        self.token = new_token()
         self.lock = Lock()
 
     @abstractmethod
@@ -82,8 +80,8 @@ def png(picture: NDArray[np.uint8]) -> bytes:
 def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
     """Return a server of the page on this machine; call `serve_forever`. Port 0: any free one."""
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
+    class Handler(PageHandler):
+        token = marking.token
 
         def do_GET(self) -> None:
             match self._steps():
@@ -116,40 +114,7 @@ def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
                 asked = None
             return asked if isinstance(asked, dict) else {}
 
-        def _steps(self) -> list[str] | None:
-            """Return the parts of the path behind the token; None for who does not know it, or another host's page."""
-            host = self.headers.get("Host", "").rpartition(":")[0]
-            first, *steps = self.path.partition("?")[0].lstrip("/").split("/")
-            known = secrets.compare_digest(first.encode(), marking.token.encode())
-            return [unquote(step) for step in steps] if known and host in (HOST, "localhost") else None
-
         def _file(self, name: str, kind: str) -> None:
             self._send(Path(__file__).with_name(name).read_bytes(), kind)
-
-        def _answer(self, make: Callable[[], bytes | Json | None]) -> None:
-            try:
-                answer = make()
-            except SphereOrientError as error:
-                content = json.dumps({"error": str(error)}).encode()
-                self._send(content, "application/json", HTTPStatus.BAD_REQUEST)
-                return
-            if answer is None:
-                self.send_error(HTTPStatus.NOT_FOUND)
-            elif isinstance(answer, bytes):
-                self._send(answer, "image/png")
-            else:
-                self._send(json.dumps(answer).encode(), "application/json")
-
-        def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, form: str, *values: object) -> None:
-            """Print nothing: the page tells what happens."""
 
     return ThreadingHTTPServer((HOST, port), Handler)

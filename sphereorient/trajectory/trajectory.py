@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
-from sphereorient.trajectory import datasets
+from sphereorient.trajectory import datasets, journal
 from sphereorient.trajectory.datasets import in_length, stored, stored_fields
 from sphereorient.trajectory.reasons import Flag, Reason
 
@@ -215,7 +215,8 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a trajectory written by `save`; unknown datasets and attributes are ignored.
+        """Read a trajectory written by `save`; unknown datasets and attributes are ignored. Where `live` did not come
+        to its end, or goes on, read the rows that it has written so far.
 
         Raises:
             TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.
@@ -225,14 +226,17 @@ class Trajectory:
         try:
             if path.exists():
                 got = "something else"
+            elif journal.journal_path(path).is_file():
+                path = journal.journal_path(path)
             if not path.is_file():  # opening a pipe would block
                 raise FileNotFoundError(path)
-            file = h5py.File(path, "r")
+            grows = journal.is_journal(path)
+            file = path.open("rb") if grows else h5py.File(path, "r")
         except (OSError, ValueError, RuntimeError) as error:
             raise TrackError(refusal(str(path), expected="an HDF5 file", got=got, do=do)) from error
         try:
             with file:
-                return cls(**_read(file))
+                return cls(**(journal.read_journal(file, cls, CameraTrack) if grows else _read(file)))
         except DAMAGE as error:  # includes ShapeError and broken JSON
             got = f"'{' '.join(str(error).split())[:200]}'"
             raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error

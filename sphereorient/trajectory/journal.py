@@ -1,0 +1,103 @@
+"""A track that is still being measured: a file of rows that only grows, so that it can be read at any time, also after
+a kill. It lies beside the track until that is written whole.
+
+The first line is JSON with the attributes of the track; then a row of fixed length for each frame (`row_type`). What
+lies behind the last whole row is ignored.
+"""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.trajectory.datasets import blank_datasets, stored_fields
+from sphereorient.trajectory.reasons import Reason
+
+SCHEMA = "sphereorient-journal/1"
+MARK = f'{{"schema": "{SCHEMA}"'.encode()
+LONGEST_HEAD = 10_000_000  # bytes
+# What is known of a frame without those that come later.
+OF_FRAME = (
+    *("time", "valid", "position", "position_cov", "orientation", "orientation_cov", "segment", "flags"),
+    *("position_systematic_cov", "orientation_systematic_cov", "margin", "margin_angle"),
+)
+OF_CAMERA = ("centre_px", "centre_sigma_px", "radius_px", "orientation", "orientation_cov", "score")
+ABOUT = ("method", "settings", "experiment", "length_unit", "provenance")
+Blank = Callable[[type[Any], int], dict[str, NDArray[Any]]]
+
+
+def journal_path(track: Path) -> Path:
+    """Return where the rows of a track are until it is whole."""
+    return track.with_name(track.name + ".partial")
+
+
+def row_type(track: type[Any], camera: type[Any], cameras: Sequence[str]) -> np.dtype[Any]:
+    """Return the type of one row: datasets of a track, then those of each camera, without padding."""
+    whole, own = dict(stored_fields(track)), dict(stored_fields(camera))
+    of_camera = [("reason", "S16"), *((name, own[name].dtype, own[name].tail) for name in OF_CAMERA)]
+    columns = [(name, whole[name].dtype, whole[name].tail) for name in OF_FRAME]
+    return np.dtype([*columns, ("cameras", [(name, of_camera) for name in sorted(cameras)])])
+
+
+def head(track: Any) -> bytes:
+    """Return the first line of the journal of a track, whose frames do not count."""
+    rate = track.frame_rate if math.isfinite(track.frame_rate) else None
+    content = {"schema": SCHEMA, "frame_rate": rate, "cameras": sorted(track.cameras)}
+    return json.dumps(content | {name: getattr(track, name) for name in ABOUT}).encode() + b"\n"
+
+
+def rows(track: Any) -> bytes:
+    """Return the frames of a track as rows."""
+    cameras = track.cameras
+    kind = row_type(type(track), type(next(iter(cameras.values()))), list(cameras))
+    table = np.zeros(len(track), kind)
+    for name in OF_FRAME:
+        table[name] = getattr(track, name)
+    for name, camera in cameras.items():
+        own = table["cameras"][name]
+        own["reason"] = [str(why) for why in camera.reason]
+        for column in OF_CAMERA:
+            own[column] = getattr(camera, column)
+    return table.tobytes()
+
+
+def is_journal(path: Path) -> bool:
+    """Return whether a file is a journal; raise OSError where it cannot be read."""
+    with path.open("rb") as file:
+        return file.read(len(MARK)) == MARK
+
+
+def read_journal(file: BinaryIO, track: type[Any], camera: type[Any], blank: Blank = blank_datasets) -> dict[str, Any]:
+    """Return the fields of the track of a journal, as far as it was written; `blank` gives what is not in it.
+
+    Raises:
+        LookupError, TypeError, ValueError: its first line is damaged.
+        OSError: it cannot be read.
+    """
+    about = json.loads(file.readline(LONGEST_HEAD))
+    kind = row_type(track, camera, about["cameras"])
+    fields: dict[str, Any] = {name: about[name] for name in ABOUT}
+    fields["frame_rate"] = math.nan if about["frame_rate"] is None else float(about["frame_rate"])
+    content = file.read()
+    table = np.frombuffer(content, kind, len(content) // kind.itemsize)
+    known = {str(reason): reason for reason in Reason}
+    found: dict[str, Any] = {}
+    for name in about["cameras"]:
+        own = table["cameras"][name]
+        texts = [text.decode() for text in own["reason"].tolist()]
+        parts = blank(camera, len(table)) | {column: np.ascontiguousarray(own[column]) for column in OF_CAMERA}
+        found[name] = camera(reason=tuple(known.get(text, text) for text in texts), **parts)
+    parts = blank(track, len(table)) | {name: np.ascontiguousarray(table[name]) for name in OF_FRAME}
+    return fields | parts | {"cameras": found}
+
+
+def nothing(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
+    """Return every dataset of a record with nothing measured, without memory for it: read-only."""
+    return {
+        name: np.broadcast_to(one[:1], (frames + len(one) - 1, *one.shape[1:])) if len(one) else one
+        for name, one in blank_datasets(record, 1).items()
+    }

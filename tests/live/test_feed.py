@@ -1,0 +1,212 @@
+"""Frames as they come: of movies, bytes, memory, cameras."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from threading import Event
+
+import numpy as np
+import pytest
+from live_examples import EXCERPT, LIMIT_S, arrivals
+
+from sphereorient.errors import MovieError
+from sphereorient.experiment.recording import open_recording
+from sphereorient.live.feed import Arrival, Feed, camera_pictures, device_frames, movie_frames, raw_frames
+from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
+
+
+def test_a_feed_that_waits_gives_all_frames_in_order():
+    feed = Feed(arrivals(50), 3, wait=True)
+    assert [one.number for one in feed] == list(range(50))
+    assert feed.dropped == 0
+
+
+def test_a_feed_of_a_camera_drops_the_oldest_frames_and_counts_them():
+    ended = Event()
+
+    def source() -> Iterator[Arrival]:
+        yield from arrivals(50)
+        ended.set()
+
+    feed = Feed(source(), 3, wait=False)
+    assert ended.wait(LIMIT_S)
+    assert [one.number for one in feed] == [47, 48, 49]
+    assert feed.dropped == 47
+
+
+def test_a_fault_of_the_source_comes_after_its_frames():
+    def source() -> Iterator[Arrival]:
+        yield from arrivals(2)
+        raise MovieError("movie: expected more, got an end; look at it.")
+
+    frames = iter(Feed(source(), 10, wait=True))
+    assert [next(frames).number, next(frames).number] == [0, 1]
+    with pytest.raises(MovieError, match="expected more"):
+        next(frames)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    with open_recording(EXCERPT / "experiment.yaml") as opened_:
+        yield opened_
+
+
+def test_raw_bytes_are_the_pictures_of_all_cameras(recording):
+    movies = list(movie_frames(recording, paced=False))[:3]
+    content = b"".join(picture.tobytes() for one in movies for picture in one.pictures)
+    found = list(raw_frames(io.BytesIO(content), recording.streams, 600.0))
+    assert [one.time_s for one in found] == pytest.approx([0, 1 / 600, 2 / 600])
+    for one, other in zip(found, movies, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(one.pictures, other.pictures, strict=True))
+    with pytest.raises(MovieError, match="bytes a frame"):
+        list(raw_frames(io.BytesIO(content[:-5]), recording.streams, 600.0))
+
+
+def test_a_ring_in_memory_gives_each_frame_once(recording, tmp_path):
+    movies = list(movie_frames(recording, paced=False))
+    size = sum(picture.nbytes for picture in movies[0].pictures)
+    with SharedFrames(tmp_path / "ring", size, slots=8) as ring:
+        ring.write(0.5, movies[0].pictures)
+        frames = shared_frames(tmp_path / "ring", recording.streams)
+        for k in range(5):
+            found = next(frames)
+            assert (found.number, found.time_s) == (k, 0.5 + k)
+            assert all(np.array_equal(a, b) for a, b in zip(found.pictures, movies[k].pictures, strict=True))
+            ring.write(1.5 + k, movies[k + 1].pictures)
+        for k in range(20):
+            ring.write(10.0 + k, movies[k].pictures)
+        assert next(frames).number == 26 - 8 + 1  # 26 were written; the oldest slot may be written at any time
+        frames.close()
+    assert not (tmp_path / "ring").exists()
+
+
+def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):
+    path = tmp_path / "ring"
+    with pytest.raises(MovieError, match="expected a ring of frames"):
+        next(shared_frames(path, recording.streams))
+    with SharedFrames(path, 77), pytest.raises(MovieError, match="77 bytes a frame"):
+        next(shared_frames(path, recording.streams))
+    path.write_bytes(b"x" * 200)
+    with pytest.raises(MovieError, match="another file"):
+        next(shared_frames(path, recording.streams))
+    path.unlink()
+    pictures = next(movie_frames(recording, paced=False)).pictures
+    with SharedFrames(path, sum(picture.nbytes for picture in pictures)) as ring:
+        ring.write(0.0, pictures)
+        frames = shared_frames(path, recording.streams)
+        next(frames)
+        ring._words[ENDED] = 1
+        assert list(frames) == []
+
+
+class FakeDevice:
+    """A camera of OpenCV."""
+
+    def __init__(self, pictures: list[np.ndarray], *, opens: bool = True) -> None:
+        self.pictures, self.opens, self.released = list(pictures), opens, False
+
+    def isOpened(self) -> bool:
+        return self.opens
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        return (True, self.pictures.pop(0)) if self.pictures else (False, None)
+
+    def release(self) -> None:
+        self.released = True
+
+
+@pytest.fixture
+def stream(recording):
+    return recording.streams[0]
+
+
+def grey(stream, value: int = 7) -> np.ndarray:
+    return np.full(stream.movie.frame_shape, value, np.uint8)
+
+
+def frames_of(stream, *devices: FakeDevice, tell=None) -> Iterator[Arrival]:
+    waiting = list(devices)
+    return device_frames("camera 0", lambda: camera_pictures(0, lambda number: waiting.pop(0)), stream, tell)
+
+
+def test_a_camera_gives_grey_pictures_of_the_size_of_the_movie(stream):
+    colour = np.dstack([grey(stream, value) for value in (10, 20, 30)])  # blue, green, red
+    device = FakeDevice([colour, colour[..., 0]])
+    first, second = frames_of(stream, device)
+    assert (int(first.pictures[0][0, 0]), int(second.pictures[0][0, 0])) == (22, 10)
+    assert device.released
+    with pytest.raises(MovieError, match="px"):
+        list(frames_of(stream, FakeDevice([colour[:-1]])))
+    with pytest.raises(MovieError, match="none that opens"):
+        list(frames_of(stream, FakeDevice([], opens=False)))
+
+
+def test_a_camera_that_ends_or_changes_its_pictures_is_told_once_and_taken_up_again(stream, monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.AGAIN_S", 0.001)
+    told: list[str] = []
+    devices = [
+        FakeDevice([grey(stream), grey(stream)]),
+        FakeDevice([], opens=False),
+        FakeDevice([], opens=False),
+        FakeDevice([grey(stream)]),
+        FakeDevice([grey(stream)[:-1]]),
+        FakeDevice([grey(stream)]),
+    ]
+    frames = frames_of(stream, *devices, tell=told.append)
+    found = [next(frames) for _ in range(4)]
+    assert [one.number for one in found] == [0, 1, 2, 3]
+    assert all(a.time_s < b.time_s for a, b in pairwise(found))
+    assert [line.split(";")[0] for line in told] == [
+        "camera 0: no picture comes any more. It is opened again each second.",
+        "camera 0: pictures come again.",
+        "camera 0: no picture comes any more. It is opened again each second.",
+        "camera 0: pictures come again.",
+    ]
+    assert all(device.released for device in devices[:5])
+
+
+def test_a_camera_that_changes_its_size_is_told(stream, monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.AGAIN_S", 0.001)
+    told: list[str] = []
+    devices = [FakeDevice([grey(stream), grey(stream)[:-1]]), FakeDevice([grey(stream)])]
+    frames = frames_of(stream, *devices, tell=told.append)
+    assert [next(frames).number for _ in range(2)] == [0, 1]
+    assert "got 650 x 649 px" in told[0]
+    assert told[1] == "camera 0: pictures come again."
+
+
+def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.STALLED_S", 0.02)
+    told: list[str] = []
+    goes_on = Event()
+
+    def source() -> Iterator[Arrival]:
+        yield from arrivals(3)
+        goes_on.wait(LIMIT_S)
+        yield from arrivals(3)
+
+    found = []
+    for arrival in Feed(source(), 10, wait=True, tell=lambda line: (told.append(line), goes_on.set())):
+        found.append(arrival.number)
+    assert found == [0, 1, 2, 0, 1, 2]
+    assert re.fullmatch(r"source: no frame for 0\.\d s; tracking waits\.", told[0])
+    assert re.fullmatch(r"source: frames come again, after 0\.\d s\.", told[1])
+    assert len(told) == 2
+
+
+def test_a_slow_source_does_not_stall(monkeypatch):
+    monkeypatch.setattr("sphereorient.live.feed.STALLED_S", 0.005)
+    told: list[str] = []
+
+    def source() -> Iterator[Arrival]:
+        for arrival in arrivals(8):
+            time.sleep(0.02)
+            yield replace(arrival, arrived_s=time.perf_counter())
+
+    list(Feed(source(), 10, wait=True, tell=told.append))
+    assert len(told) <= 4  # before the second frame nothing is known of the rate

@@ -1,0 +1,175 @@
+"""track.h5 of `live`: a journal that a kill cannot spoil, and the whole track at the end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPO
+from live_examples import EXCERPT, LIMIT_S, until
+from overlay_examples import true_track
+from typer.testing import CliRunner
+
+from sphereorient.cli import app
+from sphereorient.errors import OutputError, TrackError
+from sphereorient.experiment.recording import open_recording
+from sphereorient.live.feed import movie_frames
+from sphereorient.live.live import measured
+from sphereorient.live.prepare import open_live
+from sphereorient.live.track import REMARK, TrackBlocks, TrackOutput, whole_track
+from sphereorient.methods.settings import Settings
+from sphereorient.trajectory import Flag, Reason, Trajectory, journal
+from sphereorient.trajectory.datasets import stored_fields
+
+HIDDEN, DROPPED = range(15, 18), range(24, 26)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Frames of the excerpt, three of them black, two dropped; with what makes tracks of them."""
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, appearance):
+        frames = [
+            replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in HIDDEN else one
+            for k, one in enumerate(movie_frames(recording, paced=False))
+            if k not in DROPPED
+        ]
+        found = list(measured(tracker, appearance.fitter.views, frames))
+        yield recording, appearance, found
+
+
+def blocks_of(run) -> TrackBlocks:
+    return TrackBlocks(recording=run[0], appearance=run[1], even=True)
+
+
+def test_the_track_says_of_each_frame_what_was_measured(run, tmp_path):
+    blocks, path = blocks_of(run), tmp_path / "track.h5"
+    output = TrackOutput(path, pytest.fail)
+    output.begin(blocks, blocks.head(Settings(), "sphereorient live"))
+    for now in run[2]:
+        output.send(now)
+    output.close()
+    assert sorted(tmp_path.iterdir()) == [path]
+    track, truth = Trajectory.load(path), true_track()
+    np.testing.assert_allclose(track.time, truth.time, atol=1e-12)
+    lost = np.isin(np.arange(40), [*HIDDEN, *DROPPED])
+    assert np.array_equal(track.valid, ~lost)
+    for now in run[2]:
+        k = now.number
+        np.testing.assert_array_equal(track.orientation[k], now.R_lab_body)
+        np.testing.assert_array_equal(track.position[k], now.position_lab_mm)
+        if now.valid:  # the errors that all frames share are added
+            assert np.trace(track.orientation_cov[k]) >= np.trace(now.covariance[:3, :3])
+            assert np.trace(track.orientation_cov[k]) < 4 * np.trace(now.covariance[:3, :3])
+    for camera in track.cameras.values():
+        reason = np.array([str(why) for why in camera.reason])
+        assert set(reason[~lost]) == {Reason.OK}
+        assert set(reason[list(HIDDEN)]) <= {Reason.DARK, Reason.REPEATED}
+        assert set(reason[list(DROPPED)]) == {Reason.MISSING}
+        assert np.isfinite(camera.radius_px[~lost]).all()
+        assert np.isnan(camera.radius_px[lost]).all()
+    assert [k for k in range(40) if track.flags[k] & Flag.RECOVERED] == [HIDDEN.stop, DROPPED.stop]
+    assert [np.unique(track.segment[a:b]).tolist() for a, b in ((0, 15), (15, 18), (18, 24), (26, 40))] == [
+        [0],
+        [-1],
+        [1],
+        [2],
+    ]
+    assert np.isnan(track.velocity).all()
+    assert REMARK in track.provenance["remarks"]
+    assert (track.method, track.experiment, track.frame_rate) == ("precise", truth.experiment, 600.0)
+
+
+def test_blocks_of_any_length_give_the_same_track(run):
+    whole, parts = blocks_of(run).block(run[2]), blocks_of(run)
+    some = [parts.block(run[2][k : k + 7]) for k in range(0, len(run[2]), 7)]
+    for name, _ in stored_fields(Trajectory):
+        joint = np.concatenate([getattr(part, name) for part in some])
+        np.testing.assert_allclose(joint, getattr(whole, name), rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_a_jump_begins_a_segment(run):
+    jumped = [replace(now, found=now.number == 5) for now in run[2][:10]]
+    track = blocks_of(run).block(jumped)
+    assert track.segment.tolist() == [0] * 5 + [1] * 5
+    assert np.flatnonzero(track.flags & Flag.SPIKE).tolist() == [5]
+
+
+def test_a_journal_that_was_cut_anywhere_is_the_track_until_there(run, tmp_path):
+    blocks, path = blocks_of(run), tmp_path / "track.h5"
+    head, whole = blocks.head(Settings(), "sphereorient live"), blocks.block(run[2])
+    content = journal.rows(whole)
+    size = len(content) // 40
+    for cut, frames in ((0, 0), (1, 0), (size, 1), (17 * size - 1, 16), (len(content), 40)):
+        journal.journal_path(path).write_bytes(journal.head(head) + content[:cut])
+        track = Trajectory.load(path)
+        assert len(track) == frames
+        for name, _ in stored_fields(Trajectory):
+            np.testing.assert_array_equal(getattr(track, name), getattr(whole[:frames], name), name)
+        for name, camera in track.cameras.items():
+            assert camera.reason == whole[:frames].cameras[name].reason
+        assert track.provenance == head.provenance
+    lean = whole_track(journal.journal_path(path))
+    assert lean.velocity.strides[0] == 0  # nothing measured takes no memory
+    lean.save(path)
+    assert len(Trajectory.load(path)) == 40
+    for damaged in (b"", journal.MARK, journal.head(head)[:-9], b'{"schema": "sphereorient-journal/1"}\n'):
+        journal.journal_path(path).write_bytes(damaged)
+        with pytest.raises(TrackError):
+            Trajectory.load(journal.journal_path(path))
+
+
+def test_what_is_there_is_not_written_over(tmp_path):
+    for name in ("track.h5", "track.h5.partial"):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(OutputError, match="expected a new file"):
+            TrackOutput(tmp_path / "track.h5", pytest.fail)
+        (tmp_path / name).unlink()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
+def test_a_full_disk_is_told_and_the_rows_before_it_stay(run, tmp_path):
+    told: list[str] = []
+    blocks = blocks_of(run)
+    output = TrackOutput(tmp_path / "track.h5", told.append)
+    output.begin(blocks, blocks.head(Settings(), "sphereorient live"))
+    output.send(run[2][0])
+    until(lambda: len(Trajectory.load(tmp_path / "track.h5")) == 1)
+    output._file.close()
+    output._file = Path("/dev/full").open("wb")  # noqa: SIM115
+    output.send(run[2][1])
+    until(lambda: told)
+    output.send(run[2][2])
+    output.close()
+    assert len(told) == 1
+    assert "expected a disk with room" in told[0]
+    assert len(Trajectory.load(tmp_path / "track.h5")) == 1
+
+
+@pytest.mark.slow  # a program of its own
+def test_after_kill_9_what_was_measured_is_read_as_a_track(tmp_path):
+    path = tmp_path / "track.h5"
+    command = [sys.executable, "-m", "sphereorient.cli", "live", str(EXCERPT / "experiment.yaml")]
+    with open_recording(EXCERPT / "experiment.yaml") as recording:
+        pictures = [one.pictures for one in movie_frames(recording, paced=False)]
+    program = subprocess.Popen(
+        [*command, "--source", "-", "--to", str(path), "-q"],
+        stdin=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(REPO)},
+    )
+    for row in pictures[:30]:
+        program.stdin.write(b"".join(picture.tobytes() for picture in row))
+    program.stdin.flush()
+    until(lambda: journal.journal_path(path).exists() and len(Trajectory.load(path)) == 30, 6 * LIMIT_S)
+    program.send_signal(signal.SIGKILL)
+    program.wait()
+    track = Trajectory.load(path)
+    assert track.valid.all()
+    run = CliRunner().invoke(app, ["export", str(path), "--to", "csv", "--out", str(tmp_path / "track.csv")])
+    assert run.exit_code == 0, run.output
+    assert not path.exists()
