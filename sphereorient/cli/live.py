@@ -52,7 +52,8 @@ def live(
 ) -> None:
     """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
 
-    The experiment's movies, of the same set-up, show the empty scene and the light.
+    The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a
+    ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
     """
     from sphereorient.live.feed import Feed
     from sphereorient.live.lines import FicTracLines, fictrac_line
@@ -71,19 +72,21 @@ def live(
     if server is not None:
         typer.echo(f"page: {address(shown, server)}", err=True)
     try:
-        with open_live(experiment, chosen, named, learnt) as (recording, tracker, appearance):
-            views = appearance.fitter.views
+        with open_live(experiment, chosen, named, learnt) as opened:
+            recording, tracker = opened.recording, opened.tracker
+            views = tracker.appearance.fitter.views
             lines = FicTracLines(views[0].camera)
             for _, output in outputs:
                 if isinstance(output, TrackOutput):
                     even = source.startswith(("movie", "-"))
-                    blocks = TrackBlocks(recording=recording, appearance=appearance, even=even)
+                    blocks = TrackBlocks(recording=recording, tracker=tracker, even=even)
                     output.begin(blocks, blocks.head(chosen, command_line()))
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
             feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"), tell=_tell)
-            monitor = Monitor(feed)
+            monitor, number = Monitor(feed), tracker.number
             shown.views, shown.radius_mm, shown.monitor = views, recording.experiment.radius_mm, monitor
+            shown.save_map = opened.save_map
             try:
                 with suppress(KeyboardInterrupt):
                     for now in measured(tracker, views, monitor):
@@ -92,8 +95,13 @@ def live(
                         for kind, output in outputs:
                             output.send(_worded(kind, now, line))
                         monitor.saw(now, columns)
+                        if now.map_number != number:
+                            number = now.map_number
+                            _tell(f"frame {now.number}: orientations are by map {number} from here on")
             finally:
                 feed.close()
+            if opened.save_map is not None:
+                _save(opened.save_map)
     finally:
         for _, output in outputs:
             output.close()
@@ -102,6 +110,16 @@ def live(
             server.server_close()
     if not quiet:
         echo_lines(monitor.summary())
+
+
+def _save(save_map: "Callable[[], str]") -> None:
+    from sphereorient.errors import PaintError
+
+    _tell("the map is finished; this takes some seconds")
+    try:
+        typer.echo(save_map())
+    except PaintError as error:
+        _tell(str(error))
 
 
 def _tell(line: str) -> None:

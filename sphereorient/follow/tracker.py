@@ -408,7 +408,10 @@ class OnlineTracker:
     `tracker` has one chunk at a time (setting `refine.chunks`). Memory does not grow.
     """
 
-    def __init__(self, tracker: ChunkTracker) -> None:
+    number = 1  # of the map in use; 0: none yet
+
+    def __init__(self, tracker: ChunkTracker, appearance: Appearance) -> None:
+        self.appearance = appearance
         self._tracker = tracker
         self._time_s: dict[int, float] = {}  # of the last frames
         self._chunk = _Chunk(0, 0, self._time_s)

@@ -17,6 +17,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.files.threads import limit_cores
+from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import ChunkTracker, OnlineTracker, supported
@@ -24,8 +25,11 @@ from sphereorient.live.growing_map import GrowingMap, LiveMap
 from sphereorient.live.relative import RelativeTracker
 from sphereorient.locate import Frame
 from sphereorient.mapping.disks import Crop, Crops, cut_out
+from sphereorient.mapping.grid import ROUGH_SIDE, map_table
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
+from sphereorient.pose.fitter import FIRST_BLUR_PX, Fitter, Optics, unknown_light, widest_px
+from sphereorient.pose.lasting import Lasting
 
 HANDED_RAD = 0.025  # turn from one frame that is handed over to the next
 HANDED = 400  # frames that are handed over at most; the ball has shown its sides by then
@@ -60,7 +64,7 @@ class MapLearner:
         self._process.start()
         self._frames.cancel_join_thread()  # what a process that has ended does not take must hold nobody up
         self._paint: tuple[Tensor, Tensor] | None = None
-        self._finished = threading.Event()
+        self._painted = threading.Event()
         threading.Thread(target=self._receive, name="maps", daemon=True).start()
 
     def hand(self, shots: Sequence[Frame], R_lab_body: Tensor, number: int) -> None:
@@ -72,12 +76,13 @@ class MapLearner:
         crops = cut_out(self._place, [shot.picture for shot in shots])
         self._frames.put(pickle.dumps(_Handed(crops=crops, R_lab_body=R_lab_body, number=number)))
 
-    def finish(self) -> tuple[Tensor, Tensor]:
+    def paint(self) -> tuple[Tensor, Tensor]:
         """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H); the body frame
-        is that of the orientations handed over. PaintError without a map.
+        is that of the orientations handed over. This takes some seconds. PaintError without a map.
         """
+        self._painted.clear()
         self._frames.put(pickle.dumps(None))
-        self._finished.wait(SAVED_S)
+        self._painted.wait(SAVED_S)
         if self._paint is None:
             do = "let the ball turn longer, or learn it with `sphereorient map`"
             raise PaintError(refusal("map", expected="one learnt meanwhile", got="none yet", do=do))
@@ -95,11 +100,11 @@ class MapLearner:
                     self.newest = found
                 else:
                     self._paint = found
-                    self._finished.set()
+                    self._painted.set()
 
 
 def _learn(work: bytes, frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
-    """Take frames and give maps; after None instead of a frame, give the finished map, and end."""
+    """Take frames and give maps; for None instead of a frame, give the paint."""
     torch.set_num_threads(1)
     limit_cores(1)
     growing, done = GrowingMap(*pickle.loads(work)), 0
@@ -110,8 +115,8 @@ def _learn(work: bytes, frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
                     growing.iterate()
                     done += 1
                 maps.put(pickle.dumps(growing.paint() if done else None))
-                return
-            growing.add(one.crops, one.R_lab_body, one.number)
+            else:
+                growing.add(one.crops, one.R_lab_body, one.number)
         if not growing.ready() or growing.arrived:
             continue
         growing.iterate()
@@ -139,6 +144,7 @@ class LearningTracker:
 
     def __init__(self, place: Crops, settings: Settings, learner: MapLearner) -> None:
         self.number = 0
+        self.appearance = _unknown(place)
         self._settings, self._learner = settings, learner
         self._relative = RelativeTracker(place, settings.paint)
         self._online: OnlineTracker | None = None
@@ -176,7 +182,7 @@ class LearningTracker:
         before, _ = self._measured(time_s, shots)
         if not supported(before):
             return before
-        self._online, self.number = online, found.number
+        self._online, self.number, self.appearance = online, found.number, found.appearance
         self._R_map_body = poses.R_lab_body[0].mT @ before.R_lab_body[0]
         return _turned(poses, self._R_map_body)
 
@@ -194,4 +200,16 @@ def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
         candidates=settings.refine.candidates,
     )
     refine = settings.refine.model_copy(update={"chunks": 1})
-    return OnlineTracker(ChunkTracker(found.appearance, begin, refine, centre=found.centre))
+    tracker = ChunkTracker(found.appearance, begin, refine, centre=found.centre)
+    return OnlineTracker(tracker, found.appearance)
+
+
+def _unknown(place: Crops) -> Appearance:
+    """Return what is known of a ball without a map: where it is seen."""
+    table = map_table(torch.full((8, 16), 0.5), FIRST_BLUR_PX / widest_px(place.views), ROUGH_SIDE)
+    optics = Optics(table, FIRST_BLUR_PX, widest_px(place.views))
+    light = unknown_light(place.views)
+    fitter = Fitter(views=place.views, radius_mm=place.radius_mm, optics=optics, light=light)
+    return Appearance(
+        fitter=fitter, still=fitter, lasting=Lasting.none(len(place.views)), score_min=0.0, right_score=1.0
+    )

@@ -84,6 +84,7 @@ def json_line(now: Measured) -> str:
         "quaternion_wxyz": quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
         "sigma_rad": sigma[:3].tolist(),
         "sigma_mm": sigma[3:].tolist(),
+        "map": now.map_number,
         "found": now.found,
         "dropped": now.dropped,
         "reason": [str(why) for why in now.reason],

@@ -4,12 +4,14 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.follow import Appearance
 from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import OnlineTracker, supported
+from sphereorient.follow.tracker import supported
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
 from sphereorient.pose import CameraView
@@ -30,6 +32,7 @@ class Measured:
     covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm)
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
     poses: Poses  # all that the fit says
+    map_number: int  # of the map that it was measured with; 0: none, the orientation is relative
     found: bool  # whether it was searched for: the first one, found again, or not where it was expected
     dropped: int  # frames since the one before that came too late
     latency_s: float  # from the picture's arrival to here
@@ -45,7 +48,17 @@ class Measured:
         return float(np.sqrt(np.trace(self.covariance[:3, :3])))
 
 
-def measured(tracker: OnlineTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
+class LiveTracker(Protocol):
+    """Follows a ball frame by frame."""
+
+    number: int  # of the map in use; 0: none, orientations are relative to the first
+    appearance: Appearance
+
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the poses of the frame of a time, and whether they were searched for."""
+
+
+def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
     """Yield the pose of each frame; frames of one source, in order."""
     before: Sequence[Frame] | None = None
     number = -1
@@ -55,7 +68,7 @@ def measured(tracker: OnlineTracker, views: Sequence[CameraView], frames: Iterab
             for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
         ]
         poses, searched = tracker.next(arrival.time_s, shots)
-        yield _told(arrival, poses, searched, arrival.number - number - 1)
+        yield _told(arrival, poses, searched, arrival.number - number - 1, tracker.number)
         before, number = shots, arrival.number
 
 
@@ -66,7 +79,7 @@ def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: Camer
     return screened(picture, None if before is None else before.shown, view.background)
 
 
-def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int) -> Measured:
+def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, map_number: int) -> Measured:
     there = supported(poses)
     return Measured(
         number=arrival.number,
@@ -76,6 +89,7 @@ def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int) -> Measured
         covariance=poses.covariance[0].numpy() if there else LOST_COVARIANCE,
         reason=poses.reason,
         poses=poses,
+        map_number=map_number,
         found=found and there,
         dropped=dropped,
         latency_s=time.perf_counter() - arrival.arrived_s,

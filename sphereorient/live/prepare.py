@@ -1,30 +1,51 @@
-"""What is known before the first frame: light and blur of the set-up, learnt from a movie of it."""
+"""What is known before the first frame: light and blur of the set-up, learnt from a movie of it, or only its place."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from sphereorient.errors import ExperimentError, refusal
+from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording, silent
-from sphereorient.follow import Appearance
+from sphereorient.files.whole_file import writing
 from sphereorient.follow.tracker import ChunkTracker, OnlineTracker
+from sphereorient.live.live import LiveTracker
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Learnt, one_thread
 from sphereorient.methods.settings import Settings
+from sphereorient.sphere.texture import seen_path
+
+MAP = "texture.png"  # beside the experiment, where that names none
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LiveSetUp:
+    """An opened experiment and who follows its ball."""
+
+    recording: Recording
+    tracker: LiveTracker
+    save_map: Callable[[], str] | None = None  # writes the map that is learnt meanwhile, and tells it
 
 
 @contextmanager
 def open_live(
-    experiment: Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
-) -> Iterator[tuple[Recording, OnlineTracker, Appearance]]:
-    """Yield an experiment's recording, who follows its ball, and how it looks.
+    source: Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
+) -> Iterator[LiveSetUp]:
+    """Open an experiment. Without a texture map, that of a ball that stays in its place is learnt meanwhile.
 
     Raises:
-        ExperimentError: cameras that contradict each other.
+        ExperimentError: cameras that contradict each other, or no map of a ball that moves.
         SphereOrientError: missing, unreadable or inconsistent inputs.
     """
+    experiment = load_experiment(source)
+    path = experiment.texture_path
+    if experiment.fixed and learnt is None and (path is None or not path.exists()):
+        with _learning(experiment, settings, cameras, path or experiment.folder / MAP) as opened:
+            yield opened
+        return
     refine = settings.refine.model_copy(update={"chunks": 1})  # frames come one by one
     chosen = settings.model_copy(update={"refine": refine})
     with open_recording(experiment, cameras) as recording, one_thread():
@@ -34,4 +55,33 @@ def open_live(
         if not isinstance(follower.tracker, ChunkTracker):
             do = "look with `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
-        yield recording, OnlineTracker(follower.tracker), follower.appearance
+        yield LiveSetUp(recording=recording, tracker=OnlineTracker(follower.tracker, follower.appearance))
+
+
+@contextmanager
+def _learning(
+    experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, path: Path
+) -> Iterator[LiveSetUp]:
+    # Import late: with a map nothing is learnt.
+    from sphereorient.live.learning import LearningTracker, MapLearner
+    from sphereorient.mapping.disks import fixed_place
+    from sphereorient.report.texture_map import write_seen, write_texture
+
+    if path.exists():
+        do = "write it under sphere: texture:, or rename it"
+        raise ExperimentError(refusal(str(path), expected="no map there yet", got="a file", do=do))
+    with open_recording(experiment, cameras, textured=False) as recording, one_thread():
+        place = fixed_place(recording, settings.paint, settings.locate)
+        learner = MapLearner(place, settings.paint)
+
+        def save() -> str:
+            texture, seen = learner.paint()
+            with writing(force=True):  # that of before, by this run
+                write_texture(texture, path)
+                write_seen(seen, seen_path(path))
+            return f"Wrote {path}"
+
+        try:
+            yield LiveSetUp(recording=recording, tracker=LearningTracker(place, settings, learner), save_map=save)
+        finally:
+            learner.close()

@@ -14,10 +14,9 @@ from sphereorient.errors import OutputError, SphereOrientError, error_words, ref
 from sphereorient.experiment import input_files
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
-from sphereorient.follow import Appearance
 from sphereorient.follow.poses import Poses, no_pose, pose_table
 from sphereorient.live.feed import Tell
-from sphereorient.live.live import Measured
+from sphereorient.live.live import LiveTracker, Measured
 from sphereorient.live.outputs import DISK_S, MOST_ROWS, Spool, check_new
 from sphereorient.methods.results import measured_track, with_lasting_errors, with_systematic_errors
 from sphereorient.methods.settings import Settings, settings_yaml
@@ -33,7 +32,7 @@ class TrackBlocks:
     """Makes a track of each block of frames, in order; frames that were dropped are missing in it."""
 
     recording: Recording
-    appearance: Appearance
+    tracker: LiveTracker  # whose appearance is that of the frames
     even: bool  # whether the frames come at the experiment's rate
     _last: Measured | None = None
     _segment: int = -1  # of the last frame with a pose
@@ -80,9 +79,10 @@ class TrackBlocks:
         table = pose_table([poses], len(cameras))
         choice = torch.where(table.mask.any(1), 0, -1)
         clock = torch.tensor(time_s, dtype=torch.float64)
-        track = measured_track(experiment, clock, table, choice, self.appearance)
+        learnt = self.tracker.appearance
+        track = measured_track(experiment, clock, table, choice, learnt)
         track = with_systematic_errors(track, cameras, self.recording.covariance, experiment.radius_mm)
-        track = with_lasting_errors(track, self.appearance.lasting)
+        track = with_lasting_errors(track, learnt.lasting)
         segment, flags = np.array(marks, np.int64).T
         return replace(track, segment=segment, flags=track.flags | flags.astype(np.uint32))
 

@@ -43,5 +43,6 @@ def rows(track: Trajectory) -> Iterator[Measured]:
             poses=no_pose(1, (Reason.NOT_FOUND,)),
             found=k == 0,
             dropped=0,
+            map_number=1,
             latency_s=0.001,
         )

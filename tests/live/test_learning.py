@@ -177,7 +177,7 @@ def test_a_learner_in_its_own_process_gives_a_map_and_its_paint(ball):
         for k in range(40):
             learner.hand([ball.shots[k]], ball.R[k], 0)
         assert learner._count <= min(40, HANDED)
-        texture, seen = learner.finish()
+        texture, seen = learner.paint()
     finally:
         learner.close()
     assert texture.shape == seen.shape

@@ -24,12 +24,12 @@ from sphereorient.methods.settings import Settings
 
 def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told():
     hidden = range(15, 19)
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, appearance):
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
         frames = [
             replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in hidden else one
-            for k, one in enumerate(movie_frames(recording, paced=False))
+            for k, one in enumerate(movie_frames(opened.recording, paced=False))
         ]
-        found = list(measured(tracker, appearance.fitter.views, frames))
+        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
     truth = torch.from_numpy(true_track().orientation)
     for k, now in enumerate(found):
         assert now.number == k
@@ -46,11 +46,11 @@ def test_a_jump_is_found_and_told(tmp_path):
     order = [*range(12), *range(39, 29, -1)]
     truth = torch.from_numpy(true_track().orientation)
     assert float(so3.geodesic_distance(truth[11], truth[39])) > math.radians(20)
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, appearance):
-        frames = list(movie_frames(recording, paced=False))
-        times = recording.timeline.time_s
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+        frames = list(movie_frames(opened.recording, paced=False))
+        times = opened.recording.timeline.time_s
         shown = [replace(frames[k], number=n, time_s=float(times[n])) for n, k in enumerate(order)]
-        found = list(measured(tracker, appearance.fitter.views, shown))
+        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, shown))
     assert [n for n, now in enumerate(found) if now.found] == [0, 12]
     for now, k in zip(found, order, strict=True):
         assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)

@@ -33,18 +33,18 @@ HIDDEN, DROPPED = range(15, 18), range(24, 26)
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Frames of the excerpt, three of them black, two dropped; with what makes tracks of them."""
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as (recording, tracker, appearance):
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
         frames = [
             replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in HIDDEN else one
-            for k, one in enumerate(movie_frames(recording, paced=False))
+            for k, one in enumerate(movie_frames(opened.recording, paced=False))
             if k not in DROPPED
         ]
-        found = list(measured(tracker, appearance.fitter.views, frames))
-        yield recording, appearance, found
+        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
+        yield opened.recording, opened.tracker, found
 
 
 def blocks_of(run) -> TrackBlocks:
-    return TrackBlocks(recording=run[0], appearance=run[1], even=True)
+    return TrackBlocks(recording=run[0], tracker=run[1], even=True)
 
 
 def test_the_track_says_of_each_frame_what_was_measured(run, tmp_path):
