@@ -1,17 +1,21 @@
 """The first hour of a new user as a protocol: the commands of a journey, their times, and what is said of wrong inputs.
 
-    scripts/first_hour.py tank|fictrac|wrong [--shared ../shared] [--work FOLDER]
+    scripts/first_hour.py tank|fictrac|wrong|notebook [--shared ../shared] [--work FOLDER]
 
 `tank`: two movies and plate pictures in a folder, nothing else. `fictrac`: the folder of FicTrac's sample movie.
-`wrong`: the first journey with a wrong input at each step. What only the user knows is given by `--set`, once. Prints
+`wrong`: the first journey with a wrong input at each step. `notebook`: the toolkit's tutorial cell by cell, further
+calls of a user, and mistakes with their messages. What only the user knows is given by `--set`, once. Prints
 Markdown; errors against the truth where there is one, by the shared score_track.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
+import re
 import resource
 import shlex
 import shutil
@@ -21,26 +25,72 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import yaml
 
+REPO = Path(__file__).resolve().parents[1]
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
 KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what nobody can measure
 SHOWN = 60  # letters of a word in the protocol
+CALLS = """
+import sphereorient; from sphereorient import Trajectory, load_texture
+texture = load_texture("texture.png")
+bank = TemplateBank(texture.numpy(), size_px=40)
+bank = TemplateBank(texture.double(), size_px=40)
+disk = SphereRenderer(texture, size_px=40)
+bank(disk(R_true))
+bank((255 * disk(R_true)).byte().numpy())
+track = sphereorient.track_movies("experiment.yaml")
+track[10:50].plot()
+track[50:10].plot()
+"""  # after the tutorial's cells, in a folder with an experiment
+MISTAKES = """
+load_texture("nofile.png")
+load_texture("cam1.mkv")
+TemplateBank("texture.png")
+TemplateBank(texture.T)
+TemplateBank((255 * texture).int())
+TemplateBank(255 * texture.numpy())
+TemplateBank(texture, size_px=0)
+bank(disk(R_true)[1:])
+bank(float("nan") * disk(R_true))
+SphereRenderer(texture)
+disk(2 * R_true)
+disk(-R_true)
+disk(so3.log(R_true))
+PoseFitter("cameras.yaml", texture, radius_mm=9.0, diameter_px=79.0)
+PoseFitter(camera, texture, radius_mm=0.0, diameter_px=79.0)
+fitter(grey[1:], R_true, truth)
+fitter(float("nan") * grey, R_true, truth)
+fitter(grey, R_true + 0.1, truth)
+PathLayer()(candidates, score[1:], time_s)
+PathLayer()(2 * candidates, score, time_s)
+PathLayer()(candidates, score, -time_s)
+track["a"]
+track[3]
+sphereorient.track("cam1.mkv")
+sphereorient.track_movies("cam1.mkv")
+sphereorient.track_movies(["cam1.mkv", "cam2.mkv"])
+sphereorient.track_movies("experiment.yaml", method="fast")
+Trajectory.load("nofile.h5")
+"""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("journey", choices=("tank", "fictrac", "wrong"))
-    parser.add_argument("--shared", type=Path, default=Path(__file__).resolve().parents[1].parent / "shared")
+    parser.add_argument("journey", choices=("tank", "fictrac", "wrong", "notebook"))
+    parser.add_argument("--shared", type=Path, default=REPO.parent / "shared")
     parser.add_argument("--work", type=Path)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = arguments.work or Path(name)
         folder.mkdir(parents=True, exist_ok=True)
-        {"tank": tank, "fictrac": fictrac, "wrong": wrong}[arguments.journey](arguments.shared, folder)
+        {"tank": tank, "fictrac": fictrac, "wrong": wrong, "notebook": notebook}[arguments.journey](
+            arguments.shared, folder
+        )
 
 
 def run(folder: Path, *words: str, wrong: bool = False) -> None:
@@ -147,6 +197,47 @@ def wrong(shared: Path, folder: Path) -> None:
     run(folder, "track", "swapped.yaml", "--out", "track.h5", wrong=True)
     run(folder, "track", "experiment.yaml", "--out", "plates", wrong=True)
     run(folder, "report", "experiment.yaml", "--out", "report", wrong=True)
+
+
+def notebook(shared: Path, folder: Path) -> None:
+    """Run the toolkit's tutorial as a notebook does, in this process, which has not imported the package yet."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    for path in (shared / "experiment").glob("*.*"):
+        shutil.copy(path, folder)
+    os.chdir(folder)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    parts = re.split(r"^# %%", (REPO / "docs" / "tutorials" / "toolkit.py").read_text(), flags=re.MULTILINE)[1:]
+    cells = [part for part in parts if not part.startswith(" [markdown]")]
+    head("cell")
+    first, begun = "", (time.perf_counter(), time.process_time())
+    for number, cell in enumerate(cells, start=1):
+        row(f"cell {number}", cell, names)
+        if not first and names["plt"].get_fignums():
+            wall, cpu = time.perf_counter() - begun[0], time.process_time() - begun[1]
+            first = f"{wall:.1f} s, CPU {cpu:.1f} s"
+    print(f"\n{len(cells)} cells, 0 files edited by hand; to the first figure {first}")
+    head("further call")
+    for call in CALLS.strip().splitlines():
+        row(f"`{call}`", call, names)
+    head("mistake")
+    for call in MISTAKES.strip().splitlines():
+        row(f"`{call}`", call, names, wrong=True)
+
+
+def row(title: str, code: str, names: dict[str, Any], wrong: bool = False) -> None:
+    """Run code in a namespace and print its row, with what it printed or, of a mistake, the error."""
+    printed, error = io.StringIO(), ""
+    wall, cpu = time.perf_counter(), time.process_time()
+    with contextlib.redirect_stdout(printed):
+        try:
+            exec(code, names)
+        except Exception as problem:
+            if not wrong:
+                raise
+            error = f"{type(problem).__name__}: {problem}"
+    said = " / ".join((error if wrong else printed.getvalue()).splitlines()) or ("no error" if wrong else "")
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    print(f"| {title} | {wall:.1f} | {cpu:.1f} | {said.replace('|', ' ')} |", flush=True)
 
 
 def score(shared: Path, track: Path, truth: Path, align: str) -> None:

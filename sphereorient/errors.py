@@ -3,7 +3,7 @@
 Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -14,7 +14,7 @@ class SphereOrientError(Exception):
 
 
 class ShapeError(SphereOrientError, ValueError):
-    """A tensor has another shape than the function works on."""
+    """A tensor has another shape, type or values than the function works on."""
 
 
 class CameraError(SphereOrientError):
@@ -66,6 +66,25 @@ def error_words(error: Exception) -> str:
     """Return the error of a library or the system in one line of at most 200 characters."""
     text = str(getattr(error, "strerror", None) or error)
     return f"'{text.splitlines()[0][:200]}'" if text else type(error).__name__
+
+
+def tensor_of(name: str, values: Any) -> "Tensor":
+    """Return a tensor, or an array or numbers as one; refuse anything else (ShapeError)."""
+    import torch  # a second, which `sphereorient --help` does not need
+
+    try:
+        return torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got, do = type(values).__name__, "pass a NumPy array or a tensor; `load_texture` reads the file of a map"
+        raise ShapeError(refusal(name, expected="numbers", got=got, do=do)) from error
+
+
+def check_finite(name: str, tensor: "Tensor") -> None:
+    """Refuse a tensor with NaN or infinite values (ShapeError)."""
+    if unknown := int((~tensor.isfinite()).sum()):
+        do = "leave these frames out, or fill the pixels with the background"
+        got = f"{unknown} of {tensor.numel()} NaN or infinite"
+        raise ShapeError(refusal(name, expected="finite grey levels", got=got, do=do))
 
 
 def check_tail(name: str, tensor: "Tensor", *tail: int) -> None:

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sphereorient.errors import SettingsError, check_tail, refusal
+from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 MEAN_STEPS = 12
+NO_ROTATION = 1e-3  # of an entry of R R^T - I: far beyond rounding, half a milliradian
 ROUNDING = 1e-9  # a count that is a whole number by geometry must not be rounded up for the last bits of a sine
 HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic lattice with a point per unit of volume
 
@@ -47,6 +48,22 @@ def log(R: Tensor) -> Tensor:
     turned = ~(length <= torch.finfo(R.dtype).tiny ** 0.5)  # NaN stays NaN
     length = torch.where(turned, length, torch.ones_like(length))
     return axis * torch.where(turned, 2 * torch.atan2(length, w.abs()) / length, 0.5)
+
+
+def check_rotations(name: str, R: Tensor) -> None:
+    """Refuse matrices (..., 3, 3) that are no rotations (ShapeError); rows with NaN, for what is unknown, pass."""
+    check_tail(name, R, 3, 3)
+    if not R.is_floating_point():
+        do = "convert it with .double() or .float()"
+        raise ShapeError(refusal(name, expected="a floating-point tensor", got=str(R.dtype), do=do))
+    M = R.detach()
+    off = (M @ M.mT - torch.eye(3, dtype=M.dtype, device=M.device)).abs().flatten(-2).amax(-1)
+    wrong = (off > NO_ROTATION) | (torch.linalg.det(M) < 0)
+    if wrong.any():
+        det = float(torch.linalg.det(M[wrong][0]))
+        got = f"{int(wrong.sum())} of {wrong.numel()} that are not, the first with det {det:.3g}"
+        do = "make them with so3.exp of rotation vectors, or mend rounding with so3.nearest_rotation"
+        raise ShapeError(refusal(name, expected="rotations, R R^T = I and det 1", got=got, do=do))
 
 
 def hat(v: Tensor) -> Tensor:

@@ -91,7 +91,7 @@ class PathLayer(nn.Module):
             mask: (..., N, C) bool, True for a candidate; None: all. Order 1 drops those below `quality_min`.
 
         Raises:
-            ShapeError: the inputs differ in frames or candidates.
+            ShapeError: the inputs differ in frames or candidates; candidates are no rotations; times do not increase.
             SettingsError: the temperature is not above 0.
         """
         R, time = torch.as_tensor(R_lab_body), torch.as_tensor(time_s)
@@ -108,6 +108,10 @@ class PathLayer(nn.Module):
             there = there & (score >= self._settings.quality_min)
         unit = torch.eye(3, dtype=R.dtype, device=R.device)
         R = torch.where(there[..., None, None], R, unit)  # 0 times NaN would reach the gradients
+        so3.check_rotations("R_lab_body", R)
+        if not bool((time.diff(dim=-1) > 0).all()):
+            got, do = "times that fall, stay or are unknown", "sort the frames by time, each once"
+            raise ShapeError(refusal("time_s", expected="increasing times", got=got, do=do))
         score, variance = torch.where(there, score, 0.0), torch.where(there, variance, 0.0)
         if self.order == 2 and self.soft is None:
             return self._histories(R, -score, variance, there, time)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_disk_px, sphere_radius_px
-from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.errors import CameraError, SettingsError, ShapeError, check_finite, check_tail, refusal, tensor_of
 from sphereorient.locate import Background, CameraScene
 from sphereorient.movies import OnDemand
 from sphereorient.pose.compiled import refined
@@ -23,7 +23,9 @@ from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, Spher
 from sphereorient.pose.occluders import MOST_HIDDEN, unoccluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.pose.residuals import KNOWN
+from sphereorient.so3 import check_rotations
 from sphereorient.sphere import orthographic_view
+from sphereorient.sphere.texture import as_texture
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
@@ -391,6 +393,11 @@ class PoseFitter(nn.Module):
         diameter_px: expected diameter of the sphere's disk in the pictures.
         blur_px: standard deviation of optics, pixel and exposure together, px.
         background: (C, H, W), grey levels of the scene without the sphere; None: black.
+
+    Raises:
+        CameraError: something else than cameras.
+        SettingsError: radius or diameter not above 0.
+        ShapeError: texture is not (H, 2 H), or not of numbers 0 .. 1.
     """
 
     def __init__(
@@ -405,7 +412,14 @@ class PoseFitter(nn.Module):
     ) -> None:
         super().__init__()
         seen = list(cameras) if isinstance(cameras, Sequence) else [cameras]
-        self.register_buffer("texture", torch.as_tensor(texture).float())
+        for one in seen:
+            if not hasattr(one, "image_size"):
+                do = "pass one of load_cameras(path).values(), or a list of them"
+                raise CameraError(refusal("cameras", expected="cameras", got=type(one).__name__, do=do))
+        for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px)):
+            if not value > 0:
+                raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do="measure it"))
+        self.register_buffer("texture", as_texture(texture).float())
         views = []
         for k, camera in enumerate(seen):
             width, height = camera.image_size
@@ -415,7 +429,7 @@ class PoseFitter(nn.Module):
                 background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
             )
             views.append(CameraView.of(f"camera {k + 1}", camera, scene))
-        base = base_table(torch.as_tensor(texture).float().cpu(), diameter_px)
+        base = base_table(self.get_buffer("texture").cpu(), diameter_px)
         self.fitter = first_fitter(views, radius_mm, base, blur_px)
 
     def forward(
@@ -429,22 +443,23 @@ class PoseFitter(nn.Module):
         for a single camera; the start is right to about 10 degrees and a few pixels.
 
         Raises:
-            ShapeError: shapes that do not fit together.
+            ShapeError: shapes that do not fit together, starts that are no rotations, pictures that are not finite.
         """
-        R, X = (torch.as_tensor(part, dtype=torch.float64) for part in (R_lab_body, position_lab_mm))
-        check_tail("R_lab_body", R, 3, 3)
+        R, X = tensor_of("R_lab_body", R_lab_body).double(), tensor_of("position_lab_mm", position_lab_mm).double()
+        check_rotations("R_lab_body", R)
         check_tail("position_lab_mm", X, 3)
         device = self.get_buffer("texture").device
         fitter = self.fitter if device == self.fitter.device else self.fitter.on(device)
         views = fitter.views
         height, width = views[0].background.mean.shape
-        grey = torch.as_tensor(pictures)
+        grey = tensor_of("pictures", pictures)
         lead = R.shape[:-2]
         if grey.shape[-2:] != (height, width) or grey.numel() != lead.numel() * len(views) * height * width:
             expected = f"(..., {len(views)}, {height}, {width}) with {lead.numel()} poses"
             raise ShapeError(
                 refusal("pictures", expected=expected, got=str(tuple(grey.shape)), do="pass one picture per camera")
             )
+        check_finite("pictures", grey)
         frames = [[_grey(one) for one in row] for row in grey.reshape(-1, len(views), height, width)]
         R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
         use = torch.ones(len(R), len(views), dtype=torch.bool)

@@ -29,7 +29,15 @@ from sphereorient.trajectory import Trajectory
 KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, and what is in them
 MOST_STRIPS = 8  # tracks shown frame by frame
 PICTURES = 120  # frames of a report with pictures
-HALF = ("path", "camera_distance", "noise", "isotropy", "durations")  # figures that stand two beside each other
+PAPER = {  # numbers of the paper's figures
+    "track": "Figure 7",
+    "camera_distance": "Figure 8",
+    "durations": "Figure 9",
+    "angles": "Figure 10",
+    "densities": "Figures 11 and 12",
+    "increments": "Figure 11",
+}
+PX_PER_INCH = 120  # on the page, the same for all figures: so is their text
 FLOW_KEYS = {
     "viscosity": "viscosity_m2_s",
     "dissipation": "dissipation_w_kg",
@@ -128,37 +136,38 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
     return Surroundings(**known)
 
 
-Plan = tuple[str, str, Callable[[], Figure]]  # name, caption, function
+Plan = tuple[str, str, str, Callable[[], Figure]]  # name, title, caption, function
 
 
 def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
     of = "" if len(tracks) == 1 else f" of {name}"
-    yield "track", f"Track{of}, with bands of two standard errors.", lambda: plots.track_figure(track)
+    caption = "As measured (dots) and smooth, with bands of two standard errors."
+    yield "track", f"Track{of}", caption, lambda: plots.track_figure(track)
     if not track.held:
-        yield "path", f"Path{of} with the sphere's axes.", lambda: plots.path_figure(track)
+        yield "path", f"Path{of}", "With the sphere's axes.", lambda: plots.path_figure(track)
     if any(len(one.distance_rad) for one in distances):
-        caption = "Distance of the cameras' own orientations."
-        yield "camera_distance", caption, lambda: plots.camera_distance_figure(distances)
+        caption = "PDF of the angle between the two cameras' own orientations."
+        yield "camera_distance", "Distance of the cameras", caption, lambda: plots.camera_distance_figure(distances)
     caption = "Share of each variance that is noise, or was smoothed away."
     if summary.ensemble.segments:
-        yield "noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error)
+        yield "noise", "Noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error)
     if (more := summary.distributions) is None:
         return
     caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
-    yield "densities", caption, lambda: plots.densities_figure(summary, list(more.densities))
+    yield "densities", "PDFs", caption, lambda: plots.densities_figure(summary, list(more.densities))
     caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
-    yield "increments", caption, lambda: plots.increments_figure(more, summary.table)
+    yield "increments", "Increments", caption, lambda: plots.increments_figure(more, summary.table)
     caption = "Autocorrelations and integral times."
-    yield "correlations", caption, lambda: plots.correlations_figure(more.correlations)
+    yield "correlations", "Correlations", caption, lambda: plots.correlations_figure(more.correlations)
     caption = "Euler angles against the law of uniform attitudes."
-    yield "angles", caption, lambda: plots.angles_figure(more.angles, more.uniformity)
+    yield "angles", "Angles", caption, lambda: plots.angles_figure(more.angles, more.uniformity)
     caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
-    yield "kernel_widths", caption, lambda: plots.widths_figure(more.widths)
+    yield "kernel_widths", "Kernel widths", caption, lambda: plots.widths_figure(more.widths)
     caption = "Shares of the components in the variance, in the lab and in the body."
-    yield "isotropy", caption, lambda: plots.isotropy_figure(more.isotropies)
+    yield "isotropy", "Isotropy", caption, lambda: plots.isotropy_figure(more.isotropies)
     if (found := more.durations) is not None:
-        yield "durations", "Durations of the segments.", lambda: plots.durations_figure(found)
+        yield "durations", "Durations", "Of the segments.", lambda: plots.durations_figure(found)
 
 
 def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> Iterator[Plan]:
@@ -172,16 +181,20 @@ def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment
         path = None if experiment is None else experiment.texture_path
         texture, of = None if path is None else load_texture(path), "" if len(tracks) == 1 else f" of {name}"
         draw = partial(worn_figure, worn_of_text(text), texture)
-        yield f"unused_paint_{len(drawn)}", f"Paint{of} that differs from the map and was not used.", draw
+        caption = "It differs from the map."
+        yield f"unused_paint_{len(drawn)}", f"Paint{of} that was not used", caption, draw
 
 
 def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:
     drawn = []
-    for k, (name, caption, draw) in enumerate(plans):
+    for k, (name, title, caption, draw) in enumerate(plans):
         progress("figures", k, len(plans))
-        plots.write_figure(draw(), folder / name)
+        figure = draw()
+        plots.write_figure(figure, folder / name)
         png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
-        drawn.append({"name": name, "caption": caption, "png": png, "half": name in HALF})
+        title += f" ({PAPER[name]} of the paper)" if name in PAPER else ""
+        width = round(PX_PER_INCH * figure.get_figwidth())
+        drawn.append({"name": name, "title": title, "caption": caption, "png": png, "width": width})
     progress("figures", len(plans), len(plans))
     return drawn
 

@@ -108,21 +108,23 @@ def gallery(
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
 
-    Two thirds are bad frames, the middles of the longest stretches first; good frames, spread evenly, serve to compare.
+    The worst frame is first, then the middles of the longest stretches. Two thirds are bad frames; good ones, spread
+    evenly, serve to compare.
     """
     status = quality.status_of(track)
     good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status != quality.GOOD)
     room = min(count, len(track))
     bad_room = room - min(len(good), room - round(BAD_SHARE * room))
-    # At most half are middles, so that frames of `choose_worst` are shown too.
-    why = dict(list(_middles(track, bad, quality.bad_stretches(track)))[: -(-bad_room // 2)])
+    worst = quality.choose_worst(track, max(bad_room, min(room, 1)))
+    why = dict(list(worst.items())[:1])
 
     def fill(more: dict[int, tuple[str, ...]], upto: int) -> None:
         for k, words in more.items():
             if k not in why and len(why) < upto:
                 why[k] = words
 
-    worst = quality.choose_worst(track, bad_room)
+    # At most half are middles, so that frames of `choose_worst` are shown too.
+    fill(dict(_middles(track, bad, quality.bad_stretches(track))), -(-bad_room // 2))
     fill({k: words for k, words in worst.items() if not words[0].startswith("not in doubt")}, bad_room)
     left = np.setdiff1d(bad, list(why))
     fill({k: tuple(quality.frame_warnings(track, k)) for k in _spread(left, bad_room - len(why))}, bad_room)

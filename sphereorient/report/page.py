@@ -10,9 +10,18 @@ from typing import Any
 import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined, Template
+from numpy.typing import NDArray
 
 from sphereorient.files.provenance import versions
-from sphereorient.report.frame_warnings import STATUS_WORDS, BadStretch, bad_stretches, stated_error, strip_of
+from sphereorient.report.frame_warnings import (
+    STATUS_WORDS,
+    BadStretch,
+    bad_stretches,
+    choose_worst,
+    frame_numbers,
+    stated_error,
+    strip_of,
+)
 from sphereorient.report.gallery import Gallery, GalleryFrame
 from sphereorient.report.plots.style import SYMBOLS, decimals
 from sphereorient.report.tables import Table
@@ -37,13 +46,15 @@ Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells;
 def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, **parts: Any) -> str:
     """Return the page of a report, from statistics, tracks by the name of their file, and the command that made it.
 
-    `parts`: verdicts; figures (name, caption, png in base64, half: two beside each other); tables that were written,
-    and the suffixes of their files; strips, HTML of `strip_html`.
+    `parts`: verdicts; figures (name, title, caption, png in base64, width in px); tables that were written, and the
+    suffixes of their files; strips, HTML of `strip_html`.
     """
     css, js = strip_assets()
     names = sorted({track.experiment for track in tracks.values() if track.experiment})
+    what = "Rotation of a sphere" if all(track.held for track in tracks.values()) else "Motion of a sphere"
+    what += f", {len(tracks)} tracks compared" if len(tracks) > 1 else ""
     page = {
-        "title": f"Motion of a sphere: {_some(names)}" if names else "Motion of a sphere",
+        "title": f"{what}: {_some(names)}" if names else what,
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
@@ -86,6 +97,7 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     return _template("strip.html.j2").render(
         name=name,
         strip=strip,
+        worst=_worst(track, numbers),
         stretches=found[:MOST_STRETCHES],
         more=found[MOST_STRETCHES:],
         reasons=_reasons,
@@ -94,6 +106,13 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
         folded=sorted(ranked[UNFOLDED:], key=lambda frame: frame.k),
         caption=_caption,
     )
+
+
+def _worst(track: Trajectory, numbers: NDArray[np.int64] | None) -> dict[str, Any] | None:
+    numbers = frame_numbers(track) if numbers is None else numbers
+    found = choose_worst(track, 1).items()
+    shown = [{"k": k, "number": int(numbers[k]), "time_s": float(track.time[k]), "words": why} for k, why in found]
+    return shown[0] if shown else None
 
 
 def _reasons(stretch: BadStretch) -> str:

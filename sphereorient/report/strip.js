@@ -3,8 +3,8 @@
 (() => {
   "use strict";
   const DETAIL = { least: 40, most: 200, share: 1 / 5 }; // bins shown large: a share of all, within limits
-  const ROW = { status: 20, camera: 28, error: 54, pictures: 10, axis: 34, gap: 4 }; // heights, CSS px
-  const FONT = "12px system-ui, sans-serif";
+  const ROW = { status: 20, camera: 36, error: 60, pictures: 18, axis: 40, gap: 4 }; // heights, CSS px
+  const FONT = "15px system-ui, sans-serif";
 
   const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
   const known = (values) => values.filter((value) => value !== null);
@@ -121,8 +121,8 @@
       const low = this.owner.lowScore;
       const place = (score) => top + 2 + clamp(1 - (score - low) / (1 - low), 0, 1) * (height - 4);
       this.steps(camera.score, place, (values) => Math.min(...values));
-      this.write("1", this.left - 5, top + 6, "right");
-      this.write(String(low), this.left - 5, top + height - 5, "right");
+      this.write("1", this.left - 5, top + 8, "right");
+      this.write(String(low), this.left - 5, top + height - 7, "right");
     }
 
     /** The stated error of the orientation, logarithmic. */
@@ -130,8 +130,8 @@
       const ticks = this.owner.errorTicks;
       if (!ticks.length) return this.write("no stated errors", this.left + 4, top + height / 2, "left");
       const [low, high] = [Math.log(ticks[0]), Math.log(ticks[ticks.length - 1])];
-      const place = (value) => top + 4 + (1 - (Math.log(value) - low) / (high - low)) * (height - 8);
-      const every = Math.ceil(ticks.length / 4);
+      const place = (value) => top + 9 + (1 - (Math.log(value) - low) / (high - low)) * (height - 18);
+      const every = Math.ceil(ticks.length / 3);
       ticks.forEach((tick, k) => {
         if (k % every) return;
         this.ink.fillStyle = this.owner.colours.line;
@@ -176,7 +176,7 @@
     drawAxis() {
       const { strip, bins } = this.owner;
       const { row, number } = strip;
-      const room = 80 / Math.max(this.right - this.left, 1);
+      const room = 100 / Math.max(this.right - this.left, 1);
       const step = niceStep((this.last - this.first) * strip.per_bin * room);
       const start = number[0] - row[0];
       const gapless = number[bins - 1] - row[bins - 1] === start;
@@ -190,10 +190,10 @@
         const align = x > this.right - 24 ? "right" : x < this.left + 24 ? "left" : "center";
         const label = gapless ? at : number[nearest];
         this.write(String(label), x, this.axisTop + 11, align, "ink");
-        this.write(this.owner.time(nearest, label - number[nearest]), x, this.axisTop + 26, align);
+        this.write(this.owner.time(nearest, label - number[nearest]), x, this.axisTop + 29, align);
       }
       this.write("frame", 2, this.axisTop + 11, "left", "ink");
-      this.write("time (s)", 2, this.axisTop + 26, "left");
+      this.write("time (s)", 2, this.axisTop + 29, "left");
     }
 
     drawCursor() {
@@ -225,15 +225,15 @@
       this.readStyle();
       this.readScales();
       this.readPictures();
-      this.stretches = [...section.querySelectorAll("tr[data-first]")].map((tr) => ({
-        tr, first: Number(tr.dataset.first), last: Number(tr.dataset.last),
+      this.stretches = [...section.querySelectorAll("[data-first]")].map((part) => ({
+        part, first: Number(part.dataset.first), last: Number(part.dataset.last),
       }));
       this.overview = new Plot(this, this.find(".strip__overview"));
       this.detail = new Plot(this, this.find(".strip__detail"));
       this.overview.box = this.detail;
       this.listen();
       this.bin = 0;
-      if (this.stretches.length) this.jump(this.stretches[0]);
+      if (this.stretches.length) this.jump(this.stretches[0]); // the worst frame
       else this.choose(0, true);
       new ResizeObserver(() => this.draw()).observe(this.find(".strip__plots"));
       window.addEventListener("resize", () => this.draw());
@@ -295,7 +295,7 @@
         canvas.addEventListener("pointerleave", () => (this.find(".strip__tip").hidden = true));
       }
       this.section.addEventListener("keydown", (event) => this.onKey(event));
-      for (const stretch of this.stretches) stretch.tr.addEventListener("click", () => this.jump(stretch));
+      for (const stretch of this.stretches) stretch.part.addEventListener("click", () => this.jump(stretch));
       for (const button of this.section.querySelectorAll("[data-step]"))
         button.addEventListener("click", () => this.choose(this.bin + Number(button.dataset.step)));
       this.find(".strip__number").addEventListener("change", (event) => this.goTo(Number(event.target.value)));
@@ -389,7 +389,7 @@
       readout.style.borderLeftColor = this.colours[strip.status[bin]];
       this.find(".strip__number").value = strip.number[bin];
       const row = strip.row[bin];
-      for (const { tr, first, last } of this.stretches) tr.classList.toggle("strip__here", row >= first && row <= last);
+      for (const { part, first, last } of this.stretches) part.classList.toggle("strip__here", row >= first && row <= last);
       for (const { canvas } of [this.overview, this.detail]) {
         const said = { valuemin: strip.number[0], valuemax: strip.number[this.bins - 1], valuenow: strip.number[bin] };
         for (const [name, value] of Object.entries(said)) canvas.setAttribute(`aria-${name}`, value);

@@ -15,6 +15,8 @@ from sphereorient.trajectory import Trajectory
 
 FEW_SEGMENTS = 20  # below, intervals and tests say little
 LOST_SHARE = 0.05  # of the frames: worth a look
+APART_DEG = 5.0  # median distance of the cameras; the paper's method reaches half of it (docs/paper.md)
+MORE = "pass more tracks, or cut a long record with --set statistics.max_duration_s=SECONDS"
 GAUSSIAN = 3.0  # flatness
 CLEAR, WEAK = 0.001, 0.05  # p-values below which a finding is clear, or worth a word: a report makes a dozen tests
 
@@ -29,7 +31,7 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One sentence on the tracks; made by `verdicts`, printed on the page."""
+    """One sentence on the tracks, a doubt with what to do at its end; made by `verdicts`, printed on the page."""
 
     title: str
     grade: Grade
@@ -44,9 +46,11 @@ def verdicts(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
     return found
 
 
-def _say(title: str, words: str, good: bool | None = None) -> Verdict:
-    grade = Grade.NEUTRAL if good is None else Grade.GOOD if good else Grade.DOUBT
-    return Verdict(title=title, grade=grade, words=words)
+def _say(title: str, words: str, do: str = "", *, good: bool = False) -> Verdict:
+    """Return a verdict; with something to do it is a doubt."""
+    if do:
+        return Verdict(title=title, grade=Grade.DOUBT, words=f"{words}; {do}")
+    return Verdict(title=title, grade=Grade.GOOD if good else Grade.NEUTRAL, words=words)
 
 
 def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
@@ -57,12 +61,13 @@ def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
     worst = min(tracks, key=lambda name: float(tracks[name].valid.mean()) if len(tracks[name]) else 0.0)
     if len(tracks) > 1 and valid < frames:
         words += f"; fewest in {worst}, {100 * float(tracks[worst].valid.mean()):.4g} %"
-    yield _say("Measured", words, share >= 1 - LOST_SHARE)
+    do = "see the reasons under Frame by frame, and run `sphereorient check` on the experiment"
+    yield _say("Measured", words, do if share < 1 - LOST_SHARE else "", good=True)
     if all(track.held for track in tracks.values()):
-        yield _say("Place", "the centre is fixed: nothing is said of its translation")
+        yield _say("Place", "the centre is fixed: this page reports the rotation only")
     remarks = dict.fromkeys(remark for track in tracks.values() for remark in track.provenance.get("remarks", ()))
     for remark in list(remarks)[:5]:
-        yield _say("Remark", str(remark), good=False)
+        yield _say("Remark", str(remark), "if this is not meant, `sphereorient check` says what to do")
 
 
 def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
@@ -70,16 +75,13 @@ def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Ve
     if not count:
         longest = max(int(np.bincount(track.segment + 1)[1:].max(initial=0)) for track in tracks.values())
         least = f"{summary.settings.min_frames} frames" + (f" and {least_s:.3g} s" if np.isfinite(least_s) else "")
-        words = (
-            f"none has {least} with a motion: all numbers are unknown; the longest has {longest} frames, and its ends "
-        )
-        words += "are lost to kernels; pass longer tracks, or lower statistics.min_frames"
-        yield _say("Segments", words, good=False)
+        words = f"none has {least} with a motion: all numbers are unknown; the longest has {longest} frames, and its "
+        words += "ends are lost to kernels"
+        yield _say("Segments", words, "pass longer tracks, or lower statistics.min_frames")
         return
     if summary.distributions is None:
-        words = "one segment only: no intervals and no distributions, since the scatter between segments is unknown; "
-        words += "pass more tracks, or cut a long record with --set statistics.max_duration_s=SECONDS"
-        yield _say("Segments", words, good=False)
+        words = "one segment only: no intervals and no distributions, since the scatter between segments is unknown"
+        yield _say("Segments", words, MORE)
         return
     words = f"{count:,} segments, {len(summary.ensemble):,} samples"
     if np.isfinite(least_s):
@@ -87,7 +89,7 @@ def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Ve
         words += f", each longer than {least_s:.3g} s (integral time of the {whose} {summary.integral_time_s:.3g} s)"
     if count < FEW_SEGMENTS:
         words += "; with so few, tails are not well known and intervals of the flatness are too narrow"
-    yield _say("Segments", words, None if count >= FEW_SEGMENTS else False)
+    yield _say("Segments", words, MORE if count < FEW_SEGMENTS else "")
 
 
 def _noise(summary: Summary) -> Iterator[Verdict]:
@@ -96,12 +98,12 @@ def _noise(summary: Summary) -> Iterator[Verdict]:
     shares = {quantity: part.noise_share.value[:3].max() for quantity, part in summary.table.items()}
     if unknown := [quantity for quantity, share in shares.items() if not np.isfinite(share)]:
         words = f"the errors of {', '.join(unknown)} are unknown, at least in some frames: nothing is corrected"
-        yield _say("Noise", words, good=False)
+        yield _say("Noise", words, "track again, or read these numbers as upper limits")
     elif not summary.warnings:
         what = "noise" if summary.ensemble.error == "added" else "smoothed away"
         yield _say("Noise", f"at most {100 * max(shares.values()):.2g} % of any variance is {what}", good=True)
     for warning in summary.warnings:
-        yield _say("Noise", f"{warning}: trust the corrected values, if any", good=False)
+        yield _say("Noise", warning, "read the corrected values, and the figure of kernel widths")
 
 
 def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:
@@ -114,7 +116,8 @@ def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:
         )
         if one.uncorrected_rad is not None and len(one.uncorrected_rad):
             words += f"; without correction of perspective by {np.rad2deg(np.median(one.uncorrected_rad)):.2g}\u00b0"
-        yield _say("Cameras", words)
+        do = "run `sphereorient check`: swapped cameras, movies out of step and a poor calibration look like this"
+        yield _say("Cameras", words, do if median > APART_DEG else "")
 
 
 def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
@@ -136,12 +139,13 @@ def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
 def _attitude(more: Distributions) -> Iterator[Verdict]:
     test = more.uniformity
     how = f"p = {test.p_value:.2g}, as good as {test.effective:.0f} independent attitudes"
-    words, good = "nothing against all attitudes being equally likely", None
+    words, do = "nothing against all attitudes being equally likely", ""
     if test.p_value < CLEAR:
-        words, good = "not all attitudes are equally likely", False
+        words = "not all attitudes are equally likely"
+        do = "see in the figure of the angles which are rare: too few tracks, lost attitudes or an uneven ball"
     elif test.p_value < WEAK:
         words = "weak signs that not all attitudes are equally likely"
-    yield _say("Attitudes", f"{words} ({how})", good)
+    yield _say("Attitudes", f"{words} ({how})", do)
 
 
 def _frames(more: Distributions) -> Iterator[Verdict]:
@@ -152,7 +156,8 @@ def _frames(more: Distributions) -> Iterator[Verdict]:
             yield _say(f"Frame of {name}", f"written in {own} components ({sizes})", good=True)
         else:
             found = "not in lab or body components" if row.frame == "none" else f"written in {row.frame} components"
-            yield _say(f"Frame of {name}", f"{found} ({sizes}): see docs/errata.md E6", good=False)
+            do = "compute it again from the orientations, see docs/errata.md E6"
+            yield _say(f"Frame of {name}", f"{found} ({sizes})", do)
 
 
 def _isotropy(more: Distributions) -> Iterator[Verdict]:

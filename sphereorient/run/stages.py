@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from sphereorient.errors import SettingsError, error_words, refusal
+from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.files.provenance import provenance, sha256
@@ -173,8 +173,15 @@ def track_movies(
     Raises:
         SphereOrientError: missing, unreadable or inconsistent inputs.
     """
+    try:
+        source = experiment if isinstance(experiment, Experiment) else Path(experiment)
+    except TypeError as error:
+        got, do = type(experiment).__name__, "name the movies in it; `sphereorient init MOVIE...` writes one"
+        raise ExperimentError(
+            refusal("experiment", expected="the path of an experiment.yaml", got=got, do=do)
+        ) from error
     request = Request(
-        experiment=experiment if isinstance(experiment, Experiment) else Path(experiment),
+        experiment=source,
         method=method,
         settings=with_proposer(settings or Settings(), proposer),
         cameras=None if cameras is None else tuple(cameras),

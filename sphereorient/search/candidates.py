@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.errors import ShapeError, check_finite, check_tail, refusal, tensor_of
 from sphereorient.trajectory import Reason
 
 SAME_DEG = 12.0  # proposals of two proposers nearer than this are one
@@ -154,9 +154,10 @@ class DiskSearch(nn.Module, ABC):
         Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
 
         Raises:
-            ShapeError: the disks are of another size.
+            ShapeError: the disks are of another size, or not finite.
         """
-        grey = torch.as_tensor(disks).float()
+        grey = tensor_of("disks", disks).float()
+        check_finite("disks", grey)
         return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
 
 

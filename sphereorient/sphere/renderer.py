@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, Rays
 from sphereorient.cameras.ideal import TelecentricCamera
-from sphereorient.errors import CameraError, SettingsError, check_tail, refusal
-from sphereorient.sphere.texture import check_texture_shape, reduced_texture
+from sphereorient.errors import CameraError, SettingsError, check_tail, refusal, tensor_of
+from sphereorient.so3 import check_rotations
+from sphereorient.sphere.texture import as_texture, reduced_texture
 from sphereorient.sphere.view import paint_seen, smooth_positive, sphere_normals
 
 RIM = 0.02  # rounding of the limb, radii^2: the least depth is 0.1 radii
@@ -76,7 +77,7 @@ class SphereRenderer(nn.Module):
 
     Raises:
         SettingsError: not exactly one of camera and size_px, or a radius that is not positive.
-        ShapeError: texture is not (H, 2 H).
+        ShapeError: texture is not (H, 2 H), or not of numbers 0 .. 1.
     """
 
     texture: Tensor
@@ -94,14 +95,17 @@ class SphereRenderer(nn.Module):
         if (camera is None) == (size_px is None):
             got, do = "both" if camera else "neither", "choose a camera's picture or the size of a disk"
             raise SettingsError(refusal("renderer", expected="camera or size_px", got=got, do=do))
+        if size_px is not None and size_px < 1:
+            do = "pass the side of the disk in pixels"
+            raise SettingsError(refusal("size_px", expected="1 or more", got=f"{size_px:g}", do=do))
         if not radius_mm > 0:
             do = "pass the sphere's radius"
             raise SettingsError(refusal("radius_mm", expected="a number above 0", got=f"{radius_mm:g}", do=do))
-        if isinstance(texture, nn.Parameter):
-            self.texture = texture
+        values = as_texture(texture)
+        if isinstance(values, nn.Parameter):
+            self.texture = values
         else:
-            self.register_buffer("texture", torch.as_tensor(texture))
-        check_texture_shape(self.texture)
+            self.register_buffer("texture", values)
         self.radius_mm = radius_mm
         self.camera = orthographic_camera(size_px, 2 * radius_mm / size_px) if size_px else cast("Camera", camera)
         self.sampling = sampling or Sampling()
@@ -114,9 +118,10 @@ class SphereRenderer(nn.Module):
 
         Raises:
             CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
+            ShapeError: orientations that are no rotations.
         """
-        R = torch.as_tensor(R_lab_body, device=self.texture.device)
-        check_tail("R_lab_body", R, 3, 3)
+        R = tensor_of("R_lab_body", R_lab_body).to(self.texture.device)
+        check_rotations("R_lab_body", R)
         # mm differences at half a metre: single precision would move the picture.
         exact = R.dtype if isinstance(self.camera, TelecentricCamera) else torch.float64
         position = torch.as_tensor((0.0,) * 3 if position_mm is None else position_mm).to(R.device, exact)

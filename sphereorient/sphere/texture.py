@@ -1,5 +1,6 @@
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -7,7 +8,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
-from sphereorient.errors import ShapeError, TextureError, check_tail, refusal
+from sphereorient.errors import ShapeError, TextureError, check_tail, refusal, tensor_of
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
@@ -15,6 +16,7 @@ PICTURE_BYTES = 100_000_000
 MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
 OPAQUE = 128  # of 255: texels of less alpha are no paint
 SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
+OVERSHOOT = 2.0  # a map that was learnt may exceed white a little; grey levels are far above
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
 
 
@@ -160,6 +162,18 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     at = (first_row[..., None, None] + steps[:, None]) * closed.shape[1] + first_column[..., None, None] + steps
     texels = closed.reshape(-1)[at]
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
+
+
+def as_texture(texture: Any) -> Tensor:
+    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor; refuse others (ShapeError)."""
+    values = tensor_of("texture", texture)
+    check_texture_shape(values)
+    top = float(values.detach().amax())
+    if not values.is_floating_point() or top > OVERSHOOT:
+        got = f"{str(values.dtype).removeprefix('torch.')} up to {top:g}"
+        do = "convert it to float and divide it by the level of white, as load_texture does"
+        raise ShapeError(refusal("texture", expected="floating-point numbers, 0 black .. 1 white", got=got, do=do))
+    return values
 
 
 def check_texture_shape(texture: Tensor) -> None:

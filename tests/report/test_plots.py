@@ -710,7 +710,7 @@ def test_correlations_are_drawn_in_milliseconds_with_their_integral_times():
         np.testing.assert_allclose(spans, [(t - 0.5, t + 1.0) for t in (4, 5, 6, 7)])
         drawn = axes.collections[0].get_paths()[0].vertices[:, 1]
         assert (drawn.max(), drawn.min()) == pytest.approx((1.2, np.cos(160 * 0.02) - 0.1))
-    assert legend_texts(figure)[:2] == ["x: 4.0 ms (3.5 to 5.0)", "y: above 5.0 ms (4.5 to 6.0), zero not reached"]
+    assert legend_texts(figure)[:2] == ["x: 4.0 ms (3.5 to 5.0)", "y: above 5.0 ms (4.5 to 6.0), no zero"]
 
 
 # widths

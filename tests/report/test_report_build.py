@@ -9,6 +9,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import PIL.Image
 import pytest
 
 from sphereorient.cli import main
@@ -130,6 +131,17 @@ def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, t
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:|#|tables/)""", page)
     assert not re.findall(r"@import|url\((?!data:)", page)
     drawn = {path.stem for path in (out / "figures").iterdir()}
+    assert "2 tracks compared" in page
+    widths = {name: int(px) for name, px in re.findall(r'id="figure-(\w+)" style="width:(\d+)px"', page)}
+    scales = {PIL.Image.open(out / "figures" / f"{name}.png").width / px for name, px in widths.items()}
+    assert max(scales) - min(scales) < 0.01  # text of one size
+    assert re.findall(r"<b>([^<]* of the paper\))", page) == [
+        "Track of b/track.h5 (Figure 7 of the paper)",
+        "PDFs (Figures 11 and 12 of the paper)",
+        "Increments (Figure 11 of the paper)",
+        "Angles (Figure 10 of the paper)",
+        "Durations (Figure 9 of the paper)",
+    ]
     assert {"track", "densities", "increments", "durations", "correlations", "angles", "isotropy"} <= drawn
     assert all(
         (out / "figures" / f"{name}.{suffix}").stat().st_size > 2000 for name in drawn for suffix in ("png", "pdf")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 
+ACTION = re.compile(r".*; (if this is not meant|see|run|pass|track|read|compute) [^;]*$")  # its end says what to do
 FEW = StatisticsSettings(resamples=100)
 
 
@@ -17,6 +19,7 @@ def said(track, distances=(), settings=FEW):
     tracks = track if isinstance(track, dict) else {"track.h5": track}
     found = verdicts(summarise(list(tracks.values()), settings), tracks, distances)
     assert all(verdict.words and not verdict.words.endswith(".") for verdict in found)
+    assert all(verdict.grade != Grade.DOUBT or ACTION.match(verdict.words) for verdict in found)
     return {verdict.title: verdict for verdict in found}
 
 
@@ -85,7 +88,8 @@ def test_remarks_of_the_run_are_repeated_once(lab):
     part = lab.at(np.arange(5000))
     marked = replace(part, provenance={"remarks": ["cam2 is a frame late"]})
     found = verdicts(summarise([marked, marked], FEW), {"a": marked, "b": marked}, [])
-    assert [verdict.words for verdict in found if verdict.title == "Remark"] == ["cam2 is a frame late"]
+    (words,) = (verdict.words for verdict in found if verdict.title == "Remark")
+    assert words.startswith("cam2 is a frame late; ")
 
 
 def test_distances_are_told_in_degrees(lab):
@@ -93,6 +97,8 @@ def test_distances_are_told_in_degrees(lab):
     edges = np.linspace(0, 0.2, 11)
     one = CameraDistance(cameras=("a", "b"), distance_rad=np.full(9, 0.1), edges_rad=edges, pdf=np.ones(10),
                          uncorrected_rad=np.full(9, 0.2), uncorrected_pdf=np.ones(10))  # fmt: skip
+    assert said(part, [replace(one, distance_rad=np.full(9, 0.08))])["Cameras"].grade == Grade.NEUTRAL
+    assert said(part, [one])["Cameras"].grade == Grade.DOUBT
     words = said(part, [one])["Cameras"].words
     assert "5.7°" in words
     assert "without correction of perspective by 11°" in words

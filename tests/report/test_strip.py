@@ -190,7 +190,8 @@ def test_a_hostile_name_stays_a_name():
 def test_the_page_has_no_number_that_json_lacks_and_a_row_a_stretch():
     page = strip_html("planted", troubled(), None)
     assert len(data_of(page)["status"]) == 300
-    assert re.findall(r'data-first="(\d+)" data-last="(\d+)"', page) == [("60", "85"), ("120", "122"), ("200", "200")]
+    rows = r'<tr data-first="(\d+)" data-last="(\d+)"'
+    assert re.findall(rows, page) == [("60", "85"), ("120", "122"), ("200", "200")]
     assert "cam1: too dark (20); cam2: no clear outline (10); the orientation jumps (1)" in page
 
 
@@ -229,10 +230,23 @@ def test_there_are_not_more_pictures_than_asked_and_the_first_is_of_the_worst(co
     assert not count or 20 <= next(iter(why)) < 28
 
 
-def test_a_track_without_trouble_is_shown_evenly():
-    rows = sorted(chosen_frames(good_track(1000), 10))
+def test_a_track_without_trouble_is_shown_evenly_after_its_lowest_score():
+    track = camera_changed(good_track(1000), "cam2", 630, score=0.94)
+    why = chosen_frames(track, 11)
+    (worst, words), *others = why.items()
+    assert worst == 630
+    assert "cam2: score 0.940, usually 0.950" in words
+    rows = sorted(k for k, _ in others)
     assert len(rows) == 10
     assert max(np.diff(rows)) <= 101
+
+
+def test_the_page_begins_with_the_worst_frame_and_its_reason():
+    page = strip_html("planted", troubled(), None)
+    first = re.search(r'data-first="(\d+)".*?</p>', page, re.DOTALL)
+    assert first[1] == "60"
+    assert "gap of 20 frames begins: cam1: too dark, cam2: no clear outline" in first[0]
+    assert first.start() < page.index("strip__main") < page.index("strip__stretches") < page.index("strip__overview")
 
 
 @pytest.mark.slow

@@ -56,6 +56,21 @@ def pixel(part: Any, canvas: str, share: float, y: float) -> tuple[int, ...]:
     return tuple(part.locator(canvas).evaluate(code, [share, y]))
 
 
+def test_the_page_opens_at_the_worst_frame_with_its_picture(open_page, page_path):
+    with open_page(page_path) as page:
+        assert chosen(section(page, "planted")) == 60
+        part = section(page, "excerpt")
+        assert chosen(part) == FIRST
+        assert part.locator(".strip__nearest").inner_text() == f"Picture of frame {FIRST}:"
+        assert "gap of 8 frames begins" in part.locator(".strip__main figcaption").inner_text()
+        picture, plots = (part.locator(of).bounding_box() for of in (".strip__main img", ".strip__detail"))
+        assert picture["y"] < plots["y"]
+        part.locator(".strip__number").fill("3")
+        part.locator(".strip__number").press("Enter")
+        part.get_by_role("button", name=str(FIRST), exact=True).click()
+        assert chosen(part) == FIRST
+
+
 def test_a_click_on_a_stretch_shows_a_frame_of_it_and_its_picture(open_page, page_path):
     with open_page(page_path) as page:
         part = section(page, "excerpt")

@@ -130,7 +130,7 @@ def test_the_report_of_a_fixed_ball_says_nothing_of_its_translation(tmp_path):
     assert not held(moving, 0.01).held  # half its error: it may move
     found = verdicts(summarise(still, FEW), {"track.h5": still}, ())
     assert [one.words for one in found if one.title == "Place"] == [
-        "the centre is fixed: nothing is said of its translation"
+        "the centre is fixed: this page reports the rotation only"
     ]
     said = " ".join(f"{one.title} {one.words}" for one in found)
     assert "velocity" not in said
@@ -138,6 +138,7 @@ def test_the_report_of_a_fixed_ball_says_nothing_of_its_translation(tmp_path):
     assert "Lift" not in said
     write_report({"track.h5": still}, tmp_path / "report", settings=FEW)
     page = re.sub("base64,[A-Za-z0-9+/=]+", "", (tmp_path / "report" / "index.html").read_text())
+    assert "<title>Rotation of a sphere" in page
     assert "rad/s" in page
     assert "m/s" not in page
     for name in ("moments", "fits", "correlations", "isotropy", "kernel_widths", "multi_lag"):

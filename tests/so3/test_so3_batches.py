@@ -77,5 +77,5 @@ def test_a_batch_of_no_elements_passes_gradients(function, dtype, rng):
 def test_every_public_function_is_a_case():
     public = {f for name, f in vars(so3).items() if getattr(f, "__module__", "") == so3.__name__ and name[0] != "_"}
     grids = {so3.lattman_grid, so3.local_grid, so3.random_rotations, so3.lattman_steps}  # no tensor in, or two out
-    algebra = {so3.solve_damped, so3.inverse_damped, so3.cross_first_axis}  # in test_linalg.py
+    algebra = {so3.check_rotations, so3.solve_damped, so3.inverse_damped, so3.cross_first_axis}  # tested by themselves
     assert public - grids - algebra == set(CASES) - {steps}

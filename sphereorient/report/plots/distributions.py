@@ -135,7 +135,7 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
         look.points(axes, density.centres[there], replace(pdf, low=np.maximum(pdf.low, pdf.value / SHORTEST)), look.X)
         _gaussian(axes, density, factor)
         top = float(np.nanmax(density.pdf.value, initial=0.4))
-        axes.text(0, 1.25 * top * factor, f"{lag_ms[lag]:.2g} ms", ha="center", va="bottom", fontsize=6.5)
+        axes.text(0, 1.25 * top * factor, f"{lag_ms[lag]:.2g} ms", ha="center", va="bottom")
     bottom = min((_lowest([shown[lag]]) * 10.0**k for k, lag in enumerate(lags)), default=1e-3)
     axes.set(ylim=(bottom / 3, 8 * 10.0 ** max(len(lags) - 1, 0)), xlim=_reach(list(shown.values())))
     axes.set_xlabel(r"increment of $\omega_x$, lab (standard deviations)")
@@ -166,7 +166,7 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
         of = correlation.value.part((slice(None), i))
         words = look.interval_text(correlation.integral_time_s.part(i), "ms", 1e3)
         if words != "unknown" and not correlation.reached_zero[i]:
-            words = f"above {words}, zero not reached"
+            words = f"above {words}, no zero"
         axes.plot(lag_ms, of.value, label=f"{style.name}: {words}", **style.drawn)
         look.band(axes, lag_ms, of.low, of.high, style)
     for i, style in enumerate(FOUR):

@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
+TEXT_PT = 8.0  # of all text
 # Okabe and Ito's colours: distinct for colour-blind readers, and in grey print.
 AXIS_COLOURS = COLOURS["x"], COLOURS["y"], COLOURS["z"]
 BLACK = "#000000"
@@ -35,8 +36,8 @@ LETTERS_PER_INCH = 15  # of a note; narrow enough for wide letters
 SETTINGS: Final[dict[str, Any]] = {
     "font.family": ["sans-serif"],
     "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same letters everywhere
-    "font.size": 8,
-    "axes.labelsize": 8,
+    **dict.fromkeys(("font.size", "axes.labelsize", "xtick.labelsize", "ytick.labelsize"), TEXT_PT),
+    **dict.fromkeys(("legend.fontsize", "legend.title_fontsize"), TEXT_PT),
     "axes.linewidth": 0.6,
     "axes.grid": True,
     "axes.axisbelow": True,
@@ -44,10 +45,6 @@ SETTINGS: Final[dict[str, Any]] = {
     "grid.linewidth": 0.5,
     "grid.alpha": 0.4,
     "hatch.linewidth": 0.6,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "legend.fontsize": 7,
-    "legend.title_fontsize": 7,
     "legend.frameon": False,
     "legend.handlelength": 2.6,  # long enough to distinguish the dashes
     "lines.linewidth": 1.1,
@@ -175,7 +172,7 @@ def legend_of_figure(figure: Figure, handles: Sequence[Any], ncols: int) -> None
 def note(figure: Figure, words: str) -> None:
     """Write a note below all panels, with line breaks."""
     letters = round(LETTERS_PER_INCH * figure.get_figwidth())
-    figure.supxlabel(textwrap.fill(words, letters), fontsize=7.5)
+    figure.supxlabel(textwrap.fill(words, letters), fontsize=TEXT_PT)
 
 
 def plain_logarithms(axis: Axis) -> None:
