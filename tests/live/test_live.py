@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import socket
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from conftest import REPO
 from live_examples import EXCERPT, LIMIT_S
 from overlay_examples import true_track
 from typer.testing import CliRunner
@@ -75,6 +79,8 @@ def test_the_command_writes_and_sends_each_frame(tmp_path):
     [
         (["--to", "tcp:99999999"], "expected tcp:PORT"),
         (["--to", "poses.csv"], "expected tcp:PORT"),
+        (["--to", "zmq:x"], "zmq:PORT"),
+        (["--source", "genicam:"], "expected movie"),
         (["--source", "webcam"], "expected movie"),
         (["--source", "camera:"], "expected movie"),
     ],
@@ -94,3 +100,13 @@ def test_the_bench_times_each_line(tmp_path):
     assert came > 20
     assert came <= written
     assert 0 < float(re.findall(r"delay: ([0-9.]+) ms", run.output)[0]) < 5000
+
+
+@pytest.mark.slow  # a program of its own, and its ball
+def test_the_closed_loop_holds_the_heading_and_measures_its_delay():
+    command = [sys.executable, str(REPO / "scripts" / "closed_loop.py"), "20", "8"]
+    around = {**os.environ, "PYTHONPATH": str(REPO)}
+    run = subprocess.run(command, env=around, capture_output=True, text=True, check=True)
+    assert 0 < float(re.findall(r"answer: ([0-9.]+) ms", run.stdout)[0]) < 5000
+    held, expected = map(float, re.findall(r"at ([0-9.]+) degrees; expected ([0-9.]+)", run.stdout)[0])
+    assert held == pytest.approx(expected, abs=0.2)
