@@ -95,7 +95,7 @@ def live(
                         for kind, output in outputs:
                             output.send(_worded(kind, now, line))
                         monitor.saw(now, columns)
-                        if now.map_number != number:
+                        if now.map_number > number:
                             number = now.map_number
                             _tell(f"frame {now.number}: orientations are by map {number} from here on")
             finally:

@@ -421,25 +421,36 @@ class OnlineTracker:
         """Take the poses of the last frames, with their times, s, from who followed the ball before."""
         for time_s, poses in seen:
             self._time_s[self._number] = time_s
-            self._chunk.saw(self._number, poses, self._tracker._turns([self._chunk], [poses])[0])
-            self._number += 1
+            self._saw(poses)
+
+    def followed(self, time_s: float, shots: Sequence[Frame]) -> Poses | None:
+        """Return the poses of the frame of a time, later than that of the one before, as the frames before predict
+        them; None where they say nothing of it, or another thing. `shots`: a frame of each view.
+        """
+        self._time_s[self._number] = time_s
+        tracker, ahead = self._tracker, self._tracker._ahead(self._chunk, self._number)
+        (followed,) = [None] if ahead is None else tracker._follow([ahead], [shots])
+        if followed is None:
+            return None
+        poses = tracker._stated(followed)
+        self._saw(poses)
+        return poses
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
-        """Return the poses of the frame of a time, later than that of the one before, and whether they were searched
-        for: the frames before say nothing of it, or another thing. `shots`: a frame of each view.
-        """
-        number, self._number = self._number, self._number + 1
-        self._time_s[number] = time_s
-        self._time_s.pop(number - 4, None)
-        tracker = self._tracker
-        ahead = tracker._ahead(self._chunk, number)
-        (followed,) = [None] if ahead is None else tracker._follow([ahead], [shots])
-        poses = tracker._stated(tracker._search(shots) if followed is None else followed)
-        if followed is None:  # what was before says nothing of the motion from here
-            self._chunk.past.clear()
-            self._chunk.turns.clear()
-        self._chunk.saw(number, poses, tracker._turns([self._chunk], [poses])[0])
-        return poses, followed is None
+        """Return the poses of the frame of a time, and whether they were searched for; see `followed`."""
+        followed = self.followed(time_s, shots)
+        if followed is not None:
+            return followed, False
+        poses = self._tracker._stated(self._tracker._search(shots))
+        self._chunk.past.clear()  # what was before says nothing of the motion from here
+        self._chunk.turns.clear()
+        self._saw(poses)
+        return poses, True
+
+    def _saw(self, poses: Poses) -> None:
+        self._chunk.saw(self._number, poses, self._tracker._turns([self._chunk], [poses])[0])
+        self._number += 1
+        self._time_s.pop(self._number - 4, None)
 
 
 def _usable(shots: Sequence[Frame]) -> Tensor:

@@ -13,7 +13,7 @@ from sphereorient.follow.appearance import NO_BETTER, WIDER, Appearance
 from sphereorient.follow.fixed_centre import FixedCentre, centre_of
 from sphereorient.mapping.chain import chained
 from sphereorient.mapping.disks import Crop, Crops, disks_of, evenly_spread, pixels_of
-from sphereorient.mapping.grid import map_table, texel_areas
+from sphereorient.mapping.grid import texel_areas
 from sphereorient.mapping.iterations import (
     ROW,
     SEPARATE_ITERATIONS,
@@ -23,24 +23,28 @@ from sphereorient.mapping.iterations import (
     iterate,
     map_height,
     map_weight,
+    optics_of,
 )
 from sphereorient.mapping.learn import final_map, interpolated
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fitter import Fitter, Optics, widest_px
+from sphereorient.pose.fitter import Fitter, Optics
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.pixels import Pixels, stacked
 from sphereorient.search import GreySearch
 from sphereorient.sphere.texture_table import texture_table
 
-MOST_FITTED = 60  # frames of an iteration, evenly spread
+MOST_PIXELS = 1200  # of a disk
+MOST_FITTED = 48  # frames of an iteration, evenly spread
 COARSER = 2 / 3  # rows of the map over those of a whole movie's: an iteration must not take long
 FIRST_FRAMES, FIRST_TURN = 24, math.radians(40.0)  # from which a map is begun
 HELD_ITERATIONS = 4  # in which the place stays as the outline gave it
-BLUR_ITERATIONS = 4  # in which the blur is estimated
+BLUR_AFTER, BLUR_ITERATIONS = 1, 5  # iterations after which the blur is estimated, and until which
 SIZE_AFTER, SIZE_STEP = (2, 4), 0.01  # iterations after which the size is sought, and its step
+LATER = 4  # number, as `iterate` counts, of the later iterations: smoothness has settled
 TRIED = 6  # number, as `iterate` counts, of iterations that try a size: light and poses anew
 MOST_LEFT = 20.0  # grey levels: what an occluder leaves counts no more
 RECENT = 10  # frames by which the body frame goes on from relative orientations
+UNSEEN_SIDE = 128  # cells of the table of what is unseen: 1.6 degrees
 LEAST_WEIGHT = 0.05  # of a typical texel's: less is unseen
 WRONG_POSES, WRONG_ITERATIONS = 3, 3  # of each frame tried, at random orientations
 
@@ -66,8 +70,8 @@ class GrowingMap:
 
     def __init__(self, place: Crops, settings: MapSettings) -> None:
         rows = round(COARSER * map_height(place.views, settings) / ROW) * ROW
-        height = settings.height or max(ROW, rows)
-        self._settings = settings.model_copy(update={"height": height})
+        height, pixels = settings.height or max(ROW, rows), min(settings.pixels, MOST_PIXELS)
+        self._settings = settings.model_copy(update={"height": height, "pixels": pixels})
         self._place, self._crops = place, replace(place, position_lab_mm=place.position_lab_mm[:0])
         self._R = torch.zeros(0, 3, 3, dtype=torch.float64)  # R_lab_body as handed over
         self._absolute: list[int] = []  # number of the map that each came from; 0: relative
@@ -106,13 +110,13 @@ class GrowingMap:
         state, k = self._with_all_frames(), self._done
         if k in SIZE_AFTER and state.use.shape[1] == 1:
             state = _better_size(state, self._settings_of(state))
-        after, iteration = iterate(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, BLUR_ITERATIONS))
+        after, iteration = iterate(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
         self._state, self._done, self.moved_rad = after, k + 1, iteration.moved_rad
 
     def _settings_of(self, state: State) -> MapSettings:
-        blur_px = state.blur_px if self._done >= BLUR_ITERATIONS else self._settings.blur_px
+        blur_px = self._settings.blur_px if BLUR_AFTER <= self._done < BLUR_ITERATIONS else state.blur_px
         return self._settings.model_copy(update={"blur_px": blur_px})
 
     def _with_all_frames(self) -> State:
@@ -145,7 +149,7 @@ class GrowingMap:
         weight = map_weight(state)
         unseen = weight < LEAST_WEIGHT * weight[weight > 0].median()
         optics = _optics(state, unseen)
-        fitter = replace(state.map_fitter(), optics=optics)
+        fitter = replace(state.fitter, optics=optics)
         X, use = state.position_lab_mm, state.use
         fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, 3)
         fitter = replace(fitter, widest_px=WIDER * float(fitter.largest_px(X).max()))
@@ -210,11 +214,10 @@ def _left(state: State) -> float:
 
 
 def _optics(state: State, unseen: Tensor) -> Optics:
-    widest = widest_px(state.fitter.views)
-    table = map_table(state.texture, 2 * state.blur_px / widest)
+    optics = optics_of(state.texture, state.fitter.views, state.blur_px)
     if bool(unseen.any()):
-        table.unseen = texture_table(unseen.float(), table.blur_rad, table.side)
-    return Optics(table, state.blur_px, widest)
+        optics.fine.paint.unseen = texture_table(unseen.float(), optics.fine.paint.blur_rad, UNSEEN_SIDE)
+    return optics
 
 
 def _wrong_score(fitter: Fitter, state: State) -> float:

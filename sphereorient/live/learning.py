@@ -51,26 +51,30 @@ class _Handed:
 class MapLearner:
     """Learns the map of the frames handed over, in a process of its own; `newest` is its last one, None: none yet."""
 
-    def __init__(self, place: Crops, settings: MapSettings) -> None:
+    def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.newest: LiveMap | None = None
-        self._place = place
+        self._place: Crops | None = None
         self._last: Tensor | None = None
         self._count = 0
         self._frames: Queue[bytes] = context.Queue()
         self._maps: Queue[bytes] = context.Queue()
-        work = (pickle.dumps((place, settings)), self._frames, self._maps)
-        self._process = context.Process(target=_learn, args=work, daemon=True)
+        self._process = context.Process(target=_learn, args=(self._frames, self._maps), daemon=True)
         self._process.start()
         self._frames.cancel_join_thread()  # what a process that has ended does not take must hold nobody up
         self._paint: tuple[Tensor, Tensor] | None = None
         self._painted = threading.Event()
         threading.Thread(target=self._receive, name="maps", daemon=True).start()
 
+    def begin(self, place: Crops, settings: MapSettings) -> None:
+        """Tell the place of the ball, an empty record of crops with views and one position; frames come after it."""
+        self._place = place
+        self._frames.put(pickle.dumps((place, settings)))
+
     def hand(self, shots: Sequence[Frame], R_lab_body: Tensor, number: int) -> None:
         """Hand over a frame, with its orientation by map `number`, where all cameras see a ball that has turned."""
         still = self._last is not None and float(so3.geodesic_distance(self._last, R_lab_body)) < HANDED_RAD
-        if still or self._count >= HANDED or not all(shot.usable for shot in shots):
+        if self._place is None or still or self._count >= HANDED or not all(shot.usable for shot in shots):
             return
         self._last, self._count = R_lab_body, self._count + 1
         crops = cut_out(self._place, [shot.picture for shot in shots])
@@ -103,11 +107,11 @@ class MapLearner:
                     self._painted.set()
 
 
-def _learn(work: bytes, frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
+def _learn(frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
     """Take frames and give maps; for None instead of a frame, give the paint."""
     torch.set_num_threads(1)
     limit_cores(1)
-    growing, done = GrowingMap(*pickle.loads(work)), 0
+    growing, done = GrowingMap(*pickle.loads(frames.get())), 0
     while True:
         for one in _waiting(frames):
             if one is None:
@@ -138,8 +142,9 @@ def _waiting(frames: "Queue[bytes]") -> list[_Handed | None]:
 class LearningTracker:
     """Follows a ball without a map: relative orientations at first, then by the newest map that is learnt meanwhile.
 
-    `number` is that of the map in use, 0: none. The body frame goes on: where another map begins, the orientation of
-    the frame is that without it.
+    `number` is that of the map by which the last frame was measured, 0: none, its orientation is relative to the one
+    before: the ball shows paint that is not in the map yet. The body frame goes on: where another map begins, the
+    orientation of the frame is that without it.
     """
 
     def __init__(self, place: Crops, settings: Settings, learner: MapLearner) -> None:
@@ -147,43 +152,56 @@ class LearningTracker:
         self.appearance = _unknown(place)
         self._settings, self._learner = settings, learner
         self._relative = RelativeTracker(place, settings.paint)
+        self._map: LiveMap | None = None
         self._online: OnlineTracker | None = None
         self._R_map_body = torch.eye(3, dtype=torch.float64)
         self._tried = 0
         self._past: deque[tuple[float, Poses]] = deque(maxlen=LAST)  # in the body frame
+        self._last: tuple[float, Sequence[Frame], Tensor] | None = None  # measured by the map
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of a frame, in the body frame, and whether they were searched for; see `OnlineTracker`."""
-        found, changed = self._learner.newest, None
-        if found is not None and found.number > self._tried and len(self._past) == LAST:
+        poses, searched = self._measured(time_s, shots)
+        found = self._learner.newest
+        if found is not None and found.number > self._tried and len(self._past) == LAST and supported(poses):
             self._tried = found.number
-            changed = self._changed(found, time_s, shots)
-        poses, searched = self._measured(time_s, shots) if changed is None else (changed, False)
+            poses = self._changed(found, time_s, shots, poses)
         if supported(poses):
             self._past.append((time_s, poses))
             self._learner.hand(shots, poses.R_lab_body[0], self.number)
+            self._last = (time_s, shots, poses.R_lab_body[0]) if self.number else None
         else:
             self._past.clear()
         return poses, searched
 
     def _measured(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
-        if self._online is None:
+        if self._online is None or self._map is None:
             return self._relative.next(time_s, shots)
-        poses, searched = self._online.next(time_s, shots)
-        return _turned(poses, self._R_map_body), searched
+        followed = self._online.followed(time_s, shots)
+        if followed is not None:
+            self.number = self._map.number
+            return _turned(followed, self._R_map_body), False
+        if self._last is not None:
+            self._relative.restart(*self._last)
+        poses, searched = self._relative.next(time_s, shots)
+        if supported(poses):
+            self.number = 0
+            self._online.resume([(time_s, _turned(poses, self._R_map_body.mT))])
+        elif self._map.search.made and any(shot.usable for shot in shots):
+            poses, searched = self._online.next(time_s, shots)
+            self.number = self._map.number
+            poses = _turned(poses, self._R_map_body)
+        return poses, searched
 
-    def _changed(self, found: LiveMap, time_s: float, shots: Sequence[Frame]) -> Poses | None:
-        """Go over to another map where the ball is found with it: None, and nothing measured, where it is not."""
-        online, R_map_body = _follower(found, self._settings), found.R_map_body
-        online.resume([(then, _turned(poses, R_map_body.mT)) for then, poses in self._past])
-        poses, searched = online.next(time_s, shots)
-        if searched or not supported(poses):
-            return None
-        before, _ = self._measured(time_s, shots)
-        if not supported(before):
-            return before
-        self._online, self.number, self.appearance = online, found.number, found.appearance
-        self._R_map_body = poses.R_lab_body[0].mT @ before.R_lab_body[0]
+    def _changed(self, found: LiveMap, time_s: float, shots: Sequence[Frame], now: Poses) -> Poses:
+        """Go over to another map where the ball is found with it near `now`; return the poses of the frame."""
+        online = _follower(found, self._settings)
+        online.resume([(then, _turned(poses, found.R_map_body.mT)) for then, poses in self._past])
+        poses = online.followed(time_s, shots)
+        if poses is None or not supported(poses):
+            return now
+        self._map, self._online, self.number, self.appearance = found, online, found.number, found.appearance
+        self._R_map_body = poses.R_lab_body[0].mT @ now.R_lab_body[0]
         return _turned(poses, self._R_map_body)
 
 

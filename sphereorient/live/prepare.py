@@ -71,8 +71,6 @@ def _learning(
         do = "write it under sphere: texture:, or rename it"
         raise ExperimentError(refusal(str(path), expected="no map there yet", got="a file", do=do))
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
-        place = fixed_place(recording, settings.paint, settings.locate)
-        learner = MapLearner(place, settings.paint)
 
         def save() -> str:
             texture, seen = learner.paint()
@@ -81,7 +79,10 @@ def _learning(
                 write_seen(seen, seen_path(path))
             return f"Wrote {path}"
 
+        learner = MapLearner()  # its process begins while the ball is looked for
         try:
+            place = fixed_place(recording, settings.paint, settings.locate)
+            learner.begin(place, settings.paint)
             yield LiveSetUp(recording=recording, tracker=LearningTracker(place, settings, learner), save_map=save)
         finally:
             learner.close()

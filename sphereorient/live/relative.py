@@ -37,6 +37,12 @@ class RelativeTracker:
         self._last_s = 0.0
         self._rate = torch.zeros(3, dtype=torch.float64)  # rad/s, lab
 
+    def restart(self, time_s: float, shots: Sequence[Frame], R_lab_body: Tensor) -> None:
+        """Go on from a frame whose orientation (3, 3) is known; what was before is forgotten."""
+        seen = disks_of(crops_of(self._place, shots), ONE, self._settings)
+        self._last, self._last_s = (seen, R_lab_body), time_s
+        self._keys = [self._last]
+
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the pose of the frame of a time, and whether it was searched for; no pose where nothing agrees."""
         reason = [shot.reason for shot in shots]

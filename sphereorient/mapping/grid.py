@@ -13,7 +13,6 @@ from torch import Tensor
 from sphereorient.sphere.texture import map_directions, spline_weights, texel_coordinates, texture_coordinates
 from sphereorient.sphere.texture_table import CHUNK, SIDE, SQUARE_25, TextureTable, octahedral_directions, tangents
 
-STEP_RAD = 0.002  # step of a table's finite differences
 POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undefined
 READS = 16  # texels that a look-up reads
 WIDER = 4.0  # times the blur of the map, at which its edges are counted
@@ -80,13 +79,10 @@ def look_up(texture: Tensor, direction_body: Tensor) -> Tensor:
 def map_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> TextureTable:
     """Return the table of a map (H, 2 H) that already has the blur `blur_rad`, rad."""
     parts = []
-    for some in torch.split(octahedral_directions(side), CHUNK):
-        slope = torch.zeros_like(some)
-        for axis in tangents(some):
-            there, back = (look_up(texture.double(), some + sign * STEP_RAD * axis) for sign in (1, -1))
-            slope += ((there - back) / (2 * STEP_RAD))[:, None] * axis
-        value = look_up(texture.double(), some) - (slope * some).sum(-1)
-        parts.append(torch.cat([value[:, None], slope], dim=1).float())
+    for some in torch.split(octahedral_directions(side).float(), CHUNK):
+        value, slope = SplineTable(texture, blur_rad).sample(some.T[None])
+        level = value - (slope * some.T).sum(1)  # of the tangent plane, where directions are 0
+        parts.append(torch.cat([level, slope[0]]).T.contiguous())
     return TextureTable(torch.cat(parts), blur_rad)
 
 

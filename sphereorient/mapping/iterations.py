@@ -15,6 +15,7 @@ from sphereorient.files.threads import side_by_side
 from sphereorient.mapping.compare import fit_levels
 from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
 from sphereorient.mapping.grid import (
+    ROUGH_SIDE,
     NormalMatrix,
     coefficients_blur_rad,
     map_sums,
@@ -35,7 +36,7 @@ from sphereorient.pose.lab_light import LabLight
 from sphereorient.pose.model import Light, light_basis, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
-from sphereorient.sphere.texture_table import texture_table
+from sphereorient.sphere.texture_table import SIDE, texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
@@ -154,7 +155,7 @@ def first_state(
     fitter = Fitter(
         views=crops.views,
         radius_mm=crops.radius_mm,
-        optics=optics_of(texture, crops.views, blur_px),
+        optics=optics_of(texture, crops.views, blur_px, ROUGH_SIDE),  # of its blur alone: see `State`
         light=unknown_light(crops.views),
     )
     return State(
@@ -190,10 +191,10 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
     return state, Iteration(moved_rad=attitude_change_rad(before, state.R_lab_body), misfit=chi2, blur_px=state.blur_px)
 
 
-def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float) -> Optics:
-    """Return the optics of a map (H, 2 H) that has the blur of the pictures."""
+def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float, side: int = SIDE) -> Optics:
+    """Return the optics of a map (H, 2 H) that has the blur of the pictures; `side` counts cells of its table."""
     widest = widest_px(views)
-    return Optics(map_table(blurred, 2 * blur_px / widest), blur_px, widest)
+    return Optics(map_table(blurred, 2 * blur_px / widest, side), blur_px, widest)
 
 
 def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[State, FittedPoses]:

@@ -72,6 +72,11 @@ class GreySearch(DiskSearch):
         """Normalised views of all rotations, (K, P) int8."""
         return self._templates(self._paint)
 
+    @property
+    def made(self) -> bool:
+        """Whether the bank is made."""
+        return "bank" in vars(self)
+
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
         grey = torch.as_tensor(disks).float()

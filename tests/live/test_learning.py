@@ -172,8 +172,9 @@ def test_a_map_of_another_ball_is_not_taken(ball, grown):
 
 @pytest.mark.slow
 def test_a_learner_in_its_own_process_gives_a_map_and_its_paint(ball):
-    learner = MapLearner(ball.place, SETTINGS)
+    learner = MapLearner()
     try:
+        learner.begin(ball.place, SETTINGS)
         for k in range(40):
             learner.hand([ball.shots[k]], ball.R[k], 0)
         assert learner._count <= min(40, HANDED)
