@@ -1,9 +1,10 @@
-"""Build hook of the package: compile its C sources where there is a compiler."""
+"""Build hooks of the package: compile its C sources where there is a compiler; the text that a package index shows."""
 
 from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 import sysconfig
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 SOURCES = [Path("sphereorient/pose/refine.c"), Path("sphereorient/motion/kalman.c")]
 # Fused multiplication and addition would give other bits on other processors.
@@ -34,3 +36,13 @@ class Compiled(BuildHookInterface):
             build_data["artifacts"].append(str(target))
             build_data["pure_python"] = False
             build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")
+
+
+class Readme(MetadataHookInterface):
+    """README.md without its pictures and links into the repository, which an index does not have."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        text = Path(self.root, "README.md").read_text(encoding="utf-8")
+        text = re.sub(r"!\[[^\]]*\]\((?!https?:)[^)]*\)\n*", "", text)
+        text = re.sub(r"\[([^\]]*)\]\((?!https?:)[^)]*\)", r"\1", text)
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}

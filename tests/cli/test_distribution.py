@@ -76,6 +76,11 @@ def test_wheel_and_source_hold_what_they_should(built):
     for needed in ("sphereorient/pose/refine.c", "sphereorient/py.typed"):
         assert needed in names
     assert any(name.endswith("LICENSE") for name in names)
+    (metadata,) = [name for name in names if name.endswith("/METADATA")]
+    text = zipfile.ZipFile(wheel).read(metadata).decode()
+    assert "text/markdown" in text
+    assert "sphereorient track experiment.yaml" in text
+    assert "](" not in text.replace("](http", ""), "a package index has no such files"
     with tarfile.open(source) as packed:
         inside = packed.getnames()
     for needed in ("scripts/build_compiled.py", "README.md", "LICENSE", "CITATION.cff"):
