@@ -39,7 +39,7 @@ COARSER = 2 / 3  # rows of the map over those of a whole movie's: an iteration m
 FIRST_FRAMES, FIRST_TURN = 24, math.radians(40.0)  # from which a map is begun
 HELD_ITERATIONS = 4  # in which the place stays as the outline gave it
 BLUR_AFTER, BLUR_ITERATIONS = 1, 5  # iterations after which the blur is estimated, and until which
-SIZE_AFTER, SIZE_STEP = (2, 4), 0.01  # iterations after which the size is sought, and its step
+SIZE_STEP = 0.01  # of the distances that are tried
 LATER = 4  # number, as `iterate` counts, of the later iterations: smoothness has settled
 TRIED = 6  # number, as `iterate` counts, of iterations that try a size: light and poses anew
 MOST_LEFT = 20.0  # grey levels: what an occluder leaves counts no more
@@ -105,10 +105,12 @@ class GrowingMap:
         """Whether the frames are enough for a map."""
         return len(self) >= FIRST_FRAMES and bool((so3.geodesic_distance(self._R, self._R[0]) > FIRST_TURN).any())
 
-    def iterate(self) -> None:
-        """Improve map, orientations and light once, with all frames."""
+    def iterate(self, *, size: bool = False) -> None:
+        """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
+        three times as long.
+        """
         state, k = self._with_all_frames(), self._done
-        if k in SIZE_AFTER and state.use.shape[1] == 1:
+        if size and state.use.shape[1] == 1:
             state = _better_size(state, self._settings_of(state))
         after, iteration = iterate(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
         if k < HELD_ITERATIONS:
@@ -142,8 +144,8 @@ class GrowingMap:
         rows = torch.nonzero(same)[:, 0] if newest and bool(same.any()) else torch.arange(len(frames))[-RECENT:]
         return so3.nearest_rotation((self._state.R_lab_body[rows].mT @ self._R[frames[rows]]).mean(0))
 
-    def live_map(self) -> LiveMap:
-        """Return what following the ball with the present map needs."""
+    def live_map(self, *, searched: bool = True) -> LiveMap:
+        """Return what following the ball with the present map needs; `searched`: with the bank of its search made."""
         assert self._state is not None
         state = self._state
         weight = map_weight(state)
@@ -163,8 +165,8 @@ class GrowingMap:
         )
         search = GreySearch(state.texture.clamp(0, 1))
         self._number += 1
-        if self._number > 1:
-            search.bank  # noqa: B018  # the first map is wanted soon; those after it come with all that a search needs
+        if searched:
+            search.bank  # noqa: B018
         areas = texel_areas(len(unseen))
         return LiveMap(
             number=self._number,

@@ -1,6 +1,5 @@
 """No map at the start: relative orientations, a map learnt meanwhile in a second process, then orientations by it."""
 
-import math
 import multiprocessing
 import pickle
 import threading
@@ -34,7 +33,7 @@ from sphereorient.pose.lasting import Lasting
 HANDED_RAD = 0.025  # turn from one frame that is handed over to the next
 HANDED = 400  # frames that are handed over at most; the ball has shown its sides by then
 FIRST = 2  # iterations before the first map
-STEADY_RAD = math.radians(0.05)  # the last iteration before a later one moves orientations by less
+SIZED = 2  # times that the distance of the ball is sought
 LAST = 3  # poses from which following goes on with another map
 FEWEST = 6  # iterations of a map that is kept
 IDLE_S = 0.1
@@ -111,9 +110,10 @@ def _learn(frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
     """Take frames and give maps; for None instead of a frame, give the paint."""
     torch.set_num_threads(1)
     limit_cores(1)
-    growing, done = GrowingMap(*pickle.loads(frames.get())), 0
+    growing, done, sized = GrowingMap(*pickle.loads(frames.get())), 0, 0
     while True:
-        for one in _waiting(frames):
+        waiting = _waiting(frames)
+        for one in waiting:
             if one is None:
                 while growing.ready() and done < FEWEST and not growing.arrived:
                     growing.iterate()
@@ -123,9 +123,10 @@ def _learn(frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
                 growing.add(one.crops, one.R_lab_body, one.number)
         if not growing.ready() or growing.arrived:
             continue
-        growing.iterate()
-        done += 1
-        if (done == FIRST or growing.moved_rad < STEADY_RAD) and (found := growing.live_map()).trusted:
+        size = done >= FIRST and sized < SIZED and not waiting  # while frames come, a larger map is wanted first
+        growing.iterate(size=size)
+        done, sized = done + 1, sized + size
+        if done >= FIRST and (found := growing.live_map(searched=not waiting)).trusted:
             maps.put(pickle.dumps(found))
 
 

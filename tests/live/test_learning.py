@@ -92,7 +92,7 @@ def grown(ball):
         growing.add(cut_out(ball.place, [ball.shots[k].picture]), ball.R[k] @ Q, 0)
         if k in (FIRST_FRAMES, 40, 50, 59):
             assert growing.ready()
-            growing.iterate()
+            growing.iterate(size=k >= 50)
     return growing, growing.live_map()
 
 
