@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import Commands, app, check_writable, print_table, progress_bar
+from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import Cameras, ExperimentPath, Quiet, TrackPath, cameras_of, names_in
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.whole_file import write_text, writing
@@ -158,18 +158,20 @@ def live_delay(
     experiment: ExperimentPath,
     rate: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 200.0,
     seconds: Annotated[float, typer.Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Show it from its begin again: it has no seam.")] = False,
     learnt: Annotated[Path | None, typer.Option(help="As of `live`.")] = None,
     cameras: Cameras = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Time `live`: from a picture in memory to its line on a socket, by another process."""
+    """Time `live`: from a picture in memory to its line on a socket, by another process. A truth.h5 beside the
+    experiment tells its errors.
+    """
     from sphereorient.live.bench import delays
 
     options = [] if learnt is None else ["--learnt", str(learnt)]
-    found = delays(experiment, rate, seconds, options, cameras_of(cameras))
-    middle, slow, slowest = (f"{1e3 * found.at(share):.1f}" for share in (0.5, 0.99, 0.999))
-    came = len(found.delay_s)
-    typer.echo(f"{came} lines of {found.written} frames, {found.written - came} dropped, {found.lost} without a pose")
-    typer.echo(f"delay: {middle} ms (median), {slow} ms (99 %), {slowest} ms (99.9 %)")
+    with progress_bar(quiet, unit="lines") as advance:
+        found = delays(experiment, rate, seconds, options, cameras_of(cameras), advance, loop=loop)
+    echo_lines(found.summary())
 
 
 @bench.command("compare")

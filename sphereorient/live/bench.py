@@ -1,18 +1,21 @@
-"""Delay of live tracking: from a picture in memory to the line on a socket, through two programs."""
+"""Delay and error of live tracking: from a picture in memory to the line on a socket, through two programs."""
 
 import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 
+import h5py
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from sphereorient import so3
 from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.live.feed import movie_frames
@@ -22,7 +25,10 @@ from sphereorient.live.shared import SharedFrames
 BEGIN_S = 120.0  # until the tracker's first line
 QUIET_S = 2.0  # without a line: the end
 FIRST = 50  # lines that do not count: caches fill
-TIME, NUMBER = 22, 1  # places in FicTrac's line: time of the frame, ms; its number
+# Columns of FicTrac's line: number, rotation since the stretch began (camera), time (ms), place in the stretch.
+NUMBER, ROTATION, TIME, SEQUENCE = 1, slice(9, 12), 22, 23
+TENTHS = 10
+EVERY = 1000  # lines from one look at the memory to the next
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,10 +38,28 @@ class Delays:
     written: int
     delay_s: NDArray[np.float64]  # (n,), of the lines that came, in order
     lost: int  # of these, lines without a pose
+    error_deg: NDArray[np.float64]  # (n,), of the rotation since the stretch began; NaN without pose or truth
+    memory_mb: NDArray[np.float64]  # of the tracker, every so often; empty where the system does not tell
 
     def at(self, share: float) -> float:
         """Return the delay, s, that this share of the lines keeps."""
         return float(np.quantile(self.delay_s, share)) if len(self.delay_s) else float("nan")
+
+    def summary(self) -> list[str]:
+        """Return all of it in words."""
+        came = len(self.delay_s)
+        middle, slow, slowest = (f"{1e3 * self.at(share):.1f}" for share in (0.5, 0.99, 0.999))
+        words = [f"{came} lines of {self.written} frames, {self.written - came} dropped, {self.lost} without a pose"]
+        words.append(f"delay: {middle} ms (median), {slow} ms (99 %), {slowest} ms (99.9 %)")
+        if np.isfinite(self.error_deg).any():
+            first, *_, last = (float(np.nanmedian(part)) for part in np.array_split(self.error_deg, TENTHS))
+            worst = float(np.nanmax(self.error_deg))
+            said = f"{first:.3f}° in the first tenth (median), {last:.3f}° in the last, {worst:.3f}° at most"
+            words.append(f"error of the rotation since the first frame: {said}")
+        if len(self.memory_mb):
+            first, last = self.memory_mb[0], self.memory_mb[-1]
+            words.append(f"memory of the tracker: {first:.0f} MB at first, {last:.0f} MB at the end")
+        return words
 
 
 def delays(
@@ -45,16 +69,21 @@ def delays(
     options: Sequence[str] = (),
     cameras: Sequence[str] | None = None,
     progress: Progress = silent,
+    *,
+    loop: bool = False,
 ) -> Delays:
-    """Write an experiment's pictures, there and back again, into memory at a rate, and time the lines of `live`.
+    """Write an experiment's pictures into memory at a rate, and time the lines of `live`. The movie is shown there and
+    back again, or with `loop` from its begin again: then it has no seam. A truth.h5 beside it tells the errors.
 
     Raises:
         SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
     """
     with open_recording(experiment, cameras) as recording:
         pictures = [one.pictures for one in movie_frames(recording, paced=False)]
+        R_cam_lab = recording.streams[0].camera.R_cam_lab.numpy()
     size = sum(picture.nbytes for picture in pictures[0] if picture is not None)
-    order = [*range(len(pictures)), *range(len(pictures) - 2, 0, -1)]
+    order = [*range(len(pictures)), *(() if loop else range(len(pictures) - 2, 0, -1))]
+    memory: list[float] = []
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lines:
         lines.bind((HOST, 0))
         lines.settimeout(QUIET_S)
@@ -75,8 +104,14 @@ def delays(
             tracker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
             writer = Thread(target=write, args=(ring,), daemon=True)
             writer.start()
+
+            def saw(count: int) -> None:
+                if count % EVERY == 0:
+                    memory.extend(_memory_mb(tracker.pid))
+                progress("live", count, round(seconds * rate_hz))
+
             try:
-                found = _received(lines, tracker, begun, progress)
+                found = _received(lines, tracker, begun, saw)
             finally:
                 ended.set()
                 writer.join()
@@ -84,16 +119,23 @@ def delays(
             said = (tracker.stderr.read() if tracker.stderr else "").strip().splitlines()
             got = said[-1] if said else f"status {tracker.returncode}"
             raise SphereOrientError(refusal("live", expected="a line a frame", got=got, do="correct that"))
-    table = np.array(found).reshape(-1, 3)[FIRST:]
-    count = int(table[-1, 0] - table[0, 0]) + 1 if len(table) else 0
-    return Delays(written=count, delay_s=table[:, 1], lost=int(table[:, 2].sum()))
+    number, delay_s, *_ = table = np.array(found).reshape(-1, 6)[FIRST:].T
+    return Delays(
+        written=int(number[-1] - number[0]) + 1 if len(number) else 0,
+        delay_s=delay_s,
+        lost=int(np.isnan(table[2]).sum()),
+        error_deg=_errors_deg(np.array(found).reshape(-1, 6), order, R_cam_lab, experiment.parent / "truth.h5")[FIRST:],
+        memory_mb=np.array(memory),
+    )
 
 
 def _received(
-    lines: socket.socket, tracker: "subprocess.Popen[str]", begun: Event, progress: Progress
-) -> list[tuple[float, float, float]]:
-    """Return number, delay (s) and whether there is no pose, of each line until none comes any more."""
-    found: list[tuple[float, float, float]] = []
+    lines: socket.socket, tracker: "subprocess.Popen[str]", begun: Event, saw: Callable[[int], None]
+) -> list[tuple[float, ...]]:
+    """Return of each line, until none comes: number, delay (s), rotation since the stretch began (3), rad, in the
+    camera's axes, and place in the stretch.
+    """
+    found: list[tuple[float, ...]] = []
     begin = time.monotonic()
     while True:
         try:
@@ -104,5 +146,32 @@ def _received(
             continue
         now = time.perf_counter()
         begun.set()
-        found.append((float(parts[NUMBER]), now - float(parts[TIME]) / 1e3, float(parts[2] == "nan")))
-        progress("live", len(found), len(found))
+        rotation = map(float, parts[ROTATION])
+        found.append((float(parts[NUMBER]), now - float(parts[TIME]) / 1e3, *rotation, float(parts[SEQUENCE])))
+        saw(len(found))
+
+
+def _errors_deg(
+    table: NDArray[np.float64], order: Sequence[int], R_cam_lab: NDArray[np.float64], truth: Path
+) -> NDArray[np.float64]:
+    """Return the error of the rotation since the stretch began, (n,), degrees; NaN where it is not known."""
+    if not truth.is_file() or not len(table):
+        return np.full(len(table), np.nan)
+    with h5py.File(truth, "r") as file:
+        R = np.asarray(file["orientation"][()])
+    row = np.array(order)[(table[:, 0].astype(int) - 1) % len(order)]
+    begins = np.maximum.accumulate(np.where(table[:, 5] == 1, np.arange(len(table)), 0))
+    true = torch.from_numpy(R_cam_lab @ R[row] @ R[row[begins]].transpose(0, 2, 1) @ R_cam_lab.T)
+    error: NDArray[np.float64] = np.degrees(
+        so3.geodesic_distance(so3.exp(torch.from_numpy(table[:, 2:5])), true).numpy()
+    )
+    return error
+
+
+def _memory_mb(process: int) -> list[float]:
+    """Return the memory of a process, as Linux tells it."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return []
+    return [float(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")]

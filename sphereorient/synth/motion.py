@@ -80,6 +80,17 @@ def random_motion(
     return RandomMotion(path=replace(path, amplitude=path.amplitude * squeeze), omega=omega, R_start=R_start)
 
 
+def without_seam(motion: RandomMotion, period_s: float) -> RandomMotion:
+    """Return a motion that is the same after a period: whole waves of the path, whole turns about one axis."""
+    waves = (motion.path.rate * period_s / (2 * math.pi)).round().clamp_min(1.0)
+    path = replace(motion.path, rate=waves * 2 * math.pi / period_s)
+    omega = motion.omega.amplitude.square().sum(0).div(2).sqrt()  # rms of its components
+    turns = max(1, round(float(omega.norm()) * period_s / (2 * math.pi)))
+    even = torch.nn.functional.normalize(omega, dim=0) * (2 * math.pi * turns / period_s)
+    still = _Waves(amplitude=even[None], rate=omega.new_zeros(1), phase=torch.full((1, 3), math.pi / 2).double())
+    return replace(motion, path=path, omega=still)
+
+
 def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8) -> Tensor:
     """Integrate dR/dt = [omega_lab]x R from R_start at time 0; return R at every instant."""
     start = torch.cat([time_s.new_zeros(1), time_s[:-1]])

@@ -19,6 +19,7 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     omega_rms: float = Field(8.0, ge=0, description="rad/s per component; the paper's sphere: 7.8")
     velocity_time: float = Field(0.12, gt=0, description="correlation time of the velocity, s")
     omega_time: float = Field(0.03, gt=0, description="correlation time of the angular velocity, s")
+    periodic: bool = Field(False, description="a motion without a seam: whole turns about one axis in the movie")
     volume_mm: float = Field(45.0, gt=0, description="the centre stays within about this distance from the origin")
     image_size: tuple[int, int] = Field((650, 650), description="width and height, px")
     distance_mm: float = Field(520.0, gt=0, description="of the cameras from the origin")

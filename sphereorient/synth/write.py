@@ -18,7 +18,7 @@ from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
 from sphereorient.synth.degrade_scene import Filming, degraded_settings, wrong_cameras
-from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
+from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion, without_seam
 from sphereorient.synth.scene import RenderedScene, digitise, expose, make_scene
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import degradation, severity
@@ -112,7 +112,7 @@ def frame_times_s(settings: SynthSettings) -> Tensor:
 
 def motion_of(settings: SynthSettings) -> RandomMotion:
     """Draw the motion of a synthetic experiment."""
-    return random_motion(
+    motion = random_motion(
         settings.velocity_rms,
         settings.velocity_time,
         settings.omega_rms,
@@ -120,6 +120,7 @@ def motion_of(settings: SynthSettings) -> RandomMotion:
         settings.volume_mm,
         settings.seed,
     )
+    return without_seam(motion, settings.frames / settings.frame_rate) if settings.periodic else motion
 
 
 def _as_file(texture: Tensor) -> NDArray[np.uint8]:

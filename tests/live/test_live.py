@@ -100,6 +100,7 @@ def test_the_bench_times_each_line(tmp_path):
     assert came > 20
     assert came <= written
     assert 0 < float(re.findall(r"delay: ([0-9.]+) ms", run.output)[0]) < 5000
+    assert float(re.findall(r"([0-9.]+)° in the last", run.output)[0]) < 0.2, "against the excerpt's truth"
 
 
 @pytest.mark.slow  # a program of its own, and its ball

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from conftest import assert_close
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.synth import Motion6D, RandomMotion, random_motion
+from sphereorient.synth import Motion6D, RandomMotion, SynthSettings, random_motion
+from sphereorient.synth.write import motion_of
 
 STEP_S = 1e-4
 
@@ -119,3 +122,19 @@ def test_without_velocity_and_rotation_it_stands_still():
     now = motion(velocity_rms=0.0, omega_rms=0.0).at(torch.arange(5, dtype=torch.float64))
     assert (now.position_lab_mm == 0).all()
     assert_close(now.R_lab_body, motion().R_start.expand(5, 3, 3))
+
+
+def test_a_periodic_motion_has_no_seam_and_its_rates_are_those_of_its_poses():
+    settings = SynthSettings(frames=50, frame_rate=100.0, periodic=True, omega_rms=9.0, velocity_rms=0.1, seed=4)
+    motion = motion_of(settings)
+    step = 1e-4
+    time_s = torch.tensor([0.0, step, 0.5, 0.5 + step], dtype=torch.float64)
+    now = motion.at(time_s)
+    assert_close(now.position_lab_mm[:2], now.position_lab_mm[2:], atol=1e-9)
+    assert_close(now.R_lab_body[:2], now.R_lab_body[2:], atol=1e-9)
+    assert_close(now.omega_lab_rad_s[0], so3.log(now.R_lab_body[1] @ now.R_lab_body[0].mT) / step, atol=1e-6)
+    assert_close(now.velocity_m_s[0], (now.position_lab_mm[1] - now.position_lab_mm[0]) / step / 1000, atol=1e-2)
+    assert not now.alpha_lab_rad_s2.any()
+    turns = now.omega_lab_rad_s[0].norm() * 0.5 / (2 * math.pi)
+    assert turns == pytest.approx(round(float(turns)))
+    assert 0.5 < float(now.omega_lab_rad_s[0].norm()) / (9.0 * math.sqrt(3)) < 1.5
