@@ -84,7 +84,7 @@ def live(
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
             feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"), tell=_tell)
-            monitor, number = Monitor(feed), tracker.number
+            monitor, number = Monitor(feed, _tell), tracker.number
             shown.views, shown.radius_mm, shown.monitor = views, recording.experiment.radius_mm, monitor
             shown.save_map = opened.save_map
             try:

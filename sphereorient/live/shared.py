@@ -6,9 +6,12 @@ writer writes time and pictures first, then the number of frames.
 """
 
 import mmap
+import os
 import struct
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,6 +27,7 @@ MAGIC = b"SPHEREO1"
 SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # places of the numbers behind MAGIC
 HEAD = 5  # words of 8 bytes
 WORD = 8
+REPLACED_S = 0.5  # between looks for another ring
 NEXT_S = 0.0002  # between looks for a new frame
 MOST_SLOTS = 1 << 16
 
@@ -70,20 +74,31 @@ class SharedFrames:
 
 def shared_frames(path: Path, streams: Sequence[CameraStream]) -> Iterator[Arrival]:
     """Yield the frames of a ring, each once; of those that were written over before they were read the numbers are left
-    out.
+    out. Where another ring of this name takes its place, the numbers go on with that.
 
     Raises:
         MovieError: no such ring, or one of frames of another size.
     """
-    try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory:
-            yield from _read(memory, path, FrameBytes(streams))
-    except (OSError, ValueError):  # ValueError: an empty file
-        do = "begin the program that writes it (docs/live.md)"
-        raise MovieError(refusal(str(path), expected="a ring of frames", got="none", do=do)) from None
+    before = 0  # frames of former rings
+    again = True
+    while again:
+        again, number = False, -1
+        try:
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as memory:
+                for found in _read(memory, path, os.fstat(file.fileno()).st_ino, FrameBytes(streams)):
+                    if again := found is None:
+                        break
+                    number = found.number
+                    yield replace(found, number=before + number) if before else found
+        except (OSError, ValueError):  # ValueError: an empty file
+            do = "begin the program that writes it (docs/live.md)"
+            raise MovieError(refusal(str(path), expected="a ring of frames", got="none", do=do)) from None
+        before += number + 1
 
 
-def _read(memory: mmap.mmap, path: Path, layout: FrameBytes) -> Iterator[Arrival]:
+def _read(memory: mmap.mmap, path: Path, file_number: int, layout: FrameBytes) -> Iterator[Arrival | None]:
+    """Yield the frames of a ring, and None where another file of its name has taken its place."""
+
     def word(place: int) -> int:
         return int.from_bytes(memory[WORD * place : WORD * (place + 1)], "little")
 
@@ -94,12 +109,18 @@ def _read(memory: mmap.mmap, path: Path, layout: FrameBytes) -> Iterator[Arrival
         got = f"{size} bytes a frame" if right else "another file"
         do = "write the pictures of all cameras, of the size and type of the experiment's movies"
         raise MovieError(refusal(str(path), expected=f"a ring of {layout.size} bytes a frame", got=got, do=do))
-    number = max(0, word(WRITTEN) - 1)
+    number, look_s = max(0, word(WRITTEN) - 1), time.perf_counter()
     while True:
         written = word(WRITTEN)
         if number >= written:
             if word(ENDED):
                 return
+            if time.perf_counter() > look_s + REPLACED_S:
+                look_s = time.perf_counter()
+                with suppress(OSError):
+                    if path.stat().st_ino != file_number and path.stat().st_size:
+                        yield None
+                        return
             time.sleep(NEXT_S)
             continue
         number = max(number, written - slots + 1)

@@ -77,6 +77,8 @@ def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Ve
         least = f"{summary.settings.min_frames} frames" + (f" and {least_s:.3g} s" if np.isfinite(least_s) else "")
         words = f"none has {least} with a motion: all numbers are unknown; the longest has {longest} frames, and its "
         words += "ends are lost to kernels"
+        if not any(np.isfinite(track.velocity).any() for track in tracks.values()):
+            words = "no motion: nothing smoothed these poses, so velocities are unknown, as in a track of `live`"
         yield _say("Segments", words, "pass longer tracks, or lower statistics.min_frames")
         return
     if summary.distributions is None:

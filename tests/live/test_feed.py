@@ -210,3 +210,21 @@ def test_a_slow_source_does_not_stall(monkeypatch):
 
     list(Feed(source(), 10, wait=True, tell=told.append))
     assert len(told) <= 4  # before the second frame nothing is known of the rate
+
+
+def test_a_ring_that_another_one_replaces_is_read_on(recording, tmp_path):
+    """The acquisition program was killed, and began again."""
+    path = tmp_path / "ring"
+    movies = list(movie_frames(recording, paced=False))
+    size = sum(picture.nbytes for picture in movies[0].pictures)
+    killed = SharedFrames(path, size)
+    killed.write(0.0, movies[0].pictures)
+    frames = shared_frames(path, recording.streams)
+    assert next(frames).number == 0
+    path.unlink()
+    with SharedFrames(path, size) as ring:
+        for k in range(3):
+            ring.write(1.0 + k, movies[1 + k].pictures)
+        found = next(frames)
+        assert (found.number, found.time_s) == (1 + 2, 3.0), "the newest one; numbers go on"
+        assert np.array_equal(found.pictures[0], movies[3].pictures[0])

@@ -113,6 +113,14 @@ def test_without_a_segment_that_counts_the_reason_is_told(lab):
     assert "Noise" not in found
 
 
+def test_a_track_that_nothing_smoothed_has_no_motion_to_report(lab):
+    rates = ("velocity", "acceleration", "omega_lab", "alpha_lab")
+    nothing = {name: np.full_like(getattr(lab, name), np.nan) for name in rates}
+    found = said(replace(lab, **nothing))
+    assert "no motion: nothing smoothed these poses" in found["Segments"].words
+
+
+
 def test_rates_without_errors_are_named(lab):
     one = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax()))
     found = said(replace(one, omega_lab_sigma=one.omega_lab_sigma * np.nan))["Noise"]
