@@ -424,9 +424,11 @@ class OnlineTracker:
             self._saw(poses)
 
     def followed(self, time_s: float, shots: Sequence[Frame]) -> Poses | None:
-        """Return the poses of the frame of a time, later than that of the one before, as the frames before predict
-        them; None where they say nothing of it, or another thing. `shots`: a frame of each view.
+        """Return the poses of the frame of a time as the frames before predict them; None where they say nothing of it,
+        or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
         """
+        if not time_s > self._time_s.get(self._number - 1, -math.inf):
+            self._forget()
         self._time_s[self._number] = time_s
         tracker, ahead = self._tracker, self._tracker._ahead(self._chunk, self._number)
         (followed,) = [None] if ahead is None else tracker._follow([ahead], [shots])
@@ -442,10 +444,13 @@ class OnlineTracker:
         if followed is not None:
             return followed, False
         poses = self._tracker._stated(self._tracker._search(shots))
-        self._chunk.past.clear()  # what was before says nothing of the motion from here
-        self._chunk.turns.clear()
+        self._forget()  # what was before says nothing of the motion from here
         self._saw(poses)
         return poses, True
+
+    def _forget(self) -> None:
+        self._chunk.past.clear()
+        self._chunk.turns.clear()
 
     def _saw(self, poses: Poses) -> None:
         self._chunk.saw(self._number, poses, self._tracker._turns([self._chunk], [poses])[0])

@@ -52,11 +52,13 @@ class RelativeTracker:
         now = disks_of(crops_of(self._place, shots), ONE, self._settings)
         searched, R = True, torch.eye(3, dtype=torch.float64)
         if self._last is not None:
-            found, searched = self._compared(now, so3.exp((time_s - self._last_s) * self._rate) @ self._last[1])
+            step_s = time_s - self._last_s
+            found, searched = self._compared(now, so3.exp(max(step_s, 0.0) * self._rate) @ self._last[1])
             if found is None:
                 return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason]), True
             R = found
-            self._rate = so3.log(R @ self._last[1].mT) / (time_s - self._last_s) * (not searched)
+            known = step_s > 0 and not searched
+            self._rate = so3.log(R @ self._last[1].mT) / step_s if known else torch.zeros_like(self._rate)
         self._last, self._last_s = (now, R), time_s
         self._keep(now, R)
         parts = blank_parts(len(shots), 1)

@@ -83,6 +83,14 @@ def test_a_dark_frame_and_another_thing_have_no_relative_orientation(ball):
     assert error_deg(turn[None], (ball.R[6] @ ball.R[0].mT)[None]) < 2.0
 
 
+@pytest.mark.slow
+def test_relative_orientations_survive_times_that_stand(ball):
+    tracker = RelativeTracker(ball.place, SETTINGS)
+    found = [tracker.next(time_s, [ball.shots[k]])[0] for k, time_s in enumerate((0.0, 0.1, 0.1, 0.05, 0.2))]
+    R = torch.cat([poses.R_lab_body for poses in found])
+    assert error_deg(R[1:] @ R[:-1].mT, ball.R[1:5] @ ball.R[:4].mT).max() < 1.0
+
+
 @pytest.fixture(scope="module")
 def grown(ball):
     """A map of 60 frames, after four iterations, from orientations in the body frame of the first frame."""

@@ -60,6 +60,18 @@ def test_a_jump_is_found_and_told(tmp_path):
         assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
 
 
+def test_times_that_stand_or_go_back_begin_anew():
+    truth = torch.from_numpy(true_track().orientation)
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+        frames = list(movie_frames(opened.recording, paced=False))[:12]
+        times = [0.01 * k for k in (0, 1, 2, 3, 3, 4, 5, 6, 1, 2, 3, 4)]
+        shown = [replace(frame, time_s=time_s) for frame, time_s in zip(frames, times, strict=True)]
+        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, shown))
+    assert [n for n, now in enumerate(found) if now.found] == [0, 4, 8]
+    for k, now in enumerate(found):
+        assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+
+
 def test_the_command_writes_and_sends_each_frame(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
         reader.bind(("127.0.0.1", 0))

@@ -120,7 +120,6 @@ def test_a_track_that_nothing_smoothed_has_no_motion_to_report(lab):
     assert "no motion: nothing smoothed these poses" in found["Segments"].words
 
 
-
 def test_rates_without_errors_are_named(lab):
     one = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax()))
     found = said(replace(one, omega_lab_sigma=one.omega_lab_sigma * np.nan))["Noise"]

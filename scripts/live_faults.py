@@ -1,0 +1,107 @@
+"""Faults while `live` tracks: a black-out, a hand before the ball, a turn of 60 degrees between frames, a lamp.
+
+    scripts/live_faults.py EXPERIMENT [--learnt learnt.h5] [--cameras cam1]
+
+The frames of the experiment, changed, one by one; truth.h5 beside it tells errors. Prints Markdown: of each fault how
+many frames are without a pose or flagged, how many are wrong without a flag, and the time from the arrival of the first
+good frame to its pose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+
+from sphereorient import so3
+from sphereorient.live.feed import Arrival, movie_frames
+from sphereorient.live.live import Measured, measured
+from sphereorient.live.prepare import open_live
+from sphereorient.methods.settings import Settings
+
+FIRST, LONG_S, JUMP_DEG = 60, 0.5, 60.0
+HAND_GREY, HAND_SHARE, LAMP = 128, 0.7, 0.6
+WRONG_DEG = 1.0  # from truth, one turn of the body frame removed
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("experiment", type=Path)
+    parser.add_argument("--learnt", type=Path)
+    parser.add_argument("--cameras", nargs="+")
+    arguments = parser.parse_args()
+    with h5py.File(arguments.experiment.parent / "truth.h5", "r") as file:
+        R_true = torch.from_numpy(file["orientation"][()])
+    print("| fault | frames of it | of these flagged | wrong without a flag | back after | error before, after |")
+    print("|---|---|---|---|---|---|")
+    for name in ("black-out", "hand", "turn", "lamp"):
+        with open_live(arguments.experiment, Settings(), arguments.cameras, arguments.learnt) as opened:
+            frames = list(movie_frames(opened.recording, paced=False))
+            views = opened.tracker.appearance.fitter.views
+            middle = measured(opened.tracker, views, [replace(frames[0], time_s=-1.0)])
+            X = torch.from_numpy(next(iter(middle)).position_lab_mm)
+            disks = [(*view.camera.project(X).tolist(), view.diameter_px / 2) for view in views]
+            rows, shown, fault = changed(name, frames, R_true, disks)
+            found = list(measured(opened.tracker, views, arriving(shown)))
+        print(f"| {name} | {told(found, rows, fault, R_true)} |", flush=True)
+
+
+def arriving(frames: Sequence[Arrival]) -> Iterator[Arrival]:
+    """Each frame arrives when it is asked for."""
+    for frame in frames:
+        yield replace(frame, arrived_s=time.perf_counter())
+
+
+def changed(
+    name: str, frames: list[Arrival], R: torch.Tensor, disks: Sequence[tuple[float, float, float]]
+) -> tuple[list[int], list[Arrival], range]:
+    """Rows of the movie that are shown, as frames of even times, and which of these show the fault."""
+    step_s = frames[1].time_s - frames[0].time_s
+    rows, fault = list(range(len(frames))), range(FIRST, FIRST + round(LONG_S / step_s))
+    if name == "turn":
+        away = torch.rad2deg(so3.geodesic_distance(R[FIRST], R[FIRST + 1 :]))
+        rows = [*range(FIRST + 1), *range(FIRST + 1 + int((away > JUMP_DEG).int().argmax()), len(frames))]
+        fault = range(FIRST + 1, FIRST + 2)
+    elif name == "lamp":
+        fault = range(FIRST, len(frames))
+    shown = []
+    for number, row in enumerate(rows):
+        pictures = [np.asarray(picture).copy() for picture in frames[row].pictures]
+        for picture, (u, v, radius) in zip(pictures, disks, strict=True):
+            if number in fault and name == "black-out":
+                picture[:] = 0
+            elif number in fault and name == "hand":
+                y, x = np.ogrid[: picture.shape[0], : picture.shape[1]]
+                picture[(x < u + radius * (2 * HAND_SHARE - 1)) & (abs(y - v) < 2 * radius)] = HAND_GREY
+            elif number in fault and name == "lamp":
+                picture[:] = (LAMP * picture).astype(picture.dtype)
+        shown.append(replace(frames[row], number=number, time_s=number * step_s, pictures=pictures))
+    return rows, shown, fault
+
+
+def told(found: list[Measured], rows: list[int], fault: range, R_true: torch.Tensor) -> str:
+    """Cells of a fault's row."""
+    valid = np.array([now.valid for now in found])
+    flagged = ~valid | np.array([now.found for now in found])
+    R, true = torch.from_numpy(np.stack([now.R_lab_body for now in found])).nan_to_num(), R_true[rows]
+    number = np.arange(len(found))
+    before, good = valid & (number < fault.start), number >= fault.stop  # good frames again
+    if len(fault) == 1 or fault.stop == len(found):  # the fault is a change, after which pictures are good
+        good = number >= fault.start
+    Q = so3.nearest_rotation((true[before].mT @ R[before]).mean(0))
+    off = torch.rad2deg(so3.geodesic_distance(R, true @ Q)).numpy()
+    back = int(np.flatnonzero(good & valid)[0])
+    when = f"{back - int(np.flatnonzero(good)[0])} frames, {1e3 * found[back].latency_s:.0f} ms"
+    silent = int((valid & ~flagged & (off > WRONG_DEG)).sum())
+    errors = f"{np.median(off[before]):.3f}°, {np.median(off[good & valid]):.3f}°"
+    return f"{len(fault)} | {int(flagged[fault.start : fault.stop].sum())} | {silent} | {when} | {errors}"
+
+
+if __name__ == "__main__":
+    main()
