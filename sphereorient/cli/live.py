@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sphereorient.live.live import Measured
     from sphereorient.live.outputs import Output
 
+SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
 WAITING = 16  # frames of a camera that wait at most
 
 
@@ -83,6 +84,7 @@ def live(
                     output.begin(blocks, blocks.head(chosen, command_line()))
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
+            sys.setswitchinterval(SWITCH_S)
             feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"), tell=_tell)
             monitor, number = Monitor(feed, _tell), tracker.number
             shown.views, shown.radius_mm, shown.monitor = views, recording.experiment.radius_mm, monitor
