@@ -1,7 +1,6 @@
 """No map at the start: relative orientations, a map learnt meanwhile in a second process, then orientations by it."""
 
 import multiprocessing
-import pickle
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -9,8 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.queues import Queue
 from queue import Empty
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
@@ -43,7 +45,7 @@ SAVED_S = 120.0  # in which a map is finished
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Handed:
     crops: Sequence[Crop]  # one of each camera
-    R_lab_body: Tensor  # (3, 3)
+    R_lab_body: NDArray[np.float64]  # (3, 3)
     number: int  # of the map that it came from; 0: none
 
 
@@ -56,8 +58,8 @@ class MapLearner:
         self._place: Crops | None = None
         self._last: Tensor | None = None
         self._count = 0
-        self._frames: Queue[bytes] = context.Queue()
-        self._maps: Queue[bytes] = context.Queue()
+        self._frames: Queue[Any] = context.Queue()
+        self._maps: Queue[Any] = context.Queue()
         self._process = context.Process(target=_learn, args=(self._frames, self._maps), daemon=True)
         self._process.start()
         self._frames.cancel_join_thread()  # what a process that has ended does not take must hold nobody up
@@ -68,7 +70,7 @@ class MapLearner:
     def begin(self, place: Crops, settings: MapSettings) -> None:
         """Tell the place of the ball, an empty record of crops with views and one position; frames come after it."""
         self._place = place
-        self._frames.put(pickle.dumps((place, settings)))
+        self._frames.put((place, settings))
 
     def hand(self, shots: Sequence[Frame], R_lab_body: Tensor, number: int) -> None:
         """Hand over a frame, with its orientation by map `number`, where all cameras see a ball that has turned."""
@@ -77,14 +79,14 @@ class MapLearner:
             return
         self._last, self._count = R_lab_body, self._count + 1
         crops = cut_out(self._place, [shot.picture for shot in shots])
-        self._frames.put(pickle.dumps(_Handed(crops=crops, R_lab_body=R_lab_body, number=number)))
+        self._frames.put(_Handed(crops=crops, R_lab_body=R_lab_body.numpy(), number=number))
 
     def paint(self) -> tuple[Tensor, Tensor]:
         """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H); the body frame
         is that of the orientations handed over. This takes some seconds. PaintError without a map.
         """
         self._painted.clear()
-        self._frames.put(pickle.dumps(None))
+        self._frames.put(None)
         self._painted.wait(SAVED_S)
         if self._paint is None:
             do = "let the ball turn longer, or learn it with `sphereorient map`"
@@ -98,7 +100,7 @@ class MapLearner:
     def _receive(self) -> None:
         with suppress(EOFError, OSError):
             while True:
-                found = pickle.loads(self._maps.get())
+                found = self._maps.get()
                 if isinstance(found, LiveMap):
                     self.newest = found
                 else:
@@ -106,11 +108,11 @@ class MapLearner:
                     self._painted.set()
 
 
-def _learn(frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
+def _learn(frames: "Queue[Any]", maps: "Queue[Any]") -> None:
     """Take frames and give maps; for None instead of a frame, give the paint."""
     torch.set_num_threads(1)
     limit_cores(1)
-    growing, done, sized = GrowingMap(*pickle.loads(frames.get())), 0, 0
+    growing, done, sized = GrowingMap(*frames.get()), 0, 0
     while True:
         waiting = _waiting(frames)
         for one in waiting:
@@ -118,25 +120,25 @@ def _learn(frames: "Queue[bytes]", maps: "Queue[bytes]") -> None:
                 while growing.ready() and done < FEWEST and not growing.arrived:
                     growing.iterate()
                     done += 1
-                maps.put(pickle.dumps(growing.paint() if done else None))
+                maps.put(growing.paint() if done else None)
             else:
-                growing.add(one.crops, one.R_lab_body, one.number)
+                growing.add(one.crops, torch.from_numpy(one.R_lab_body), one.number)
         if not growing.ready() or growing.arrived:
             continue
         size = done >= FIRST and sized < SIZED and not waiting  # while frames come, a larger map is wanted first
         growing.iterate(size=size)
         done, sized = done + 1, sized + size
         if done >= FIRST and (found := growing.live_map(searched=not waiting)).trusted:
-            maps.put(pickle.dumps(found))
+            maps.put(found)
 
 
-def _waiting(frames: "Queue[bytes]") -> list[_Handed | None]:
+def _waiting(frames: "Queue[Any]") -> list[_Handed | None]:
     """Return what waits; wait a little for the first."""
     found: list[_Handed | None] = []
     with suppress(Empty):
-        found.append(pickle.loads(frames.get(timeout=IDLE_S)))
+        found.append(frames.get(timeout=IDLE_S))
         while True:
-            found.append(pickle.loads(frames.get_nowait()))
+            found.append(frames.get_nowait())
     return found
 
 
