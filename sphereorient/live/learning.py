@@ -160,7 +160,6 @@ class LearningTracker:
         self._R_map_body = torch.eye(3, dtype=torch.float64)
         self._tried = 0
         self._past: deque[tuple[float, Poses]] = deque(maxlen=LAST)  # in the body frame
-        self._last: tuple[float, Sequence[Frame], Tensor] | None = None  # measured by the map
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of a frame, in the body frame, and whether they were searched for; see `OnlineTracker`."""
@@ -172,7 +171,8 @@ class LearningTracker:
         if supported(poses):
             self._past.append((time_s, poses))
             self._learner.hand(shots, poses.R_lab_body[0], self.number)
-            self._last = (time_s, shots, poses.R_lab_body[0]) if self.number else None
+            if self.number:
+                self._relative.know(time_s, shots, poses.R_lab_body[0])
         else:
             self._past.clear()
         return poses, searched
@@ -184,8 +184,6 @@ class LearningTracker:
         if followed is not None:
             self.number = self._map.number
             return _turned(followed, self._R_map_body), False
-        if self._last is not None:
-            self._relative.restart(*self._last)
         poses, searched = self._relative.next(time_s, shots)
         if supported(poses):
             self.number = 0
@@ -203,6 +201,8 @@ class LearningTracker:
         poses = online.followed(time_s, shots)
         if poses is None or not supported(poses):
             return now
+        if self._map is None:
+            self._relative.forget()
         self._map, self._online, self.number, self.appearance = found, online, found.number, found.appearance
         self._R_map_body = poses.R_lab_body[0].mT @ now.R_lab_body[0]
         return _turned(poses, self._R_map_body)

@@ -35,13 +35,18 @@ class RelativeTracker:
         self._keys: list[tuple[Disks, Tensor]] = []  # with R_lab_body (3, 3)
         self._last: tuple[Disks, Tensor] | None = None
         self._last_s = 0.0
+        self._known: tuple[float, Sequence[Frame], Tensor] | None = None  # instead of the last one
         self._rate = torch.zeros(3, dtype=torch.float64)  # rad/s, lab
 
-    def restart(self, time_s: float, shots: Sequence[Frame], R_lab_body: Tensor) -> None:
-        """Go on from a frame whose orientation (3, 3) is known; what was before is forgotten."""
-        seen = disks_of(crops_of(self._place, shots), ONE, self._settings)
-        self._last, self._last_s = (seen, R_lab_body), time_s
-        self._keys = [self._last]
+    def forget(self) -> None:
+        """Forget the keyframes: their orientations have drifted from what is known now."""
+        self._keys = []
+
+    def know(self, time_s: float, shots: Sequence[Frame], R_lab_body: Tensor) -> None:
+        """Go on from a frame whose orientation (3, 3) is known by a map."""
+        self._known = time_s, shots, R_lab_body
+        if self._is_far(R_lab_body):
+            self._keys.append((self._disks(shots), R_lab_body))
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the pose of the frame of a time, and whether it was searched for; no pose where nothing agrees."""
@@ -49,7 +54,11 @@ class RelativeTracker:
         use = torch.tensor([shot.usable for shot in shots])
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
-        now = disks_of(crops_of(self._place, shots), ONE, self._settings)
+        if self._known is not None:
+            self._last_s, before, R_before = self._known
+            self._last, self._known = (self._disks(before), R_before), None
+            self._rate = torch.zeros_like(self._rate)
+        now = self._disks(shots)
         searched, R = True, torch.eye(3, dtype=torch.float64)
         if self._last is not None:
             step_s = time_s - self._last_s
@@ -60,7 +69,8 @@ class RelativeTracker:
             known = step_s > 0 and not searched
             self._rate = so3.log(R @ self._last[1].mT) / step_s if known else torch.zeros_like(self._rate)
         self._last, self._last_s = (now, R), time_s
-        self._keep(now, R)
+        if self._is_far(R):
+            self._keys.append((now, R))
         parts = blank_parts(len(shots), 1)
         parts |= {"R_lab_body": R[None], "position_lab_mm": self._place.position_lab_mm[:1]}
         parts["covariance"][..., :3, :3] = SCALE_RAD**2 / 3 * torch.eye(3)
@@ -94,16 +104,21 @@ class RelativeTracker:
     def _nearest(self, now: Disks, R: Tensor) -> list[tuple[Disks, Tensor]]:
         """Return the keyframes that show most of what an orientation shows."""
         here = (R.mT @ now.sight_lab[0][..., None])[..., 0]
+        if not self._keys:
+            return []
         there = torch.stack([(key.mT @ disks.sight_lab[0][..., None])[..., 0] for disks, key in self._keys])
         cosine = (here @ there.mT).flatten(1).amax(1)
         return [self._keys[k] for k in cosine.topk(min(NEAREST, len(self._keys))).indices.tolist()]
 
-    def _keep(self, now: Disks, R: Tensor) -> None:
-        """Take a frame as a keyframe where it is far from all of them."""
-        keys = torch.stack([key for _, key in self._keys]) if self._keys else R[None][:0]
-        near = so3.geodesic_distance(keys, R) < math.radians(self._settings.keyframe_deg)
-        if not bool(near.any()) and len(self._keys) < KEYFRAMES:
-            self._keys.append((now, R))
+    def _is_far(self, R: Tensor) -> bool:
+        """Return whether an orientation is far from those of all keyframes, and there is room for one more."""
+        if not self._keys:
+            return True
+        near = so3.geodesic_distance(torch.stack([key for _, key in self._keys]), R)
+        return len(self._keys) < KEYFRAMES and not bool((near < math.radians(self._settings.keyframe_deg)).any())
+
+    def _disks(self, shots: Sequence[Frame]) -> Disks:
+        return disks_of(crops_of(self._place, shots), ONE, self._settings)
 
 
 def crops_of(place: Crops, shots: Sequence[Frame]) -> Crops:
