@@ -1,7 +1,9 @@
 """No map at the start: relative orientations, a map learnt meanwhile in a second process, then orientations by it."""
 
 import multiprocessing
+import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
@@ -87,7 +89,9 @@ class MapLearner:
         """
         self._painted.clear()
         self._frames.put(None)
-        self._painted.wait(SAVED_S)
+        end_s = time.monotonic() + SAVED_S
+        while not self._painted.wait(IDLE_S) and self._process.is_alive() and time.monotonic() < end_s:
+            pass
         if self._paint is None:
             do = "let the ball turn longer, or learn it with `sphereorient map`"
             raise PaintError(refusal("map", expected="one learnt meanwhile", got="none yet", do=do))
@@ -110,6 +114,7 @@ class MapLearner:
 
 def _learn(frames: "Queue[Any]", maps: "Queue[Any]") -> None:
     """Take frames and give maps; for None instead of a frame, give the paint."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking, which then asks for the paint
     torch.set_num_threads(1)
     limit_cores(1)
     growing, done, sized = GrowingMap(*frames.get()), 0, 0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,6 +15,7 @@ from renders import error_deg
 from test_fixed_centre import truth
 
 from sphereorient import so3
+from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.poses import Poses
@@ -191,3 +195,25 @@ def test_a_learner_in_its_own_process_gives_a_map_and_its_paint(ball):
         learner.close()
     assert texture.shape == seen.shape
     assert float((seen > 0).double().mean()) > 0.3
+
+
+@pytest.mark.slow
+def test_ctrl_c_does_not_end_the_learner_and_without_it_there_is_no_waiting(ball):
+    learner = MapLearner()
+    try:
+        learner.begin(ball.place, SETTINGS)
+        for k in range(30):
+            learner.hand([ball.shots[k]], ball.R[k], 0)
+        until = time.monotonic() + 60
+        while learner.newest is None and time.monotonic() < until:
+            time.sleep(0.1)
+        os.kill(learner._process.pid, signal.SIGINT)
+        assert learner.paint()[0].isfinite().any()
+        learner._process.kill()
+        learner._paint = None
+        begun = time.monotonic()
+        with pytest.raises(PaintError, match="learnt meanwhile"):
+            learner.paint()
+        assert time.monotonic() - begun < 30
+    finally:
+        learner.close()
