@@ -17,7 +17,6 @@ from sphereorient.errors import SettingsError, refusal
 if TYPE_CHECKING:
     from sphereorient.experiment.recording import Recording
     from sphereorient.live.feed import Arrival
-    from sphereorient.live.live import Measured
     from sphereorient.live.outputs import Output
 
 SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
@@ -57,7 +56,7 @@ def live(
     ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
     """
     from sphereorient.live.feed import Feed
-    from sphereorient.live.lines import FicTracLines, fictrac_line
+    from sphereorient.live.lines import FicTracLines, fictrac_line, worded
     from sphereorient.live.live import measured
     from sphereorient.live.monitor import Monitor
     from sphereorient.live.page import LivePage, address, open_page
@@ -95,7 +94,7 @@ def live(
                         columns = lines.columns(now) if table or server is not None else None
                         line = fictrac_line(columns) if table and columns is not None else ""
                         for kind, output in outputs:
-                            output.send(_worded(kind, now, line))
+                            output.send(worded(kind, now, line))
                         monitor.saw(now, columns)
                         if now.map_number > number:
                             number = now.map_number
@@ -126,14 +125,6 @@ def _save(save_map: "Callable[[], str]") -> None:
 
 def _tell(line: str) -> None:
     typer.echo(f"note: {line}", err=True)
-
-
-def _worded(kind: str, now: "Measured", line: str) -> object:
-    from sphereorient.live.lines import json_line
-
-    if kind == "h5":
-        return now
-    return json_line(now) if kind in ("jsonl", "zmq") else line if kind == "dat" else f"FT, {line}"
 
 
 def _check_source(name: str) -> None:

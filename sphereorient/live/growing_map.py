@@ -77,7 +77,8 @@ class GrowingMap:
         self._absolute: list[int] = []  # number of the map that each came from; 0: relative
         self._pixels: list[Pixels] = []
         self._state: State | None = None
-        self._number = self._done = 0
+        self._number = 0
+        self.done = 0  # iterations
         self.moved_rad = math.inf  # by the last iteration; infinite where frames came since
 
     @property
@@ -109,16 +110,16 @@ class GrowingMap:
         """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
         three times as long.
         """
-        state, k = self._with_all_frames(), self._done
+        state, k = self._with_all_frames(), self.done
         if size and state.use.shape[1] == 1:
             state = _better_size(state, self._settings_of(state))
         after, iteration = iterate(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
-        self._state, self._done, self.moved_rad = after, k + 1, iteration.moved_rad
+        self._state, self.done, self.moved_rad = after, k + 1, iteration.moved_rad
 
     def _settings_of(self, state: State) -> MapSettings:
-        blur_px = self._settings.blur_px if BLUR_AFTER <= self._done < BLUR_ITERATIONS else state.blur_px
+        blur_px = self._settings.blur_px if BLUR_AFTER <= self.done < BLUR_ITERATIONS else state.blur_px
         return self._settings.model_copy(update={"blur_px": blur_px})
 
     def _with_all_frames(self) -> State:
@@ -166,7 +167,7 @@ class GrowingMap:
         search = GreySearch(state.texture.clamp(0, 1))
         self._number += 1
         if searched:
-            search.bank  # noqa: B018
+            search.prepare()
         areas = texel_areas(len(unseen))
         return LiveMap(
             number=self._number,

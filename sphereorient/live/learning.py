@@ -31,7 +31,7 @@ from sphereorient.mapping.disks import Crop, Crops, cut_out
 from sphereorient.mapping.grid import ROUGH_SIDE, map_table
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
-from sphereorient.pose.fitter import FIRST_BLUR_PX, Fitter, Optics, unknown_light, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
 from sphereorient.pose.lasting import Lasting
 
 HANDED_RAD = 0.025  # turn from one frame that is handed over to the next
@@ -117,23 +117,22 @@ def _learn(frames: "Queue[Any]", maps: "Queue[Any]") -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking, which then asks for the paint
     torch.set_num_threads(1)
     limit_cores(1)
-    growing, done, sized = GrowingMap(*frames.get()), 0, 0
+    growing, sized = GrowingMap(*frames.get()), 0
     while True:
         waiting = _waiting(frames)
         for one in waiting:
             if one is None:
-                while growing.ready() and done < FEWEST and not growing.arrived:
+                while growing.ready() and growing.done < FEWEST and not growing.arrived:
                     growing.iterate()
-                    done += 1
-                maps.put(growing.paint() if done else None)
+                maps.put(growing.paint() if growing.done else None)
             else:
                 growing.add(one.crops, torch.from_numpy(one.R_lab_body), one.number)
         if not growing.ready() or growing.arrived:
             continue
-        size = done >= FIRST and sized < SIZED and not waiting  # while frames come, a larger map is wanted first
+        size = growing.done >= FIRST and sized < SIZED and not waiting  # else a larger map is wanted first
         growing.iterate(size=size)
-        done, sized = done + 1, sized + size
-        if done >= FIRST and (found := growing.live_map(searched=not waiting)).trusted:
+        sized += size
+        if growing.done >= FIRST and (found := growing.live_map(searched=not waiting)).trusted:
             maps.put(found)
 
 
@@ -233,9 +232,7 @@ def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
 def _unknown(place: Crops) -> Appearance:
     """Return what is known of a ball without a map: where it is seen."""
     table = map_table(torch.full((8, 16), 0.5), FIRST_BLUR_PX / widest_px(place.views), ROUGH_SIDE)
-    optics = Optics(table, FIRST_BLUR_PX, widest_px(place.views))
-    light = unknown_light(place.views)
-    fitter = Fitter(views=place.views, radius_mm=place.radius_mm, optics=optics, light=light)
+    fitter = first_fitter(place.views, place.radius_mm, table, FIRST_BLUR_PX)
     return Appearance(
         fitter=fitter, still=fitter, lasting=Lasting.none(len(place.views)), score_min=0.0, right_score=1.0
     )

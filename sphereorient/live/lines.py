@@ -93,6 +93,13 @@ def json_line(now: Measured) -> str:
     return json.dumps({name: without_nan(value) for name, value in content.items()}, allow_nan=False)
 
 
+def worded(kind: str, now: Measured, line: str) -> object:
+    """Return what an output of a kind takes of a frame, whose FicTrac line is known."""
+    if kind == "h5":
+        return now
+    return json_line(now) if kind in ("jsonl", "zmq") else line if kind == "dat" else f"FT, {line}"
+
+
 def without_nan(value: object) -> object:
     """Return a number, or nested lists, with None, JSON's null, for NaN and infinity."""
     if isinstance(value, float):

@@ -31,7 +31,7 @@ from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, 
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_columns, light_sums, noise_curves, solved_light
-from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, first_fitter, widest_px
 from sphereorient.pose.lab_light import LabLight
 from sphereorient.pose.model import Light, light_basis, no_stray
 from sphereorient.pose.pixels import Pixels
@@ -152,12 +152,8 @@ def first_state(
 ) -> State:
     """Return the initial state from orientations (n, 3, 3) of frames (n,) and a map; `extra_px`: added blur."""
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
-    fitter = Fitter(
-        views=crops.views,
-        radius_mm=crops.radius_mm,
-        optics=optics_of(texture, crops.views, blur_px, ROUGH_SIDE),  # of its blur alone: see `State`
-        light=unknown_light(crops.views),
-    )
+    table = optics_of(texture, crops.views, blur_px, ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
+    fitter = first_fitter(crops.views, crops.radius_mm, table, blur_px)
     return State(
         frames=frames,
         pixels=pixels_of(crops, fitter, frames, settings.pixels, extra_px),

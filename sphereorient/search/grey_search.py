@@ -72,6 +72,10 @@ class GreySearch(DiskSearch):
         """Normalised views of all rotations, (K, P) int8."""
         return self._templates(self._paint)
 
+    def prepare(self) -> None:
+        """Make the bank now, not when it is needed."""
+        self.bank.size()
+
     @property
     def made(self) -> bool:
         """Whether the bank is made."""
