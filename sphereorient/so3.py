@@ -1,22 +1,35 @@
 """Rotations: (..., 3, 3) matrices that act on columns, not checked; rotation vectors (..., 3), rad, right-handed."""
 
+import ctypes
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
+from sphereorient.files.compiled import compiled
 
+SOURCE = Path(__file__).with_suffix("")
 MEAN_STEPS = 12
 NO_ROTATION = 1e-3  # of an entry of R R^T - I: far beyond rounding, half a milliradian
 ROUNDING = 1e-9  # a count that is a whole number by geometry must not be rounded up for the last bits of a sine
 HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic lattice with a point per unit of volume
 
 
+class _Rotations(ctypes.Structure):
+    """The record of so3.c."""
+
+    _fields_ = [("count", ctypes.c_int64), ("from", ctypes.c_void_p), ("to", ctypes.c_void_p)]
+
+
 def exp(rotvec: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length, by Rodrigues' formula."""
     check_tail("rotvec", rotvec, 3)
+    if (done := _compiled("so3_exp", rotvec, 1, (3, 3))) is not None:
+        return done
     turn = torch.linalg.vector_norm(rotvec, dim=-1)[..., None, None]
     # sin(t) / t and (1 - cos(t)) / t^2; a branch that is not taken needs a finite argument for its gradient.
     some = turn > torch.finfo(turn.dtype).tiny ** 0.25
@@ -33,6 +46,8 @@ def log(R: Tensor) -> Tensor:
     Source: Shepperd 1978, through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)
+    if (done := _compiled("so3_log", R, 2, (3,))) is not None:
+        return done
     xx, xy, xz, yx, yy, yz, zx, zy, zz = R.flatten(-2).unbind(-1)
     x, y, z, xy, xz, yz = zy - yz, xz - zx, yx - xy, xy + yx, xz + zx, yz + zy
     squares = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
@@ -48,6 +63,24 @@ def log(R: Tensor) -> Tensor:
     turned = ~(length <= torch.finfo(R.dtype).tiny ** 0.5)  # NaN stays NaN
     length = torch.where(turned, length, torch.ones_like(length))
     return axis * torch.where(turned, 2 * torch.atan2(length, w.abs()) / length, 0.5)
+
+
+def _compiled(name: str, given: Tensor, dims: int, tail: tuple[int, ...]) -> Tensor | None:
+    """Return what compiled code makes of items of `dims` dimensions: items of shape `tail`. None where it cannot: it
+    was not built, numbers are no doubles of this machine, or somebody asks for derivatives.
+    """
+    code = compiled(SOURCE, _Rotations)
+    plain = type(given) is Tensor and given.dtype == torch.float64 and given.device.type == "cpu"
+    if code is None or not plain or given.requires_grad or forward_ad.unpack_dual(given).tangent is not None:  # type: ignore[no-untyped-call]
+        return None
+    given = given.contiguous()
+    try:
+        begin = given.data_ptr()
+    except RuntimeError:  # a tensor of torch.func has no numbers of its own
+        return None
+    made = given.new_empty(*given.shape[: given.ndim - dims], *tail)
+    getattr(code, name)(ctypes.byref(_Rotations(made.numel() // math.prod(tail), begin, made.data_ptr())))
+    return made
 
 
 def check_rotations(name: str, R: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ class FixedCentre:
     covariance_mm2: Tensor  # (3, 3), of its error, which is one and the same in all frames
     follows_rad_mm: Tensor  # (3, 3), error of the orientation, delta lab, per error of the centre: mean over frames
 
-    @property
+    @cached_property
     def spread_mm2(self) -> Tensor:
         """Covariance (3, 3) that holds fits at the centre to FIRM of its error."""
         return FIRM**2 * self.covariance_mm2
@@ -44,8 +45,12 @@ class FixedCentre:
 
     def with_error(self, covariance: Tensor) -> Tensor:
         """Add the centre's own error to covariances (..., 6, 6) of delta (rad) and position (mm) of poses held here."""
+        return covariance + self._error
+
+    @cached_property
+    def _error(self) -> Tensor:
         follows = torch.cat([self.follows_rad_mm, torch.eye(3, dtype=self.follows_rad_mm.dtype)])
-        whole: Tensor = covariance + follows @ self.covariance_mm2 @ follows.mT
+        whole: Tensor = follows @ self.covariance_mm2 @ follows.mT
         return whole
 
 

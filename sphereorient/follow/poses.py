@@ -21,7 +21,7 @@ class Poses(FittedPoses):
         return len(self.nll)
 
 
-def poses_of(fit: FittedPoses, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
+def poses_of(fit: FittedPoses, chosen: Tensor | slice, use: Tensor, reason: Sequence[Reason]) -> Poses:
     """Return some rows of a fit as the poses of one frame."""
     return Poses(**{name: part[chosen] for name, part in fit.parts().items()}, use=use, reason=tuple(reason))
 

@@ -4,9 +4,12 @@ import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import accumulate, combinations, pairwise
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
@@ -18,13 +21,13 @@ from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Fitter, Picture, Shown, Steps
-from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown, Steps
+from sphereorient.pose.settle import NearStart, settled
 from sphereorient.trajectory import Reason
 
+Floats = NDArray[np.float64]
+
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
-NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
-FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 LONG_STEP = 3.0  # times the step before: a longer one changes the motion
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
@@ -37,14 +40,14 @@ OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    position_lab_mm: Tensor  # (3,)
-    R_before: Tensor  # (3, 3), rotation from lab to body in the frame before
-    turn: Tensor  # (3,), rad, lab, since then
+    position_lab_mm: Floats  # (3,)
+    R_before: Floats  # (3, 3), rotation from lab to body in the frame before
+    turn: Floats  # (3,), rad, lab, since then
     use: Tensor  # (C,) bool, cameras that saw the sphere
     reason: tuple[Reason, ...]  # C, why the others did not
-    place_spread: Tensor  # (3, 3), mm^2
+    place_spread: Floats  # (3, 3), mm^2
     rough: bool  # from one predecessor alone: the motion is unknown
-    moved: Tensor  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
+    moved: Floats  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
     open_share: float  # of the time from the frame before to this one, in which the shutter is open
 
 
@@ -56,7 +59,7 @@ class _Chunk:
     last: int  # + 1
     time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
-    turns: deque[Tensor] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
+    turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
 
     def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> _Expected | None:
         """Extrapolate position and rotation, to second order where three frames are known."""
@@ -68,13 +71,15 @@ class _Chunk:
         if len(rows) > 1 and numbers[-2] == frame - 2:
             t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
             on = (t2 - t1) / (t1 - t0)  # 1 for even frames
-        X, spread = last.position_lab_mm[0], last.covariance[0, 3:, 3:]
+        places = [one.position_lab_mm[0].numpy() for one in rows]
+        spreads = [one.covariance[0, 3:, 3:].numpy() for one in rows]
+        X, spread = places[-1], spreads[-1]
         rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
         open_share = exposure_s / (self.time_s[frame] - self.time_s[frame - 1])
-        turn, moved = torch.zeros(3, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
+        turn, moved = np.zeros(3), np.zeros(6)
         if not rough:
-            *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
-            *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
+            *_, X0, X1 = places
+            *_, C0, C1 = spreads
             turn, move, spread = on * self.turns[-1], on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
             astray_mm = ASTRAY_SHARE * radius_mm
             if len(rows) == 3:
@@ -83,25 +88,25 @@ class _Chunk:
                 more = (t2 - t0) / (t1 - self.time_s[frame - 3])
                 turn = (1 + more) * turn - on * before * more * self.turns[0]
                 a, b = on * (1 + more), on * before * more
-                further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
+                further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * spreads[0]
                 # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
-                if float(further.diagonal().sum()) < astray_mm**2:
-                    move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
+                if float(further.trace()) < astray_mm**2:
+                    move, spread = (1 + more) * move - b * (X0 - places[0]), further
             X = X1 + move
-            moved = open_share * torch.cat([turn, move])
+            moved = open_share * np.concatenate([turn, move])
         return _Expected(
             position_lab_mm=X,
-            R_before=last.R_lab_body[0],
+            R_before=last.R_lab_body[0].numpy(),
             turn=turn,
             use=last.use,
             reason=last.reason,
-            place_spread=spread + astray_mm**2 * torch.eye(3, dtype=torch.float64),
+            place_spread=spread + astray_mm**2 * np.eye(3),
             rough=rough,
             moved=moved,
             open_share=open_share,
         )
 
-    def saw(self, frame: int, poses: Poses, turn: Tensor) -> None:
+    def saw(self, frame: int, poses: Poses, turn: Floats) -> None:
         """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
         if supported(poses):
             if self.past:
@@ -157,13 +162,25 @@ class ChunkTracker:
                 found[chunk.first + k] = poses
         yield from (found[k] for k in range(sum(batch)))
 
-    def _turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Tensor:
+    def _turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Floats:
         """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
-        turns = torch.eye(3, dtype=torch.float64).repeat(self._lanes(len(chunks)), 1, 1)
+        turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
         for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
             if chunk.past and supported(poses):
-                turns[row] = poses.R_lab_body[0] @ chunk.past[-1][1].R_lab_body[0].mT
-        return so3.log(turns)[: len(chunks)]
+                turns[row] = poses.R_lab_body[0].numpy() @ chunk.past[-1][1].R_lab_body[0].numpy().T
+        return so3.log(torch.from_numpy(turns))[: len(chunks)].numpy()
+
+    def _disks_px(self, position_lab_mm: Tensor) -> Disks:
+        """Return the fitter's disks of positions (n, 3); those of a fixed centre do not change."""
+        if self.centre is None:
+            return self.fitter.disks_px(position_lab_mm)
+        middles, radius = self._disks_of_centre
+        return middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm))
+
+    @cached_property
+    def _disks_of_centre(self) -> Disks:
+        assert self.centre is not None
+        return self.fitter.disks_px(self.centre.position_lab_mm[None])
 
     def _lanes(self, count: int) -> int:
         """Return the size of batches: always the same, since the last bits depend on it."""
@@ -186,7 +203,8 @@ class ChunkTracker:
         pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
         if pose is None or self.centre is None:
             return pose
-        return replace(pose, position_lab_mm=self.centre.position_lab_mm, place_spread=self.centre.spread_mm2)
+        place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
+        return replace(pose, position_lab_mm=place, place_spread=spread)
 
     def _stated(self, poses: Poses) -> Poses:
         """Return poses with the errors of a fixed centre."""
@@ -200,27 +218,31 @@ class ChunkTracker:
         expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
         frames = [[shot.shown for shot in row] for row in shots]
         usable = torch.tensor([[shot.readable for shot in row] for row in shots])
-        X, R_before, turn, use, spread, moved = (
-            torch.stack([getattr(one, name) for one in expected])
-            for name in ("position_lab_mm", "R_before", "turn", "use", "place_spread", "moved")
+        known = torch.stack([one.use for one in expected])
+        X, R_before, turn, spread, moved = (
+            torch.from_numpy(np.stack([getattr(one, name) for one in expected]))
+            for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
         )
-        R, precision = so3.exp(turn) @ R_before, torch.linalg.inv(spread)
-        known, use = use, use & usable
+        R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
+        use = known & usable
         if any(one.rough for one in expected):
             was = X, R
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
-        disks_px = self.fitter.disks_px(X)
+        disks_px = self._disks_px(X)
         fit = self._fitted(frames, X, R, use, precision, moved, disks_px)
         good = self._supported(fit, use)
-        # Whether a picture is dark or white takes all of it: only where it is not as expected.
-        usable = torch.stack([all_ if ok else _usable(row) for all_, ok, row in zip(usable, good, shots, strict=True)])
-        changed = (use != (known & usable)).any(1)
-        if bool(changed.any()):
-            use = known & usable
-            fit = self._fitted(frames, X, R, use, precision, moved, disks_px).where(changed, fit)
-            good = torch.where(changed, self._supported(fit, use), good)
+        if not bool(good.all()):
+            # Whether a picture is dark or white takes all of it: only where it is not as expected.
+            usable = torch.stack(
+                [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
+            )
+            changed = (use != (known & usable)).any(1)
+            if bool(changed.any()):
+                use = known & usable
+                fit = self._fitted(frames, X, R, use, precision, moved, disks_px).where(changed, fit)
+                good = torch.where(changed, self._supported(fit, use), good)
         first = good
         within = disks_px[1] <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
@@ -241,8 +263,7 @@ class ChunkTracker:
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
                 fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
             good = good | torch.isfinite(nearest)
-        # Another camera is judged only where this frame needs it: results must not depend on the batch.
-        doubtful = ~first | before.any(1)
+        others = torch.zeros_like(use)
         if bool((usable & ~use).any()):
             # A camera without the sphere before may see it again: test it at the joint pose.
             both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision, moved)
@@ -250,9 +271,10 @@ class ChunkTracker:
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
             contradicts = self._contradictory(both, usable, limit)
             back = unused & self._supported(both, usable) & ~contradicts
-            doubtful = doubtful | (unused & contradicts)
             fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
-        others = (good & doubtful)[:, None] & usable & ~use
+            # Another camera is judged only where this frame needs it: results must not depend on the batch.
+            doubtful = ~first | before.any(1) | (unused & contradicts)
+            others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
             one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision, moved)
             others[:, k] &= self._supported(one, _only(usable, k))
@@ -262,7 +284,7 @@ class ChunkTracker:
             for used, contradicts, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
         ]
         good = good & within
-        return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
+        return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
     def _approached(
         self, frames: Sequence[Sequence[Shown]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
@@ -283,42 +305,18 @@ class ChunkTracker:
         use: Tensor,
         precision: Tensor,
         moved: Tensor,
-        disks_px: tuple[Tensor, Tensor] | None = None,
+        disks_px: Disks | None = None,
     ) -> FittedPoses:
-        """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
-        if self.centre is None:
-            # All cameras together determine the position; for one of two the distance is better known from before.
-            precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
-        fine, widest = self.fitter.optics.fine, self.fitter.widest_px
-        pixels = self.fitter.pixels(frames, X, fine, widest, moved, disks_px)
-        fit, far = self._settled(pixels.thinned(FIRST_EVERY), X, R, use, precision, 2)
-        if bool(far.any()):
-            begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
-            pixels = self.fitter.pixels(frames, begin, fine, widest, moved)
-        begin, most_hidden = self._from(fit.position_lab_mm), self.fitter.most_hidden
-        return self._settled(pixels, begin, fit.R_lab_body, use, precision, 3, most_hidden)[0]
-
-    def _settled(
-        self,
-        pixels: Pixels,
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        precision: Tensor,
-        more: int,
-        most_hidden: float = 0.0,
-    ) -> tuple[FittedPoses, Tensor]:
-        """Take one step, and `more` from where that one was long; return also where it was, (B,) bool."""
-        fine = self.fitter.optics.fine
-        fit = self.fitter.fit(pixels, X, R, use, fine, 1, precision, most_hidden)
-        turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
-        # One camera's distances scatter; a change of its picture shows in the rotation as well.
-        far = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
-        if bool(far.any()):
-            begin = self._from(fit.position_lab_mm)
-            again = self.fitter.fit(pixels, begin, fit.R_lab_body, use, fine, more, precision, most_hidden)
-            fit = again.where(far, fit)
-        return fit, far
+        """Fit poses that are nearly right."""
+        begin = NearStart(
+            position_lab_mm=self._from(X),
+            R_lab_body=R,
+            use=use,
+            place_precision=precision,
+            moved=moved,
+            held=self.centre is not None,
+        )
+        return settled(self.fitter, frames, begin, disks_px)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
@@ -326,10 +324,11 @@ class ChunkTracker:
 
     def _supported(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Return which poses have converged and explain all pictures in use well, (B,) bool."""
-        explained = (fit.score >= self.score_min) | ~use
-        arrived = fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD
-        good: Tensor = use.any(1) & explained.all(1) & arrived & ~self._contradictory(fit, use)
-        return good
+        seen = use.numpy()
+        explained = (fit.score.numpy() >= self.score_min) | ~seen
+        arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
+        good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
+        return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
 
     def _contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
         """Return for which poses two cameras disagree, (B,) bool: their pictures are not of one instant."""

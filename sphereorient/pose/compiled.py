@@ -3,20 +3,28 @@
 import ctypes
 import math
 import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.files.compiled import compiled
 from sphereorient.files.threads import cores
+from sphereorient.locate import Background
 from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
 from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
-from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, TUKEY
+
+if TYPE_CHECKING:
+    from sphereorient.pose.settle import NearStart
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
 RESULTS = {
@@ -32,6 +40,7 @@ RESULTS = {
     "nll": (),
     "step": (6,),
 }  # parts of `FittedPoses`, in the order of the record
+READABLE = {np.dtype(name) for name in ("uint8", "uint16", "float32")}  # pixels, in this machine's order of bytes
 SOURCE = Path(__file__).with_name("refine")
 
 
@@ -39,9 +48,8 @@ class _Table(ctypes.Structure):
     _fields_ = [("rows", ctypes.c_void_p), ("side", ctypes.c_int64)]
 
 
+# The records of refine.c, field by field.
 class _Task(ctypes.Structure):
-    """The record `Task` of refine.c, field by field."""
-
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("disks", "places", "inner", "cameras", "tiles", "instants", "origins")),
         *((name, ctypes.c_void_p) for name in ("grey", "behind", "inside", "clipped", "direction", "origin", "axes")),
@@ -70,6 +78,40 @@ class _Task(ctypes.Structure):
         ("place", ctypes.c_void_p),
         ("kept", ctypes.c_void_p),
         *((name, ctypes.c_void_p) for name in RESULTS),
+    ]
+
+
+class _Stencil(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("places", "inner", "tiles")),
+        *((name, ctypes.c_void_p) for name in ("place", "tile")),
+    ]
+
+
+class _Scene(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("width", "height", "origins")),
+        *((name, ctypes.c_void_p) for name in ("behind", "shown", "direction", "origin", "axes")),
+        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm")),
+        ("full_scale", ctypes.c_double),
+    ]
+
+
+class _Shot(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_int64) for name in ("grey", "row", "column", "bytes", "u", "v")]
+
+
+class _Near(ctypes.Structure):
+    _fields_ = [
+        ("task", _Task),
+        ("some", _Stencil),
+        ("all", _Stencil),
+        *((name, ctypes.c_void_p) for name in ("scene", "shot", "moved")),
+        *((name, ctypes.c_int64) for name in ("some_more", "all_more")),
+        ("near_rad", ctypes.c_double),
+        ("most_hidden", ctypes.c_float),
+        ("held", ctypes.c_int64),
+        ("far", ctypes.c_void_p),
     ]
 
 
@@ -129,16 +171,100 @@ def refined(
     task.iterations, task.most_hidden = iterations, most_hidden
     for name, part in (("kept", kept), *parts.items()):
         setattr(task, name, part.data_ptr())
+    _run(code.refine, task, poses)
+    return kept, parts
+
+
+def _run(work: Callable[..., int], task: ctypes.Structure, poses: int) -> None:
+    """Let compiled code do the work of B poses, on all cores."""
     threads = max(1, min(poses, cores()))
     ends = [poses * part // threads for part in range(threads + 1)]
-    work = [
-        lambda begin=begin, end=end: code.refine(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
+    parts = [
+        lambda begin=begin, end=end: work(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
         for begin, end in pairwise(ends)
     ]
-    others = [_threads().submit(part) for part in work[1:]]
-    if any([work[0](), *(other.result() for other in others)]):
+    others = [_threads().submit(part) for part in parts[1:]]
+    if any([parts[0](), *(other.result() for other in others)]):
         raise MemoryError
-    return kept, parts
+
+
+def settled(
+    frames: Sequence[Sequence[NDArray[np.generic]]],
+    scenes: Sequence[tuple[LinesOfSight, Background]],
+    middle_px: Tensor,
+    stencils: tuple[Stencil, Stencil],
+    begin: "NearStart",
+    model: SphereModel,
+    *,
+    instants: int,
+    more: tuple[int, int],
+    near_rad: float,
+    most_hidden: float,
+    first: bool,
+) -> tuple[dict[str, Tensor], Tensor] | None:
+    """Fit B poses to the frames of C cameras as `settled` of settle.py does: with the first of two stencils, where that
+    is `first`, then with the second. Disks lie about `middle_px` (C, B, 2). Return the parts of `FittedPoses`, and
+    which poses the first stencil moved, (B,) bool: nothing else was done there. None where compiled code cannot do it.
+    """
+    code = library()
+    kinds = {frame.dtype for row in frames for frame in row}
+    if code is None or not kinds <= READABLE:
+        return None
+    poses, cameras = begin.use.shape
+    at, parts = _Addresses(), pose_arrays(cameras, poses)
+    far = torch.full((poses,), not first)
+    near = _Near(task=_of_model(model)[0], some_more=more[0], all_more=more[1], near_rad=near_rad)
+    near.most_hidden, near.held, near.far = most_hidden, begin.held, far.data_ptr()
+    near.some, near.all = (_of_stencil(one) for one in stencils)
+    known = [_of_scene(*one) for one in scenes]
+    scene, shot = (_Scene * cameras)(*(one[0] for one in known)), (_Shot * (poses * cameras))()
+    for c, middles in enumerate(middle_px.nan_to_num().tolist()):
+        for b, (u, v) in enumerate(middles):
+            frame = frames[b][c]
+            shot[b * cameras + c] = _Shot(frame.ctypes.data, *frame.strides, frame.itemsize, round(u), round(v))
+    near.scene, near.shot = ctypes.addressof(scene), ctypes.addressof(shot)
+    near.moved = at(begin.moved, torch.float64) if instants > 1 else None
+    instant, share = _quadrature(instants)
+    task = near.task
+    task.cameras, task.instants, task.instant, task.shares = cameras, instants, at(instant), at(share)
+    task.start, task.start_rotation = at(begin.position_lab_mm, torch.float64), at(begin.R_lab_body, torch.float64)
+    task.use, task.place_precision = at(begin.use), at(begin.place_precision, torch.float64)
+    for name, part in parts.items():
+        setattr(task, name, part.data_ptr())
+    _run(code.settle, near, poses)
+    return parts, far
+
+
+@lru_cache(maxsize=16)
+def _of_scene(sight: LinesOfSight, background: Background) -> tuple[_Scene, list[Tensor]]:
+    """Return the record of a camera, and what it points to."""
+    alive = [torch.from_numpy(np.ascontiguousarray(background.mean)), sight.direction]
+    alive += [sight.origin.contiguous(), sight.axes.contiguous(), sight.pitch_rad, sight.pitch_mm]
+    behind, direction, origin, axes, pitch_rad, pitch_mm = (part.data_ptr() for part in alive)
+    if background.shown is not None:
+        alive.append(torch.from_numpy(np.ascontiguousarray(background.shown)))
+    width, height = sight.size
+    scene = _Scene(
+        width=width,
+        height=height,
+        origins=1 if sight.one_origin else width * height,
+        behind=behind,
+        shown=None if background.shown is None else alive[-1].data_ptr(),
+        direction=direction,
+        origin=origin,
+        axes=axes,
+        pitch_rad=pitch_rad,
+        pitch_mm=pitch_mm,
+        full_scale=background.full_scale,
+    )
+    return scene, alive
+
+
+@lru_cache(maxsize=64)
+def _of_stencil(stencil: Stencil) -> _Stencil:
+    tiles = int(stencil.tile.max()) + 1
+    place, tile = stencil.place.data_ptr(), stencil.tile.data_ptr()
+    return _Stencil(places=len(stencil.tile), inner=stencil.inner, tiles=tiles, place=place, tile=tile)
 
 
 class _Addresses:

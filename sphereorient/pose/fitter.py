@@ -30,6 +30,7 @@ from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, text
 
 Picture = NDArray[np.generic]
 Shown = Picture | OnDemand  # of which fits cut out disks
+Disks = tuple[Tensor, Tensor]  # see `Fitter.disks_px`
 Record = TypeVar("Record", Pixels, PoseStart, FittedPoses)
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
@@ -238,7 +239,7 @@ class Fitter:
         limb_px = self.limb_px if self.limb_px is None else self.limb_px[camera : camera + 1]
         return replace(self, views=[self.views[camera]], light=self.light.of(camera), limb_px=limb_px)
 
-    def disks_px(self, position_lab_mm: Tensor) -> tuple[Tensor, Tensor]:
+    def disks_px(self, position_lab_mm: Tensor) -> Disks:
         """Return middles (C, B, 2) of the disks that a sphere at (B, 3), mm, shows, and the largest radius (B,), px."""
         disks = [sphere_disk_px(view.camera, position_lab_mm, self.radius_mm) for view in self.views]
         middles, radii = (torch.stack(parts) for parts in zip(*disks, strict=True))
@@ -257,6 +258,10 @@ class Fitter:
         normal_body = R_body_view @ orthographic_view(DISK_PX, torch.float64).normal_view.mT
         return (unseen.sample(normal_body.float())[0] < UNSEEN).double().mean(-1) < KNOWN
 
+    def stencil(self, level: PyramidLevel, radius_px: float) -> Stencil:
+        """Return the places of a disk of some radius, px, at a level."""
+        return level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
+
     def pixels(
         self,
         pictures: Sequence[Sequence[Shown]],
@@ -264,7 +269,7 @@ class Fitter:
         level: PyramidLevel,
         radius_px: float | None = None,
         moved: Tensor | None = None,
-        disks_px: tuple[Tensor, Tensor] | None = None,
+        disks_px: Disks | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
         Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. `moved` (B, 6): the
@@ -276,7 +281,7 @@ class Fitter:
         if radius_px is None:
             radius_px = max(1.0, float(largest_px.max()))
             radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
-        stencil = level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
+        stencil = self.stencil(level, radius_px)
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
                 if isinstance(frame, OnDemand):  # all of them, before the first is waited for

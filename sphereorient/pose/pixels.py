@@ -145,6 +145,16 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     return Stencil(right=right, down=down, tile=torch.from_numpy(tile), place=place, reach=reach, inner=inner)
 
 
+@lru_cache(maxsize=64)
+def thinned_stencil(stencil: Stencil, step: int) -> Stencil:
+    """Return every `step`-th place, as `Pixels.thinned`."""
+    count = whole_vectors(len(range(0, len(stencil.right), step)))
+    some = np.s_[: step * count : step]
+    right, down, tile = stencil.right[some], stencil.down[some], stencil.tile[some].contiguous()
+    place, inner = torch.from_numpy(np.stack([right, down])), min(len(range(0, stencil.inner, step)), count)
+    return Stencil(right=right, down=down, tile=tile, place=place, reach=stencil.reach, inner=inner)
+
+
 def window_of(
     middle_px: tuple[float, float], stencil: Stencil, blur_px: float, size: tuple[int, int]
 ) -> tuple[int, int, int, int]:

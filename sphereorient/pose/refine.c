@@ -958,36 +958,240 @@ static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
     conclude(t, sums, pose, whole, step);
 }
 
+/* What the fits of one stencil need: memory for one pose at a time. */
+typedef struct {
+    Disk at;
+    Sums *sums;
+    float *floats;
+    uint8_t *bytes;
+    double *doubles;
+} Work;
+
+static void close_work(Work *work) { free(work->floats), free(work->bytes), free(work->sums), free(work->doubles); }
+
+/* Return 0, or 1 without memory; to be closed in both cases. */
+static int open_work(const Task *t, Work *work) {
+    const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK, n = 6 + t->n_difference + t->n_black;
+    const int64_t grids = t->most_hidden > 0 ? 4 : 0, pairs = LANES * (n * (n + 3) / 2);
+    memset(work, 0, sizeof *work);
+    Disk *at = &work->at;
+    if (grids) square_about(t, at);
+    const int64_t cells = at->width * at->height;
+    work->floats = malloc(sizeof(float) * (size_t)(P * (FLOATS + 2 * t->cameras) + grids * cells));
+    work->bytes = malloc((size_t)(2 * P));
+    work->sums = malloc(sizeof(Sums) * (size_t)t->cameras);
+    work->doubles = malloc(sizeof(double) * (size_t)(pairs + t->cameras * t->tiles * n));
+    if (!work->floats || !work->bytes || !work->sums || !work->doubles) return 1;
+    float *next = work->floats;
+    float **parts[] = {&at->paint,    &at->cover,    &at->x,       &at->y,       &at->aside,      &at->out[0],  &at->out[1],
+                       &at->out[2],   &at->turn[0],  &at->turn[1], &at->turn[2], &at->move[0],    &at->move[1], &at->move[2],
+                       &at->limb[0],  &at->limb[1],  &at->limb[2], &at->count,   &at->difference, &at->black,   &at->beside,
+                       &at->residual, &at->variance, &at->lit};
+    for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
+    at->sorted = at->count; /* not needed at the same time */
+    at->known = work->bytes, at->counts = work->bytes + P;
+    at->sums = (double(*)[LANES])work->doubles;
+    for (int64_t c = 0; c < t->cameras; c++, next += 2 * P) {
+        Sums *of = work->sums + c;
+        of->expected = next, of->weight = next + P, of->scores = work->doubles + pairs + c * t->tiles * n;
+    }
+    for (int64_t g = 0; g < grids; g++, next += cells) at->grid[g] = next;
+    return 0;
+}
+
 /* The size of the record that this code reads: a caller with another one must not call it. */
 int64_t refine_record(void) { return (int64_t)sizeof(Task); }
 
 /* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
 int refine(const Task *t, int64_t begin, int64_t end) {
-    const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK, n = 6 + t->n_difference + t->n_black;
-    const int64_t grids = t->most_hidden > 0 ? 4 : 0;
-    Disk at = {0};
-    if (grids) square_about(t, &at);
-    const int64_t cells = at.width * at.height;
-    float *floats = malloc(sizeof(float) * (size_t)(P * (FLOATS + 2 * t->cameras) + grids * cells)), *next = floats;
-    uint8_t *bytes = malloc((size_t)(2 * P));
-    Sums *sums = malloc(sizeof(Sums) * (size_t)t->cameras);
-    double *scores = malloc(sizeof(double) * (size_t)(t->cameras * t->tiles * n));
-    double *pairs = malloc(sizeof(double) * LANES * (size_t)(n * (n + 3) / 2));
-    const int without = !floats || !bytes || !sums || !scores || !pairs;
-    if (!without) {
-        float **parts[] = {&at.paint,   &at.cover,   &at.x,       &at.y,       &at.aside,      &at.out[0],  &at.out[1],
-                           &at.out[2],  &at.turn[0], &at.turn[1], &at.turn[2], &at.move[0],    &at.move[1], &at.move[2],
-                           &at.limb[0], &at.limb[1], &at.limb[2], &at.count,   &at.difference, &at.black,   &at.beside,
-                           &at.residual, &at.variance, &at.lit};
-        for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
-        at.sorted = at.count; /* not needed at the same time */
-        at.known = bytes, at.counts = bytes + P;
-        at.sums = (double(*)[LANES])pairs;
-        for (int64_t c = 0; c < t->cameras; c++, next += 2 * P)
-            sums[c].expected = next, sums[c].weight = next + P, sums[c].scores = scores + c * t->tiles * n;
-        for (int64_t g = 0; g < grids; g++, next += cells) at.grid[g] = next;
-        for (int64_t pose = begin; pose < end; pose++) fit(t, &at, sums, pose);
+    Work work;
+    const int without = open_work(t, &work);
+    for (int64_t pose = begin; pose < end && !without; pose++) fit(t, &work.at, work.sums, pose);
+    close_work(&work);
+    return without;
+}
+
+/* The fit of poses that are nearly right, as `settled` of settle.py, from whole frames. */
+
+/* The scene of one camera, and its lines of sight. */
+typedef struct {
+    int64_t width, height, origins; /* origins: 1, or one for each pixel */
+    const float *behind;            /* (height, width) */
+    const uint8_t *shown;           /* the same, or none where nothing hides the sphere */
+    const float *direction;         /* (3, height, width) */
+    const float *origin;            /* (3, origins) */
+    const float *axes;              /* (2, 3) */
+    const float *pitch_rad;         /* (height - 1, width - 1) */
+    const float *pitch_mm;          /* the same, or a single one where there is one origin */
+    double full_scale;
+} Scene;
+
+/* One frame of one camera: where its rows begin, bytes to the next row and pixel, bytes of a pixel (4: single
+   precision), and the pixel at the middle of the sphere. */
+typedef struct {
+    const char *grey;
+    int64_t row, column, bytes, u, v;
+} Shot;
+
+typedef struct {
+    int64_t places, inner, tiles;
+    const int64_t *place, *tile;
+} Stencil;
+
+typedef struct {
+    Task task;         /* all but what is cut out of frames, and the stencil */
+    Stencil some, all; /* of the first stage, and of the second */
+    const Scene *scene; /* (cameras) */
+    const Shot *shot;   /* (poses, cameras) */
+    const double *moved; /* (poses, 6), or none */
+    int64_t some_more, all_more; /* further iterations after a long step */
+    double near_rad;             /* a longer step is long */
+    float most_hidden;           /* of the second stage */
+    int64_t held;                /* whether each fit begins at the given position, with its precision */
+    uint8_t *far; /* (poses), 1 where the first stage is left out; then where it moved the pose: nothing else is done */
+} Near;
+
+/* One pose: its disks, cut out with one stencil, and its fits. */
+typedef struct {
+    Task task;
+    Work work;
+    double X[3], R[9];
+    float *pixels;  /* (cameras, 5 + 3 where each pixel has an origin, places) */
+    float *single;  /* (cameras, 11): origin, axes, pitches */
+    uint8_t *marks; /* (cameras, 3, places) */
+    double *moved;  /* (cameras, 6) */
+} Cut;
+
+static void close_cut(Cut *cut) {
+    close_work(&cut->work);
+    free(cut->pixels), free(cut->single), free(cut->marks), free(cut->moved);
+}
+
+/* Return 0, or 1 without memory; to be closed in both cases. */
+static int open_cut(const Near *n, const Stencil *stencil, float most_hidden, Cut *cut) {
+    Task *t = &cut->task;
+    *t = n->task;
+    const int64_t cameras = t->cameras;
+    t->places = stencil->places, t->inner = stencil->inner, t->tiles = stencil->tiles;
+    t->place = stencil->place, t->tile = stencil->tile, t->most_hidden = most_hidden;
+    t->origins = 1;
+    for (int64_t c = 0; c < cameras; c++)
+        if (n->scene[c].origins > 1) t->origins = t->places;
+    const int64_t each = 5 + (t->origins > 1 ? 3 : 0);
+    cut->pixels = malloc(sizeof(float) * (size_t)(cameras * each * t->places));
+    cut->single = malloc(sizeof(float) * (size_t)(cameras * 11));
+    cut->marks = malloc((size_t)(cameras * 3 * t->places));
+    cut->moved = malloc(sizeof(double) * (size_t)(cameras * 6));
+    if (open_work(t, &cut->work) || !cut->pixels || !cut->single || !cut->marks || !cut->moved) return 1;
+    const int64_t all = cameras * t->places;
+    t->grey = cut->pixels, t->behind = cut->pixels + all, t->direction = cut->pixels + 2 * all;
+    t->origin = t->origins > 1 ? cut->pixels + 5 * all : cut->single;
+    t->axes = cut->single + 3 * cameras, t->pitch_rad = cut->single + 9 * cameras, t->pitch_mm = cut->single + 10 * cameras;
+    t->inside = cut->marks, t->clipped = cut->marks + all, t->kept = cut->marks + 2 * all;
+    t->moved = n->moved ? cut->moved : 0;
+    t->start = cut->X, t->start_rotation = cut->R;
+    return 0;
+}
+
+static inline int64_t within(int64_t at, int64_t count) { return at < 0 ? 0 : at < count ? at : count - 1; }
+
+static inline float grey_level(const Shot *shot, int64_t right, int64_t down) {
+    const char *at = shot->grey + down * shot->row + right * shot->column;
+    uint16_t two;
+    float four;
+    if (shot->bytes == 1) return (float)*(const uint8_t *)at;
+    if (shot->bytes == 2) return memcpy(&two, at, sizeof two), (float)two;
+    return memcpy(&four, at, sizeof four), four;
+}
+
+/* Cut the disks of a pose out of its frames, as `cut_pixels` without a blur. */
+static void cut_disks(const Near *n, const Cut *cut, int64_t pose) {
+    const Task *t = &cut->task;
+    const int64_t P = t->places, all = t->cameras * P;
+    uint8_t *inside = cut->marks, *clipped = cut->marks + all;
+    for (int64_t c = 0; c < t->cameras; c++) {
+        const Scene *scene = n->scene + c;
+        const Shot *shot = n->shot + pose * t->cameras + c;
+        const int64_t width = scene->width, height = scene->height, size = width * height;
+        const float limit = (float)scene->full_scale;
+        float *grey = cut->pixels + c * P, *behind = grey + all, *direction = cut->pixels + 2 * all + c * 3 * P;
+        float *origin = cut->pixels + 5 * all + c * 3 * P;
+        for (int64_t p = 0; p < P; p++) {
+            const int64_t x = shot->u + t->place[p], y = shot->v + t->place[P + p];
+            const int64_t right = within(x, width), down = within(y, height), at = down * width + right;
+            grey[p] = grey_level(shot, right, down);
+            behind[p] = scene->behind[at];
+            inside[c * P + p] = x == right && y == down && (!scene->shown || scene->shown[at]);
+            clipped[c * P + p] = grey[p] >= limit;
+            for (int i = 0; i < 3; i++) direction[i * P + p] = scene->direction[i * size + at];
+            if (t->origins > 1)
+                for (int i = 0; i < 3; i++) origin[i * P + p] = scene->origin[i * scene->origins + (scene->origins > 1 ? at : 0)];
+        }
+        float *single = cut->single;
+        for (int i = 0; i < 3 && t->origins == 1; i++) single[c * 3 + i] = scene->origin[i];
+        for (int i = 0; i < 6; i++) single[3 * t->cameras + c * 6 + i] = scene->axes[i];
+        const int64_t here = within(shot->v, height - 1) * (width - 1) + within(shot->u, width - 1);
+        single[9 * t->cameras + c] = scene->pitch_rad[here];
+        single[10 * t->cameras + c] = scene->pitch_mm[scene->origins > 1 ? here : 0];
+        for (int i = 0; i < 6 && n->moved; i++) cut->moved[c * 6 + i] = n->moved[pose * 6 + i];
     }
-    free(floats), free(bytes), free(sums), free(scores), free(pairs);
+}
+
+/* Let the fits of a cut write the results of a pose. */
+static void point_at(const Near *n, Task *t, int64_t pose) {
+    const Task *of = &n->task;
+    const int64_t cameras = t->cameras, k = pose * cameras;
+    int64_t seen = 0;
+    for (int64_t c = 0; c < cameras; c++) seen += of->use[k + c];
+    t->use = of->use + k;
+    /* All cameras together determine the position; for one of two the distance is better known from before. */
+    t->place_precision = n->held || seen < cameras ? of->place_precision + pose * 9 : 0;
+    t->position = of->position + pose * 3, t->rotation = of->rotation + pose * 9;
+    t->covariance = of->covariance + pose * 36, t->step = of->step + pose * 6, t->nll = of->nll + pose;
+    t->own_turn = of->own_turn + k * 3, t->own_covariance = of->own_covariance + k * 9;
+    t->own_move = of->own_move + k * 3, t->own_sigma = of->own_sigma + k;
+    t->excess = of->excess + k, t->score = of->score + k;
+}
+
+/* Take one step, and `more` from where that one was long; return whether it was. */
+static int settle_on(const Near *n, Cut *cut, int64_t pose, int64_t more) {
+    Task *t = &cut->task;
+    cut_disks(n, cut, pose);
+    point_at(n, t, pose);
+    t->iterations = 1;
+    fit(t, &cut->work.at, cut->work.sums, 0);
+    int64_t seen = 0;
+    for (int64_t c = 0; c < t->cameras; c++) seen += t->use[c];
+    /* One camera's distances scatter; a change of its picture shows in the rotation as well. */
+    const double move = length(t->step + 3), limit = n->near_rad * (double)t->radius_mm;
+    const int far = length(t->step) > n->near_rad || (seen > 1 && move > limit);
+    if (far) {
+        if (!n->held) memcpy(cut->X, t->position, sizeof cut->X);
+        memcpy(cut->R, t->rotation, sizeof cut->R);
+        t->iterations = more;
+        fit(t, &cut->work.at, cut->work.sums, 0);
+    }
+    return far;
+}
+
+/* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
+int settle(const Near *n, int64_t begin, int64_t end) {
+    Cut some, all;
+    memset(&some, 0, sizeof some), memset(&all, 0, sizeof all);
+    const int without = open_cut(n, &n->some, 0.0f, &some) || open_cut(n, &n->all, n->most_hidden, &all);
+    for (int64_t pose = begin; pose < end && !without; pose++) {
+        const double *X = n->task.start + pose * 3, *R = n->task.start_rotation + pose * 9;
+        memcpy(all.X, X, sizeof all.X), memcpy(all.R, R, sizeof all.R);
+        if (!n->far[pose]) {
+            memcpy(some.X, X, sizeof some.X), memcpy(some.R, R, sizeof some.R);
+            n->far[pose] = (uint8_t)settle_on(n, &some, pose, n->some_more);
+            if (n->far[pose]) continue; /* the disks are to be cut out anew */
+            if (!n->held) memcpy(all.X, n->task.position + pose * 3, sizeof all.X);
+            memcpy(all.R, n->task.rotation + pose * 9, sizeof all.R);
+        }
+        n->far[pose] = 0;
+        settle_on(n, &all, pose, n->all_more);
+    }
+    close_cut(&some), close_cut(&all);
     return without;
 }

@@ -74,8 +74,10 @@ def turned(steps: Floats, heading_rad: Floats) -> Floats:
 def rotation_vectors(R: Floats) -> Floats:
     """Return the rotation vectors (N, 3), rad, of rotations (N, 3, 3); NaN of NaN."""
     known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
-    turn = so3.log(torch.from_numpy(np.where(known[:, None, None], R, np.eye(3)))).numpy()
-    return np.where(known[:, None], turn, np.nan)
+    some = R if known.all() else np.where(known[:, None, None], R, np.eye(3))
+    turn: Floats = so3.log(torch.from_numpy(some)).numpy()
+    turn[~known] = np.nan
+    return turn
 
 
 def _stretches(known: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -118,3 +118,30 @@ def test_what_was_not_measured_stays_nan_and_alone():
 def test_wrong_shapes_are_refused(function):
     with pytest.raises(ShapeError, match=r"expected shape \(\.\.\., 3.*got \(3, 4\)"):
         function(torch.zeros(3, 4))
+
+
+@pytest.mark.skipif(so3.compiled(so3.SOURCE, so3._Rotations) is None, reason="needs compiled code: `make setup`")
+def test_compiled_code_gives_what_torch_gives(rng, monkeypatch):
+    turns = torch.tensor([0.0, 1e-300, 1e-160, 1e-78, 1e-12, 1e-4, 1.0, 3.0, math.pi - 1e-9, math.pi, 7.0], dtype=F64)
+    rotvec = torch.cat([*(directions(rng) * turn for turn in turns), torch.full((1, 3), math.nan, dtype=F64)])
+    rotvec = rotvec.reshape(-1, 3)
+    R = torch.cat([so3.exp(rotvec), so3.random_rotations(500, generator=rng), -torch.ones(1, 3, 3, dtype=F64)])
+    strided = R.mT.contiguous().mT
+    found = so3.exp(rotvec), so3.log(R), so3.log(strided.reshape(1, -1, 3, 3))[0]
+    monkeypatch.setattr(so3, "compiled", lambda *_: None)
+    assert_close(found[0], so3.exp(rotvec), 1e-15)
+    assert_close(found[1], so3.log(R), 1e-15)
+    assert torch.equal(found[1].nan_to_num(9.0), found[2].nan_to_num(9.0))
+
+
+def test_derivatives_are_asked_for_in_any_of_torchs_ways(rng):
+    rotvec = torch.randn(4, 3, generator=rng, dtype=F64)
+    by_hand = torch.stack([torch.autograd.functional.jacobian(so3.exp, one) for one in rotvec])
+    assert float(by_hand.abs().amax()) > 0.1
+    assert_close(torch.func.vmap(torch.func.jacfwd(so3.exp))(rotvec), by_hand)
+    assert_close(torch.func.vmap(torch.func.jacrev(so3.exp))(rotvec), by_hand)
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(rotvec, torch.ones_like(rotvec))
+        along = torch.autograd.forward_ad.unpack_dual(so3.log(so3.exp(dual))).tangent
+    inside = rotvec.norm(dim=-1) < 3
+    assert_close(along[inside], torch.ones_like(rotvec)[inside], 1e-9)

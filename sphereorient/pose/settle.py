@@ -1,0 +1,132 @@
+"""The fit of poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from sphereorient.movies import OnDemand
+from sphereorient.pose import compiled
+from sphereorient.pose.fit import FittedPoses, PoseStart
+from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown
+from sphereorient.pose.pixels import Pixels, Stencil, thinned_stencil, window_of
+
+NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
+FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
+MORE = 2, 3  # further iterations after a long step: of some pixels, of all
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NearStart(PoseStart):
+    """Where the fit of B poses begins that are right to a few degrees and pixels."""
+
+    place_precision: Tensor  # (B, 3, 3), 1/mm^2; counts where not all cameras see the sphere, and where it is held
+    moved: Tensor  # (B, 6), turn (rad) and move (mm) while the shutter is open
+    held: bool  # whether each step begins at the given position
+
+    def of(self, rows: Tensor) -> "NearStart":
+        """Return some of the poses, by index."""
+        parts = {name: part[rows] for name, part in vars(self).items() if isinstance(part, Tensor)}
+        return NearStart(**parts, held=self.held)
+
+    def after(self, fit: FittedPoses) -> "NearStart":
+        """Return the start of a further fit."""
+        position_lab_mm = self.position_lab_mm if self.held else fit.position_lab_mm
+        return replace(self, position_lab_mm=position_lab_mm, R_lab_body=fit.R_lab_body)
+
+
+def settled(
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None = None
+) -> FittedPoses:
+    """Fit B poses to the frames of C cameras at the finest level. `disks_px`: what the fitter's method of this name
+    tells of the first positions, where that is known. Where compiled code can do it, it does.
+    """
+    done = _compiled(fitter, frames, begin, disks_px, first=True)
+    if done is None:
+        return _settled_in_torch(fitter, frames, begin, disks_px)
+    fit, far = done
+    if bool(far.any()):
+        rows = far.nonzero()[:, 0]
+        there = begin.after(fit).of(rows)
+        again = _compiled(fitter, [frames[k] for k in rows.tolist()], there, None, first=False)
+        assert again is not None  # as before
+        for name, part in again[0].parts().items():
+            getattr(fit, name)[rows] = part
+    return fit
+
+
+def _compiled(
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None, *, first: bool
+) -> tuple[FittedPoses, Tensor] | None:
+    """Return fits, and for which poses the disks are to be cut out anew, (B,) bool."""
+    if fitter.device.type != "cpu" or compiled.library() is None:
+        return None
+    middle_px, _ = disks_px or fitter.disks_px(begin.position_lab_mm)
+    stencil = fitter.stencil(fitter.optics.fine, fitter.widest_px)
+    done = compiled.settled(
+        _decoded(fitter, frames, middle_px, stencil),
+        [(view.sight, view.background) for view in fitter.views],
+        middle_px,
+        (thinned_stencil(stencil, FIRST_EVERY), stencil),
+        begin,
+        fitter.fine_model,
+        instants=fitter.instants,
+        more=MORE,
+        near_rad=NEAR_RAD,
+        most_hidden=fitter.most_hidden,
+        first=first,
+    )
+    return None if done is None else (FittedPoses(**done[0]), done[1])
+
+
+def _decoded(
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], middle_px: Tensor, stencil: Stencil
+) -> list[list[Picture]]:
+    """Return pictures that hold at least the disks about `middle_px` (C, B, 2)."""
+    middles = middle_px.nan_to_num().tolist()
+
+    def window(b: int, c: int) -> tuple[int, int, int, int]:
+        return window_of(middles[c][b], stencil, 0.0, fitter.views[c].sight.size)
+
+    for b, row in enumerate(frames):
+        for c, frame in enumerate(row):
+            if isinstance(frame, OnDemand):  # all of them, before the first is waited for
+                frame.ask(*window(b, c))
+    return [
+        [frame.part(*window(b, c)) if isinstance(frame, OnDemand) else frame for c, frame in enumerate(row)]
+        for b, row in enumerate(frames)
+    ]
+
+
+def _settled_in_torch(
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None
+) -> FittedPoses:
+    fine, moved = fitter.optics.fine, begin.moved
+    pixels = fitter.pixels(frames, begin.position_lab_mm, fine, fitter.widest_px, moved, disks_px)
+    fit, far = _step(fitter, pixels.thinned(FIRST_EVERY), begin, MORE[0])
+    there = begin.after(fit)
+    if bool(far.any()):
+        X = torch.where(far[:, None], there.position_lab_mm, begin.position_lab_mm)
+        pixels = fitter.pixels(frames, X, fine, fitter.widest_px, moved)
+    return _step(fitter, pixels, there, MORE[1], fitter.most_hidden)[0]
+
+
+def _step(
+    fitter: Fitter, pixels: Pixels, begin: NearStart, more: int, most_hidden: float = 0.0
+) -> tuple[FittedPoses, Tensor]:
+    """Take one step, and `more` from where that one was long; return also where it was, (B,) bool."""
+    fine, use = fitter.optics.fine, begin.use
+    precision = begin.place_precision
+    if not begin.held:
+        # All cameras together determine the position; for one of two the distance is better known from before.
+        precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
+    fit = fitter.fit(pixels, begin.position_lab_mm, begin.R_lab_body, use, fine, 1, precision, most_hidden)
+    turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
+    # One camera's distances scatter; a change of its picture shows in the rotation as well.
+    far = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * fitter.radius_mm))
+    if bool(far.any()):
+        on = begin.after(fit)
+        again = fitter.fit(pixels, on.position_lab_mm, on.R_lab_body, use, fine, more, precision, most_hidden)
+        fit = again.where(far, fit)
+    return fit, far

@@ -1,0 +1,125 @@
+"""The fit of nearly right poses out of whole frames: compiled code against torch's, which defines it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from refine_examples import (
+    BEHIND,
+    BLUR_PX,
+    RADIUS_MM,
+    balls,
+    base_of,
+    moved,
+    noisy,
+    pictures_of,
+    rig_of,
+    scene_of,
+    turned,
+)
+
+from sphereorient import so3
+from sphereorient.locate import CameraScene
+from sphereorient.pose import compiled
+from sphereorient.pose.fit import POSE_PARTS
+from sphereorient.pose.fitter import CameraView, first_fitter
+from sphereorient.pose.settle import NearStart, settled
+
+RIG, COUNT = rig_of(), 6
+pytestmark = pytest.mark.skipif(
+    compiled.library() is None, reason="needs the compiled fit: `make setup` with a compiler"
+)
+KINDS = [np.uint8, np.uint16, np.float32, np.float64]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Balls, one of them at the border of a picture, before a mask; frames in grey levels."""
+    X, R = balls(COUNT, 4)
+    X[2, 0] += 16.0
+    pictures = noisy(pictures_of(RIG, "patches", X, R), 2.0, 3).round().clamp(0, 255).numpy()
+    shown = np.ones(pictures.shape[-2:], bool)
+    shown[70:75, :] = False
+    height, width = shown.shape
+    views = []
+    for k, camera in enumerate(RIG.cameras):
+        mean = np.full((height, width), BEHIND, np.float32)
+        background = scene_of(mean, shown if k else None, full_scale=190.0)
+        known = CameraScene(background=background, diameter_px=RIG.diameter_px)
+        views.append(CameraView.of(f"cam{k + 1}", camera, known))
+    fitter = replace(first_fitter(views, RADIUS_MM, base_of("patches"), BLUR_PX), widest_px=0.55 * RIG.diameter_px)
+    return fitter, pictures, X, R
+
+
+def start(X, R, *, held: bool = False) -> NearStart:
+    """Poses off by less and by more than the first step can mend."""
+    count = len(X)
+    off = torch.linspace(0.05, 2.0, count).tolist()
+    use = torch.ones(count, 2, dtype=torch.bool)
+    use[1, 0] = False
+    return NearStart(
+        position_lab_mm=X if held else torch.cat([moved(X[k : k + 1], 0.05 * off[k], k) for k in range(count)]),
+        R_lab_body=torch.cat([turned(R[k : k + 1], off[k], k) for k in range(count)]),
+        use=use,
+        place_precision=4.0 * torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
+        moved=0.01 * torch.ones(count, 6, dtype=torch.float64),
+        held=held,
+    )
+
+
+def assert_same(found, expected) -> None:
+    assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, expected.R_lab_body)).max()) < 2e-3
+    assert float((found.position_lab_mm - expected.position_lab_mm).norm(dim=-1).max()) < 5e-4
+    assert float((found.score - expected.score).abs().max()) < 1e-3
+    sigmas = [part.covariance.diagonal(dim1=-2, dim2=-1) for part in (found, expected)]
+    assert float((sigmas[0] / sigmas[1] - 1).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("held", [False, True])
+def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
+    fitter, pictures, X, R = scene
+    frames, begin = [list(row) for row in pictures.astype(kind)], start(X, R, held=held)
+    found = settled(fitter, frames, begin)
+    monkeypatch.setattr(compiled, "library", lambda: None)
+    expected = settled(fitter, frames, begin)
+    assert_same(found, expected)
+    assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, R)).max()) < 0.5
+
+
+def test_the_shutter_is_open_while_the_ball_moves(scene, monkeypatch):
+    fitter, pictures, X, R = scene
+    frames, begin = [list(row) for row in pictures], start(X, R)
+    found = settled(replace(fitter, instants=3), frames, begin)
+    assert not torch.equal(found.R_lab_body, settled(fitter, frames, begin).R_lab_body)
+    monkeypatch.setattr(compiled, "library", lambda: None)
+    assert_same(found, settled(replace(fitter, instants=3), frames, begin))
+
+
+def test_lines_of_sight_may_start_at_different_places(scene, monkeypatch):
+    fitter, pictures, X, R = scene
+    views = list(fitter.views)
+    sight = RIG.sights[1]
+    ported = type(sight).__new__(type(sight))
+    vars(ported).update(vars(sight))
+    ported.origin = sight.origin + sight.direction * torch.linspace(-3, 3, sight.size[0])  # as behind a wall
+    ported.one_origin, ported.pitch_mm = False, torch.full_like(sight.pitch_rad, 0.01)
+    views[1] = replace(views[1], sight=ported)
+    behind_a_wall, frames = replace(fitter, views=views), [list(row) for row in pictures]
+    found = settled(behind_a_wall, frames, start(X, R))
+    monkeypatch.setattr(compiled, "library", lambda: None)
+    assert_same(found, settled(behind_a_wall, frames, start(X, R)))
+
+
+def test_a_pose_does_not_depend_on_its_batch_or_on_how_a_frame_lies_in_memory(scene):
+    fitter, pictures, X, R = scene
+    frames, begin = [list(row) for row in pictures.astype(np.uint8)], start(X, R)
+    whole = settled(fitter, frames, begin)
+    rows = torch.tensor([1, 5])
+    flipped = [[np.ascontiguousarray(frame[:, ::-1])[:, ::-1] for frame in frames[k]] for k in rows.tolist()]
+    some = settled(fitter, flipped, begin.of(rows))
+    for name in POSE_PARTS:
+        assert torch.equal(getattr(whole, name)[rows], getattr(some, name)), name
