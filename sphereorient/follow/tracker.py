@@ -22,7 +22,8 @@ from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown, Steps
-from sphereorient.pose.settle import NearStart, settled
+from sphereorient.pose.settle import settled
+from sphereorient.pose.start import NearStart
 from sphereorient.trajectory import Reason
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,9 +21,7 @@ from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, e
 from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, TUKEY
-
-if TYPE_CHECKING:
-    from sphereorient.pose.settle import NearStart
+from sphereorient.pose.start import NearStart
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
 RESULTS = {
@@ -193,7 +190,7 @@ def settled(
     scenes: Sequence[tuple[LinesOfSight, Background]],
     middle_px: Tensor,
     stencils: tuple[Stencil, Stencil],
-    begin: "NearStart",
+    begin: NearStart,
     model: SphereModel,
     *,
     instants: int,

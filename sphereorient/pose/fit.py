@@ -26,6 +26,7 @@ from sphereorient.pose.model import (
 from sphereorient.pose.occluders import unoccluded
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import EDGE_PX, NOISE_MIN, Residuals, by_pose, residuals, torch_sums
+from sphereorient.pose.start import PoseStart
 from sphereorient.so3 import inverse_damped, solve_damped
 
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
@@ -76,16 +77,6 @@ def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
     """Return arrays of `FittedPoses` of a leading shape: zeros, and the unit rotation."""
     parts = pose_arrays(cameras, *shape)
     return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PoseStart:
-    """Where the fit of B poses begins."""
-
-    position_lab_mm: Tensor  # (B, 3)
-    R_lab_body: Tensor  # (B, 3, 3)
-    use: Tensor  # (B, C) bool, the cameras that see the sphere; a pose without any stays
-    place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
 
 
 def refine(

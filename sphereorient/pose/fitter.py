@@ -17,12 +17,13 @@ from sphereorient.errors import CameraError, SettingsError, ShapeError, check_fi
 from sphereorient.locate import Background, CameraScene
 from sphereorient.movies import OnDemand
 from sphereorient.pose.compiled import refined
-from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
+from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
 from sphereorient.pose.occluders import MOST_HIDDEN, unoccluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.pose.residuals import KNOWN
+from sphereorient.pose.start import PoseStart
 from sphereorient.so3 import check_rotations
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture import as_texture

@@ -1,39 +1,20 @@
 """The fit of poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from sphereorient.movies import OnDemand
 from sphereorient.pose import compiled
-from sphereorient.pose.fit import FittedPoses, PoseStart
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_stencil, window_of
+from sphereorient.pose.start import NearStart
 
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 MORE = 2, 3  # further iterations after a long step: of some pixels, of all
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NearStart(PoseStart):
-    """Where the fit of B poses begins that are right to a few degrees and pixels."""
-
-    place_precision: Tensor  # (B, 3, 3), 1/mm^2; counts where not all cameras see the sphere, and where it is held
-    moved: Tensor  # (B, 6), turn (rad) and move (mm) while the shutter is open
-    held: bool  # whether each step begins at the given position
-
-    def of(self, rows: Tensor) -> "NearStart":
-        """Return some of the poses, by index."""
-        parts = {name: part[rows] for name, part in vars(self).items() if isinstance(part, Tensor)}
-        return NearStart(**parts, held=self.held)
-
-    def after(self, fit: FittedPoses) -> "NearStart":
-        """Return the start of a further fit."""
-        position_lab_mm = self.position_lab_mm if self.held else fit.position_lab_mm
-        return replace(self, position_lab_mm=position_lab_mm, R_lab_body=fit.R_lab_body)
 
 
 def settled(
@@ -48,7 +29,7 @@ def settled(
     fit, far = done
     if bool(far.any()):
         rows = far.nonzero()[:, 0]
-        there = begin.after(fit).of(rows)
+        there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
         again = _compiled(fitter, [frames[k] for k in rows.tolist()], there, None, first=False)
         assert again is not None  # as before
         for name, part in again[0].parts().items():
@@ -105,7 +86,7 @@ def _settled_in_torch(
     fine, moved = fitter.optics.fine, begin.moved
     pixels = fitter.pixels(frames, begin.position_lab_mm, fine, fitter.widest_px, moved, disks_px)
     fit, far = _step(fitter, pixels.thinned(FIRST_EVERY), begin, MORE[0])
-    there = begin.after(fit)
+    there = begin.after(fit.position_lab_mm, fit.R_lab_body)
     if bool(far.any()):
         X = torch.where(far[:, None], there.position_lab_mm, begin.position_lab_mm)
         pixels = fitter.pixels(frames, X, fine, fitter.widest_px, moved)
@@ -126,7 +107,7 @@ def _step(
     # One camera's distances scatter; a change of its picture shows in the rotation as well.
     far = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * fitter.radius_mm))
     if bool(far.any()):
-        on = begin.after(fit)
+        on = begin.after(fit.position_lab_mm, fit.R_lab_body)
         again = fitter.fit(pixels, on.position_lab_mm, on.R_lab_body, use, fine, more, precision, most_hidden)
         fit = again.where(far, fit)
     return fit, far

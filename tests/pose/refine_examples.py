@@ -14,10 +14,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
 from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.fit import FittedPoses, PoseStart, refine
+from sphereorient.pose.fit import FittedPoses, refine
 from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.model import LATER, Light, Shading, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
+from sphereorient.pose.start import PoseStart
 from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 from sphereorient.synth import random_texture

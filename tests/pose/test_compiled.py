@@ -23,10 +23,11 @@ from refine_examples import (
 from sphereorient import so3
 from sphereorient.files.compiled import built_for
 from sphereorient.pose import compiled
-from sphereorient.pose.fit import POSE_PARTS, PoseStart, learn_light, refine
+from sphereorient.pose.fit import POSE_PARTS, learn_light, refine
 from sphereorient.pose.lab_light import learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, SphereModel
 from sphereorient.pose.occluders import unoccluded
+from sphereorient.pose.start import PoseStart
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
 

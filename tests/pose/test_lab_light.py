@@ -23,7 +23,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose import fitter
-from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
+from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lab_light import (
     KNOTS,
     LAB_PARTS,
@@ -40,6 +40,7 @@ from sphereorient.pose.lab_light import (
 from sphereorient.pose.model import FIRST, LATER, SphereModel, no_stray, scene_beside, sphere_view, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import residuals
+from sphereorient.pose.start import PoseStart
 from sphereorient.sphere.texture_table import octahedral_directions
 
 SIGMA = 2.0  # grey levels

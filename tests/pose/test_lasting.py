@@ -11,8 +11,9 @@ from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, ri
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine, trace
+from sphereorient.pose.fit import FittedPoses, learn_light, refine, trace
 from sphereorient.pose.lasting import Lasting, _of_left_out, lasting_errors
+from sphereorient.pose.start import PoseStart
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y

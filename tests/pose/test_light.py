@@ -24,7 +24,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import PoseStart, learn_light, light_columns, light_sums, noise_curve, refine, solved_light
+from sphereorient.pose.fit import learn_light, light_columns, light_sums, noise_curve, refine, solved_light
 from sphereorient.pose.model import (
     FIRST,
     Light,
@@ -36,6 +36,7 @@ from sphereorient.pose.model import (
     sphere_view,
 )
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.start import PoseStart
 
 KINDS = ("patches",)
 NOISE = torch.tensor([[4.0, 0.05, 0.001, 0.0]])  # grey levels^2 and so on

@@ -26,7 +26,8 @@ from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.pose.fitter import CameraView, first_fitter
-from sphereorient.pose.settle import NearStart, settled
+from sphereorient.pose.settle import settled
+from sphereorient.pose.start import NearStart
 
 RIG, COUNT = rig_of(), 6
 pytestmark = pytest.mark.skipif(
