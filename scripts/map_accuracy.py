@@ -217,7 +217,7 @@ def fictrac_attitudes(path: Path) -> Tensor:
 
 def withheld(source: Path, texture: Path | None, path: Path) -> Path:
     """Write an experiment again with another map or none, and return where."""
-    return write_experiment(replace(load_experiment(source), path=path, texture_path=texture))
+    return write_experiment(replace(load_experiment(source).with_sphere(texture_path=texture), path=path))
 
 
 def run(command: str, experiment: Path, out: Path, cameras: str | None, more: list[str]) -> Usage:

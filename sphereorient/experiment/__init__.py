@@ -3,6 +3,7 @@
 from sphereorient.experiment.experiment import (
     Experiment,
     ExperimentKeys,
+    Sphere,
     input_files,
     load_experiment,
     open_movies,

@@ -1,6 +1,6 @@
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.files.whole_file import relative_path
-from sphereorient.files.yaml_file import read_document, refuse_unknown, validated, write_document
+from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated, write_document
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
 from sphereorient.sphere import seen_path
 
@@ -18,6 +18,16 @@ MAX_CAMERAS = 2
 MOVIES_OWN = "movies"  # value of `times`
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 FrameNumber = Annotated[int, Field(ge=0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere:
+    """One sphere of an experiment."""
+
+    name: str = ""  # empty: the only one, written as `sphere:`
+    diameter_mm: float | None = None  # None: unknown, lengths are in radii
+    texture_path: Path | None = None  # None: to be estimated
+    fixed: bool = False  # whether the centre is fixed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,9 +41,7 @@ class Experiment:
     cameras: dict[str, Camera]  # of the movies, in their order
     movie_paths: dict[str, Path]
     exposure_s: float | None = None
-    diameter_mm: float | None = None  # None: unknown, lengths are in radii
-    texture_path: Path | None = None  # None: to be estimated
-    fixed: bool = False  # whether the centre is fixed
+    spheres: tuple[Sphere, ...] = (Sphere(),)
     mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something static hides the sphere
     background_paths: dict[str, Path] = field(default_factory=dict)  # scene without the sphere
     times: str | None = None  # path of a table, or "movies": their time stamps; None: constant frame rate
@@ -50,18 +58,56 @@ class Experiment:
         return self.path.parent
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the spheres; ("",) if the file has `sphere:`."""
+        return tuple(sphere.name for sphere in self.spheres)
+
+    def of(self, name: str) -> "Experiment":
+        """Return the experiment of one sphere alone, as if the file had it under `sphere:`; else ExperimentError."""
+        if name not in self.names:
+            raise ExperimentError(refuse_unknown(name, self.names, f"{self.path}, spheres"))
+        return replace(self, spheres=(replace(self.spheres[self.names.index(name)], name=""),))
+
+    def with_sphere(self, **changes: Any) -> "Experiment":
+        """Return the experiment with other fields of its only sphere; ExperimentError if it has several."""
+        return replace(self, spheres=(replace(self.sphere, **changes),))
+
+    @property
+    def sphere(self) -> Sphere:
+        """The only sphere; ExperimentError if there are several."""
+        if len(self.spheres) > 1:
+            got, do = ", ".join(self.names), "pick one: --sphere NAME, or experiment.of(NAME) in Python"
+            raise ExperimentError(refusal(f"{self.path}, spheres", expected="one ball", got=got, do=do))
+        return self.spheres[0]
+
+    @property
+    def diameter_mm(self) -> float | None:
+        """Diameter of the only sphere; None: unknown."""
+        return self.sphere.diameter_mm
+
+    @property
+    def texture_path(self) -> Path | None:
+        """Texture map of the only sphere; None: to be estimated."""
+        return self.sphere.texture_path
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the centre of the only sphere is fixed."""
+        return self.sphere.fixed
+
+    @property
     def length_unit(self) -> str:
-        """Unit of all lengths of a track: mm, or radii of a sphere of unknown diameter."""
-        return "radii" if self.diameter_mm is None else "mm"
+        """Unit of all lengths of a track: mm, or radii of an only sphere of unknown diameter."""
+        return "radii" if any(sphere.diameter_mm is None for sphere in self.spheres) else "mm"
 
     @property
     def radius_mm(self) -> float:
-        """Radius of the sphere; 1 if its diameter is unknown and lengths are in radii."""
+        """Radius of the only sphere; 1 if its diameter is unknown and lengths are in radii."""
         return 1.0 if self.diameter_mm is None else self.diameter_mm / 2
 
 
 class SphereKeys(BaseModel, frozen=True, extra="forbid"):
-    """The key `sphere`."""
+    """The key `sphere`, and each sphere of `spheres`."""
 
     diameter: Positive | None
     texture: str | None = None
@@ -85,7 +131,8 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     frame_rate: Positive | None = None
     times: str | None = None
     exposure: Positive | None = None
-    sphere: SphereKeys
+    sphere: SphereKeys | None = None
+    spheres: dict[str, SphereKeys] = Field(default_factory=dict, min_length=1)
     masks: dict[str, str] = Field(default_factory=dict)
     backgrounds: dict[str, str] = Field(default_factory=dict)
     cameras: str
@@ -109,13 +156,15 @@ def load_experiment(path: Path | str) -> Experiment:
         raise ExperimentError(refusal(str(path), expected="an experiment.yaml", got="a movie", do=do))
     do = "write one with `sphereorient init MOVIE`, or correct the path"
     document = read_document(path, SCHEMA, ExperimentError, do)
-    untimed = () if {"frame_rate", "times"} & document.keys() else ("frame_rate or times",)
-    keys = validated(ExperimentKeys, document, str(path), ExperimentError, untimed)
+    needed = (("frame_rate", "times"), ("sphere", "spheres"))
+    missing = [" or ".join(either) for either in needed if not document.keys() & set(either)]
+    keys = validated(ExperimentKeys, document, str(path), ExperimentError, missing)
     for key in ("masks", "backgrounds", "start", "flip"):
         for name in getattr(keys, key):
             if name not in keys.movies:
                 raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))
     _check_numbers(path, keys)
+    _check_spheres(path, keys)
     cameras_path = path.parent / keys.cameras
     known = load_cameras(cameras_path)
     for name in keys.movies:
@@ -131,9 +180,15 @@ def load_experiment(path: Path | str) -> Experiment:
         camera_covariance=load_covariance(cameras_path, cameras),
         movie_paths={name: path.parent / movie for name, movie in keys.movies.items()},
         exposure_s=keys.exposure,
-        diameter_mm=keys.sphere.diameter,
-        texture_path=None if keys.sphere.texture is None else path.parent / keys.sphere.texture,
-        fixed=keys.sphere.fixed,
+        spheres=tuple(
+            Sphere(
+                name=name,
+                diameter_mm=sphere.diameter,
+                texture_path=None if sphere.texture is None else path.parent / sphere.texture,
+                fixed=sphere.fixed,
+            )
+            for name, sphere in (keys.spheres if keys.sphere is None else {"": keys.sphere}).items()
+        ),
         mask_paths={name: path.parent / mask for name, mask in keys.masks.items()},
         background_paths={name: path.parent / picture for name, picture in keys.backgrounds.items()},
         times=keys.times if keys.times in (None, MOVIES_OWN) else str(path.parent / str(keys.times)),
@@ -155,16 +210,18 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
     def relative(path: Path | str) -> str:
         return relative_path(path, experiment.folder)
 
-    times, texture = experiment.times, experiment.texture_path
-    sphere: dict[str, Any] = {"diameter": experiment.diameter_mm}
-    sphere |= {} if texture is None else {"texture": relative(texture)}
-    sphere |= {"fixed": True} if experiment.fixed else {}
+    def keys_of(sphere: Sphere) -> dict[str, Any]:
+        keys: dict[str, Any] = {"diameter": sphere.diameter_mm}
+        keys |= {} if sphere.texture_path is None else {"texture": relative(sphere.texture_path)}
+        return keys | ({"fixed": True} if sphere.fixed else {})
+
+    times, spheres = experiment.times, {sphere.name: keys_of(sphere) for sphere in experiment.spheres}
     document: dict[str, Any] = {
         "name": experiment.name,
         "frame_rate": float(experiment.frame_rate_hz) if times is None else None,
         "times": times if times in (None, MOVIES_OWN) else relative(str(times)),
         "exposure": None if experiment.exposure_s is None else float(experiment.exposure_s),
-        "sphere": sphere,
+        **({"sphere": spheres[""]} if "" in spheres else {"spheres": spheres}),
         "cameras": relative(experiment.cameras_path),
         "movies": {name: relative(path) for name, path in experiment.movie_paths.items()},
         "masks": {name: relative(path) for name, path in experiment.mask_paths.items()},
@@ -207,9 +264,9 @@ def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> d
     single = [experiment.path, experiment.cameras_path]
     for paths in (experiment.background_paths, experiment.mask_paths):
         single += [paths[name] for name in used if name in paths]
-    if experiment.texture_path is not None:
-        counts = seen_path(experiment.texture_path)
-        single += [experiment.texture_path, *([counts] if counts.is_file() else [])]
+    for texture in (sphere.texture_path for sphere in experiment.spheres):
+        if texture is not None:
+            single += [texture, *([counts] if (counts := seen_path(texture)).is_file() else [])]
     if experiment.times not in (None, MOVIES_OWN):
         single.append(Path(str(experiment.times)))
     movies = [experiment.movie_paths[name] for name in used if name in experiment.movie_paths]
@@ -232,3 +289,19 @@ def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
         expected, do = f"at most the time between frames, {1 / keys.frame_rate:.4g} s", "write it in seconds"
         raise ExperimentError(refusal(f"{path}, exposure", expected=expected, got=f"{keys.exposure:g}", do=do))
+
+
+def _check_spheres(path: Path, keys: ExperimentKeys) -> None:
+    def refused(where: str, expected: str, got: str, do: str) -> ExperimentError:
+        return ExperimentError(refusal(f"{path}, {where}", expected=expected, got=got, do=do))
+
+    if keys.sphere is None and not keys.spheres:
+        raise refused("sphere", "a value", "none", "add the key, or `spheres` with a name for each ball")
+    if keys.sphere is not None and keys.spheres:
+        raise refused("sphere", "either sphere or spheres", "both", "write `sphere` for one ball, else `spheres`")
+    for name, sphere in keys.spheres.items():
+        if not name.strip() or "/" in name or name == ".":
+            raise refused("spheres", "names without '/'", short(name), "give each ball a name, such as a")
+        if sphere.diameter is None and len(keys.spheres) > 1:
+            got, do = "none", "measure it: lengths of several balls are in mm"
+            raise refused(f"spheres.{name}.diameter", "a number (mm)", got, do)

@@ -1,4 +1,4 @@
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.experiment.experiment import Experiment, load_experiment, open_movies, outside_paths
+from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths
 from sphereorient.experiment.stream import CameraStream, given_mask
 from sphereorient.experiment.timeline import Rows, Timeline, timeline
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
@@ -23,15 +23,36 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class TextureMap:
+    """The texture map of a sphere, as read from its file."""
+
+    grey: Tensor  # (H, 2 H); (0, 0) if it is to be estimated
+    unseen: Tensor | None = None  # (H, 2 H) bool, texels that are no paint; None: all are
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """Experiment with open movies; made by `open_recording`."""
 
     experiment: Experiment
     streams: Sequence[CameraStream]
     timeline: Timeline
-    texture: Tensor  # (H, 2 H); (0, 0) if it is to be estimated
-    unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
+    maps: Mapping[str, TextureMap]  # of each sphere, by name; one object for spheres of one file
     remarks: tuple[str, ...]
+
+    def of(self, name: str) -> "Recording":
+        """Return the recording of one sphere alone, with the same movies; ExperimentError for an unknown name."""
+        return replace(self, experiment=self.experiment.of(name), maps={"": self.maps[name]})
+
+    @property
+    def texture(self) -> Tensor:
+        """Texture map of the only sphere, (H, 2 H); (0, 0) if it is to be estimated."""
+        return self.maps[self.experiment.sphere.name].grey
+
+    @property
+    def unseen(self) -> Tensor | None:
+        """Texels of this map that are no paint, (H, 2 H) bool; None: all are paint."""
+        return self.maps[self.experiment.sphere.name].unseen
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -62,6 +83,9 @@ class Recording:
         return replace(self, timeline=grid, streams=streams), place
 
 
+NO_MAP = TextureMap(grey=torch.empty(0, 0))
+
+
 @contextmanager
 def open_recording(
     source: Experiment | str | Path, cameras: Sequence[str] | None = None, *, textured: bool = True
@@ -72,12 +96,8 @@ def open_recording(
         SphereOrientError: inputs missing, unreadable or inconsistent; with `textured`, no texture map.
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
-    if textured and experiment.texture_path is None:
-        do = "learn it with `sphereorient map`, then write sphere.texture: the file that this gives"
-        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
-    texture, unseen = torch.empty(0, 0), None
-    if textured and experiment.texture_path is not None:
-        texture, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
+    paths = {sphere.name: _texture_path(experiment, sphere) for sphere in experiment.spheres} if textured else {}
+    loaded = {path: _load_map(path) for path in dict.fromkeys(paths.values())}
     names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
     frames = timeline(experiment, movies)
@@ -92,18 +112,32 @@ def open_recording(
         for name, movie in movies.items()
     ]
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
-    if unseen is not None:
-        texture = texture.masked_fill(unseen, UNKNOWN)
-        remarks += [f"{experiment.texture_path}: {100 * unseen_share(unseen):.0f} % of the ball is unseen and no paint"]
+    remarks += [
+        f"{path}: {100 * unseen_share(one.unseen):.0f} % of the ball is unseen and no paint"
+        for path, one in loaded.items()
+        if one.unseen is not None
+    ]
     remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
     yield Recording(
         experiment=experiment,
         streams=streams,
         timeline=frames,
-        texture=texture,
-        unseen=unseen,
+        maps={name: loaded[paths[name]] if textured else NO_MAP for name in experiment.names},
         remarks=(*remarks, *frames.remarks),
     )
+
+
+def _texture_path(experiment: Experiment, sphere: Sphere) -> Path:
+    if sphere.texture_path is not None:
+        return sphere.texture_path
+    key, name = (f"spheres.{sphere.name}", f", ball {sphere.name}") if sphere.name else ("sphere", "")
+    do = f"learn it with `sphereorient map`, then write {key}.texture: the file that this gives"
+    raise ExperimentError(refusal(f"{experiment.path}{name}", expected="a texture", got="none", do=do))
+
+
+def _load_map(path: Path) -> TextureMap:
+    grey, unseen = load_texture(path), load_unseen(path)
+    return TextureMap(grey=grey if unseen is None else grey.masked_fill(unseen, UNKNOWN), unseen=unseen)
 
 
 def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:

@@ -1,7 +1,7 @@
 """The method of `sphereorient map`: learn the texture map from movies in which the sphere rotates."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
@@ -75,7 +75,7 @@ def learn_map(
         if old is not None:
             learnt, comparison, kept_share = corrected(learnt, old)
         opened = recording.experiment
-        untextured = replace(opened, texture_path=None)  # the file that it names may be the one to be written
+        untextured = opened.with_sphere(texture_path=None)  # the file that it names may be the one to be written
         origin = provenance(input_files(untextured, list(recording.cameras)), opened.folder, command)
         return MapResult(
             experiment=opened,

@@ -107,8 +107,8 @@ class Dataset:
 def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
     """Yield the datasets of a track or camera that have a row for each frame, in the order of the file."""
     for name, column in stored_fields(record):
-        if column.rows == "frames":
-            values = np.asarray(getattr(record, name))
+        values = np.asarray(getattr(record, name))
+        if column.rows == "frames" and not (column.of_several and np.isnan(values).all()):
             yield Dataset(name=name, units=column.units, description=column.description, values=values)
 
 

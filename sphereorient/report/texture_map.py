@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +102,7 @@ def compare_pictures(learnt: LearntMap, track: Trajectory, experiment: Experimen
     compared = []
     column = {view.name: c for c, view in enumerate(learnt.views)}
     with ExitStack() as opened:
-        page, streams = prepared(track, replace(experiment, texture_path=texture), None, opened)
+        page, streams = prepared(track, experiment.with_sphere(texture_path=texture), None, opened)
         rows = np.flatnonzero(learnt.paint.isfinite().any(1).numpy() & track.valid)
         rows = rows if len(rows) else np.flatnonzero(track.valid)
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(EXAMPLES, len(rows))).round().astype(int))]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import ShapeError, TrackError, refusal
 
 KEY = "column"
+LONGEST_NAME = 100  # characters
 LARGEST_RATIO = 1200  # compression ratio; a dataset that claims more is not in the file
 
 
@@ -27,6 +28,7 @@ class DatasetSpec:
     fill: float = np.nan  # value if not measured
     since: str = ""  # first version with this dataset; older files are read without it
     rows: str = "frames"  # frames, offsets (frames + 1) or candidates
+    of_several: bool = False  # whether a file of one sphere is without it
 
 
 def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
@@ -67,6 +69,8 @@ def check_shapes(record: object, rows: Mapping[str, int]) -> None:
 def write_datasets(record: Any, group: h5py.Group) -> None:
     """Write all datasets of a record."""
     for name, c in stored_fields(record):
+        if c.of_several and group.name == "/":
+            continue
         write_dataset(group, _place(name), np.asarray(getattr(record, name), c.dtype), c)
 
 
@@ -81,7 +85,7 @@ def read_datasets(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any
     known = {
         name: read_dataset(group, _place(name), c.dtype).astype(c.dtype)
         for name, c in stored_fields(record)
-        if not c.since or _place(name) in group
+        if not (c.since or c.of_several) or _place(name) in group
     }
     if len(known) == sum(1 for _ in stored_fields(record)):
         return known
@@ -114,6 +118,15 @@ def inside(group: h5py.Group, place: str) -> Any:
             return None
         here = here[part]
     return here
+
+
+def named_group(parent: h5py.Group, name: str) -> h5py.Group:
+    """Return a group in another one; TrackError for a link, a dataset, or a name that no message could show."""
+    group = inside(parent, name)
+    if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > LONGEST_NAME:
+        label, do = f"{parent.file.filename}: {parent.name.strip('/')}", "write the track again"
+        raise TrackError(refusal(label, expected="groups with names", got=repr(name)[:60], do=do))
+    return group
 
 
 def _place(name: str) -> str:

@@ -14,6 +14,7 @@ class Flag(IntFlag):
     SPIKE = 128
     EXTRAPOLATED = 256
     CONTRADICTION = 512
+    IDENTITY = 1024  # of several spheres: it may be another one, see the dataset `identity`
 
 
 class Reason(StrEnum):

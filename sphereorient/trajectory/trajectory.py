@@ -2,11 +2,12 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import h5py
 import numpy as np
@@ -26,9 +27,10 @@ if TYPE_CHECKING:
     from sphereorient.trajectory.walk import Walk
 
 SCHEMA = "sphereorient-track/1"
+SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME each, see tracks.py
+SPHERES = "spheres"
 TEXTS = ("method", "settings", "experiment")
 HELD = 0.1  # of the position's stated error
-LONGEST_NAME = 100  # characters
 AGAIN = "write the track again"
 REASON = datasets.DatasetSpec("1", "why this camera has no orientation in the frame; ok where it has one")
 # Rows of `plot`: label, measured field, smoothed field.
@@ -133,6 +135,9 @@ class Trajectory:
         "1", "negative log-likelihood of the next distinct orientation less that of the chosen one", since="0.2"
     )
     margin_angle: Floats = stored("rad", "angle between these two; NaN where no other one was looked for", since="0.2")
+    identity: Floats = stored(
+        "1", "probability that this is the ball of this name; NaN where it was never in doubt", of_several=True
+    )
     cameras: Mapping[str, CameraTrack]
     frame_rate: float  # Hz
     method: str  # paper, precise
@@ -203,15 +208,21 @@ class Trajectory:
             OutputError: the file cannot be written.
         """
         with whole_hdf5(Path(path)) as file:
-            file.attrs["schema"] = SCHEMA
-            file.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
-            for name in (*TEXTS, "frame_rate", "length_unit"):
-                file.attrs[name] = getattr(self, name)
-            datasets.write_datasets(self, file)
-            file["flags"].attrs["bits"] = json.dumps({flag.name: flag.value for flag in Flag})
-            cameras = file.create_group("cameras")
-            for name in sorted(self.cameras):
-                write_camera(self.cameras[name], cameras.create_group(name))
+            self.write(file)
+
+    def write(self, group: h5py.Group) -> None:
+        """Write into an empty group: a file, or the group of one sphere of several."""
+        group.attrs["schema"] = SCHEMA
+        group.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
+        for name in (*TEXTS, "frame_rate", "length_unit"):
+            group.attrs[name] = getattr(self, name)
+        datasets.write_datasets(self, group)
+        alone = group.name == "/"
+        bits = {flag.name: flag.value for flag in Flag if not (alone and flag is Flag.IDENTITY)}
+        group["flags"].attrs["bits"] = json.dumps(bits)
+        cameras = group.create_group("cameras")
+        for name in sorted(self.cameras):
+            write_camera(self.cameras[name], cameras.create_group(name))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -219,27 +230,15 @@ class Trajectory:
         to its end, or goes on, read the rows that it has written so far.
 
         Raises:
-            TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.
+            TrackError: no HDF5 file, another schema, several spheres, or a dataset missing or of wrong shape.
         """
-        path = Path(path)
-        got, do = "no file", "pass the track.h5 that `sphereorient track` wrote"
-        try:
-            if path.exists():
-                got = "something else"
-            elif journal.journal_path(path).is_file():
-                path = journal.journal_path(path)
-            if not path.is_file():  # opening a pipe would block
-                raise FileNotFoundError(path)
-            grows = journal.is_journal(path)
-            file = path.open("rb") if grows else h5py.File(path, "r")
-        except (OSError, ValueError, RuntimeError) as error:
-            raise TrackError(refusal(str(path), expected="an HDF5 file", got=got, do=do)) from error
-        try:
-            with file:
-                return cls(**(journal.read_journal(file, cls, CameraTrack) if grows else _read(file)))
-        except DAMAGE as error:  # includes ShapeError and broken JSON
-            got = f"'{' '.join(str(error).split())[:200]}'"
-            raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error
+        with opened_track(path) as file:
+            return cls.read(file)
+
+    @classmethod
+    def read(cls, file: h5py.Group | BinaryIO) -> Self:
+        """Read what `write` wrote, or a journal."""
+        return cls(**(_read(file) if isinstance(file, h5py.Group) else journal.read_journal(file, cls, CameraTrack)))
 
     def __getitem__(self, frames: slice | int) -> Self:
         """Return the frames of a slice with positive step; raise TypeError or ShapeError for anything else."""
@@ -347,22 +346,48 @@ def _continuous(quat_wxyz: Floats) -> Floats:
     return signed
 
 
-def _read(file: h5py.File) -> dict[str, Any]:
-    schema = file.attrs.get("schema")
+@contextmanager
+def opened_track(path: str | Path) -> Iterator[h5py.File | BinaryIO]:
+    """Open the file of a track, or the journal of one that is not whole; TrackError if it is neither, or damaged."""
+    path = Path(path)
+    got, do = "no file", "pass the track.h5 that `sphereorient track` wrote"
+    try:
+        if path.exists():
+            got = "something else"
+        elif journal.journal_path(path).is_file():
+            path = journal.journal_path(path)
+        if not path.is_file():  # opening a pipe would block
+            raise FileNotFoundError(path)
+        file = path.open("rb") if journal.is_journal(path) else h5py.File(path, "r")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise TrackError(refusal(str(path), expected="an HDF5 file", got=got, do=do)) from error
+    try:
+        with file:
+            yield file
+    except DAMAGE as error:  # includes ShapeError and broken JSON
+        got = f"'{' '.join(str(error).split())[:200]}'"
+        raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error
+
+
+def _read(group: h5py.Group) -> dict[str, Any]:
+    schema, name = group.attrs.get("schema"), f"{group.file.filename}{group.name.rstrip('/')}"
+    spheres = datasets.inside(group, SPHERES) if schema == SCHEMA_OF_SEVERAL else None
+    if spheres is not None:
+        got, do = ", ".join(spheres)[:200], "pick one: --sphere NAME, or Tracks.load(path)[NAME] in Python"
+        raise TrackError(refusal(name, expected="the track of one ball", got=got, do=do))
     if schema != SCHEMA:
         got, do = repr(str(schema))[1:60].strip("'"), "pass a track, or update sphereorient where the track is newer"
-        raise TrackError(refusal(f"{file.filename}: schema", expected=SCHEMA, got=got, do=do))
-    for name in (*TEXTS, "frame_rate", "provenance"):
-        if name not in file.attrs:
-            label = f"{file.filename}: attribute {name}"
-            raise TrackError(refusal(label, expected="a value", got="none", do=AGAIN))
-    cameras = datasets.inside(file, "cameras")
-    return datasets.read_datasets(file, Trajectory) | {
+        raise TrackError(refusal(f"{name}: schema", expected=SCHEMA, got=got, do=do))
+    for attribute in (*TEXTS, "frame_rate", "provenance"):
+        if attribute not in group.attrs:
+            raise TrackError(refusal(f"{name}: attribute {attribute}", expected="a value", got="none", do=AGAIN))
+    cameras = datasets.inside(group, "cameras")
+    return datasets.read_datasets(group, Trajectory) | {
         "cameras": {name: read_camera(cameras, name) for name in cameras or ()},
-        "frame_rate": float(file.attrs["frame_rate"]),
-        "provenance": json.loads(file.attrs["provenance"]),
-        "length_unit": str(file.attrs.get("length_unit", "mm")),
-        **{name: str(file.attrs[name]) for name in TEXTS},
+        "frame_rate": float(group.attrs["frame_rate"]),
+        "provenance": json.loads(group.attrs["provenance"]),
+        "length_unit": str(group.attrs.get("length_unit", "mm")),
+        **{name: str(group.attrs[name]) for name in TEXTS},
     }
 
 
@@ -376,10 +401,7 @@ def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
 
 def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
     """Read one camera from the group of all."""
-    group = datasets.inside(cameras, name)
-    if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > LONGEST_NAME:
-        label = f"{cameras.file.filename}: cameras"
-        raise TrackError(refusal(label, expected="groups with names", got=repr(name)[:60], do=AGAIN))
+    group = datasets.named_group(cameras, name)
     known = {str(reason): reason for reason in Reason}
     texts = [text.decode() for text in datasets.read_dataset(group, "reason", "S").tolist()]
     reason = tuple(known.get(text, text) for text in texts)

@@ -9,9 +9,20 @@ import numpy as np
 import pytest
 from conftest import SHARED
 from experiment_examples import FULL, HEIGHT, SHORT, WIDTH, make_folder, save_movie, written
+from PIL import Image
 
 from sphereorient.errors import CameraError, ExperimentError, MovieError, OutputError
-from sphereorient.experiment import Experiment, load_experiment, open_movies, outside_paths, write_experiment
+from sphereorient.experiment import (
+    Experiment,
+    Sphere,
+    input_files,
+    load_experiment,
+    open_movies,
+    outside_paths,
+    recording,
+    write_experiment,
+)
+from sphereorient.sphere import load_texture
 
 
 @pytest.fixture
@@ -96,6 +107,28 @@ FAULTS = {
     "mask of no movie": (FULL.replace("masks: {cam1", "masks: {side"), "masks: expected one of cam1, cam2, got 'side'"),
     "movie without camera": (SHORT.replace("{cam1:", "{cam9:"), "camera of movie cam9: expected one of cam1, cam2"),
     "three cameras": (SHORT.replace("{cam1: cam1.npy}", "{a: a.mkv, b: b.mkv, c: c.mkv}"), "movies: .*at most 2"),
+    "both keys": (SHORT + "spheres: {a: {diameter: 14}}\n", "sphere: expected either sphere or spheres, got both"),
+    "no ball": (SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {}"), "spheres: .*at least 1"),
+    "one name twice": (
+        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diameter: 14}, a: {diameter: 14}}"),
+        "expected YAML, got 'the key 'a' twice' in line 4",
+    ),
+    "unknown key of a ball": (
+        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diametre: 14}}"),
+        "spheres, a: .*got 'diametre'; write 'diameter' instead",
+    ),
+    "a name that is a path": (
+        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a/b: {diameter: 14}}"),
+        "spheres: expected names without '/', got 'a/b'",
+    ),
+    "a name that is empty": (
+        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {'': {diameter: 14}}"),
+        "spheres: expected names",
+    ),
+    "several balls, one of unknown diameter": (
+        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diameter: 14}, b: {diameter: null}}"),
+        r"spheres\.b\.diameter: expected a number \(mm\), got none",
+    ),
     "no movies": (SHORT.replace("{cam1: cam1.npy}", "{}"), "movies: .*at least 1"),
     "movies as a list": (SHORT.replace("{cam1: cam1.npy}", "[cam1.npy]"), "movies: expected a valid dictionary"),
     "fixed as a word": (SHORT.replace("true", "maybe"), r"sphere\.fixed: expected a valid boolean, got 'maybe'"),
@@ -182,3 +215,63 @@ def test_a_flipped_movie_is_read_flipped(folder):
     for how, expected in (flips | {"both": picture[:, ::-1, ::-1]}).items():
         movies = open_movies(load_experiment(written(folder, SHORT + f"flip: {{cam1: {how}}}\n")))
         np.testing.assert_array_equal(movies["cam1"].sample([0]), expected)
+
+
+# several balls
+
+BALLS = FULL.replace(
+    "sphere: {diameter: 18.0, texture: texture.png}",
+    "spheres: {b: {diameter: 18.0, texture: texture.png}, a: {diameter: 14, texture: other.png, fixed: true}}",
+)
+
+
+def test_spheres_are_read_in_their_order_and_written_back_the_same(folder):
+    experiment = load_experiment(written(folder, BALLS))
+    assert experiment.spheres == (
+        Sphere(name="b", diameter_mm=18.0, texture_path=folder / "texture.png"),
+        Sphere(name="a", diameter_mm=14.0, texture_path=folder / "other.png", fixed=True),
+    )
+    again = load_experiment(write_experiment(dataclasses.replace(experiment, path=folder / "again.yaml")))
+    assert again.spheres == experiment.spheres
+    assert {folder / "texture.png", folder / "other.png"} <= input_files(experiment).keys()
+
+
+def test_the_experiment_of_one_ball_is_that_of_a_file_with_only_this_ball(folder):
+    of_b = load_experiment(written(folder, BALLS)).of("b")
+    alone = load_experiment(written(folder, FULL))
+    assert of_b.names == alone.names == ("",)
+    assert (of_b.diameter_mm, of_b.texture_path, of_b.radius_mm) == (18.0, folder / "texture.png", 9.0)
+    assert of_b.spheres == alone.spheres == alone.of("").spheres
+
+
+def test_what_holds_for_one_ball_is_refused_for_several(folder):
+    experiment = load_experiment(written(folder, BALLS))
+    for name in ("sphere", "diameter_mm", "texture_path", "fixed", "radius_mm"):
+        with pytest.raises(ExperimentError, match=r"spheres: expected one ball, got b, a; pick one: --sphere NAME"):
+            getattr(experiment, name)
+    with pytest.raises(ExperimentError, match="spheres: expected one of b, a, got 'c'"):
+        experiment.of("c")
+    assert experiment.length_unit == "mm"
+
+
+def test_textures_of_several_balls_are_read_once_a_file(folder, monkeypatch):
+    read = []
+    for name in ("texture.png", "other.png"):
+        Image.fromarray(np.arange(128, dtype=np.uint8).reshape(8, 16)).save(folder / name)
+    monkeypatch.setattr(recording, "load_texture", lambda path: read.append(path) or load_texture(path))
+    text = BALLS.replace("{b:", "{c: {diameter: 18.0, texture: texture.png}, b:").replace(
+        "masks: {cam1: mask.png}\n", ""
+    )
+    with recording.open_recording(load_experiment(written(folder, text))) as opened:
+        assert sorted(path.name for path in read) == ["other.png", "texture.png"]
+        assert opened.maps["c"] is opened.maps["b"]
+        assert opened.of("a").texture is opened.maps["a"].grey
+        assert opened.of("a").streams is opened.streams
+        assert opened.of("a").experiment.diameter_mm == 14
+        with pytest.raises(ExperimentError, match="expected one ball"):
+            _ = opened.texture
+    with (
+        pytest.raises(ExperimentError, match=r"ball a: expected a texture, got none; .*write spheres\.a\.texture"),
+        recording.open_recording(load_experiment(written(folder, text.replace(", texture: other.png", "")))),
+    ):
+        pass

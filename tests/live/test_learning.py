@@ -41,7 +41,7 @@ def ball(tmp_path_factory):
         exposure_samples=1, omega_rms=60.0, seed=5,
     )  # fmt: skip
     path = write_synthetic_experiment(tmp_path_factory.mktemp("turns"), settings)
-    experiment = replace(load_experiment(path), fixed=True, texture_path=None)
+    experiment = load_experiment(path).with_sphere(fixed=True, texture_path=None)
     with open_recording(experiment, ["cam1"], textured=False) as recording:
         place = fixed_place(recording, SETTINGS, LocateSettings())
         shots = list(screened_frames(recording.streams[0], place.views[0].background))

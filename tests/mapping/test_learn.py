@@ -17,7 +17,7 @@ from renders import error_deg
 
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment, open_movies
-from sphereorient.experiment.recording import Recording, silent
+from sphereorient.experiment.recording import Recording, TextureMap, silent
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.experiment.timeline import timeline
 from sphereorient.locate import LocateSettings
@@ -33,7 +33,7 @@ QUICK = MapSettings(pixels=700, rounds=6)
 @contextmanager
 def opened(path, cameras=None, frames=None):
     """A recording whose experiment names no texture."""
-    experiment = replace(load_experiment(path), texture_path=None)
+    experiment = load_experiment(path).with_sphere(texture_path=None)
     experiment = experiment if frames is None else replace(experiment, frames=frames)
     names = cameras or list(experiment.movie_paths)
     movies = open_movies(experiment, names)
@@ -42,8 +42,8 @@ def opened(path, cameras=None, frames=None):
         CameraStream(name=name, camera=experiment.cameras[name], movie=movies[name], rows=lines.rows[name])
         for name in names
     ]
-    grey = torch.full((8, 16), 0.5)
-    yield Recording(experiment=experiment, streams=streams, timeline=lines, texture=grey, unseen=None, remarks=())
+    maps = {"": TextureMap(grey=torch.full((8, 16), 0.5))}
+    yield Recording(experiment=experiment, streams=streams, timeline=lines, maps=maps, remarks=())
 
 
 def truth(path):

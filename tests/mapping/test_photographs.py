@@ -207,9 +207,8 @@ def test_frames_of_the_shared_experiment_shuffled_and_thinned_are_photographs(tm
     rows = torch.linspace(0, 239, 30).round().long()[torch.randperm(30, generator=torch.Generator().manual_seed(1))]
     frames = list(open_movie(source.parent / "cam1.mkv").frames(0, 240))
     np.save(tmp_path / "stills.npy", np.stack([frames[k] for k in rows.tolist()]))
-    experiment = replace(
-        load_experiment(source), texture_path=None, movie_paths={"cam1": tmp_path / "stills.npy"}, start={}
-    )
+    experiment = load_experiment(source).with_sphere(texture_path=None)
+    experiment = replace(experiment, movie_paths={"cam1": tmp_path / "stills.npy"}, start={})
     with open_recording(experiment, ["cam1"], textured=False) as recording:
         learnt = mapped(recording, MapSettings(unordered=True))
     assert learnt.valid.all()

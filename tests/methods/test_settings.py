@@ -388,7 +388,7 @@ def test_every_input_has_its_fingerprint(tmp_path):
 
 def test_only_the_cameras_that_were_used_have_fingerprints(tmp_path):
     _, experiment = two_folders(tmp_path)
-    kept = provenance(input_files(replace(experiment, texture_path=None), ["cam2"]), tmp_path, "")
+    kept = provenance(input_files(experiment.with_sphere(texture_path=None), ["cam2"]), tmp_path, "")
     assert set(kept["sha256"]) == {"experiment.yaml", "cameras.yaml", "right/movie.mkv", "right/empty.png"}
 
 

@@ -221,5 +221,7 @@ def test_a_pdf_can_be_written(experiment, tmp_path):
 
 def test_an_experiment_without_a_map_is_refused(experiment, tmp_path):
     with pytest.raises(ExperimentError, match="texture"):
-        demo_figure(true_track(experiment, ("cam1",)), replace(experiment, texture_path=None), tmp_path / "figure.png")
+        demo_figure(
+            true_track(experiment, ("cam1",)), experiment.with_sphere(texture_path=None), tmp_path / "figure.png"
+        )
     assert not list(tmp_path.iterdir())
