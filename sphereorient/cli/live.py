@@ -56,7 +56,7 @@ def live(
     ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
     """
     from sphereorient.live.feed import Feed
-    from sphereorient.live.lines import FicTracLines, fictrac_line, worded
+    from sphereorient.live.lines import OF_JSON, FicTracLines, JsonLines, fictrac_line, worded
     from sphereorient.live.live import measured
     from sphereorient.live.monitor import Monitor
     from sphereorient.live.page import LivePage, address, open_page
@@ -66,7 +66,8 @@ def live(
     chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
     _check_source(source)
     outputs = [_output(name) for name in to or []]
-    table = any(kind not in ("jsonl", "zmq", "h5") for kind, _ in outputs)
+    kinds = {kind for kind, _ in outputs}
+    table, json = bool(kinds - {*OF_JSON, "h5"}), bool(kinds & {*OF_JSON})
     shown = LivePage()
     server = None if page is None else open_page(shown, page)
     if server is not None:
@@ -75,7 +76,7 @@ def live(
         with open_live(experiment, chosen, named, learnt) as opened:
             recording, tracker = opened.recording, opened.tracker
             views = tracker.appearance.fitter.views
-            lines = FicTracLines(views[0].camera)
+            lines, json_lines = FicTracLines(views[0].camera), JsonLines(recording.experiment.fixed)
             for _, output in outputs:
                 if isinstance(output, TrackOutput):
                     even = source.startswith(("movie", "-"))
@@ -93,8 +94,9 @@ def live(
                     for now in measured(tracker, views, monitor):
                         columns = lines.columns(now) if table or server is not None else None
                         line = fictrac_line(columns) if table and columns is not None else ""
+                        as_json = json_lines.line(now) if json else ""
                         for kind, output in outputs:
-                            output.send(worded(kind, now, line))
+                            output.send(worded(kind, now, line, as_json))
                         monitor.saw(now, columns)
                         if now.map_number > number:
                             number = now.map_number
