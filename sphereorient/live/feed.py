@@ -1,5 +1,6 @@
 """Frames as they come: from movies, from raw bytes of another program, from a camera; in a thread of its own."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -151,6 +152,7 @@ class Feed:
 
     def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, tell: Tell = lambda line: None) -> None:
         self.dropped = 0
+        self.newest_s = -math.inf  # time of the newest frame of a source that does not wait
         self._tell, self._usual_s, self._last_s = tell, 0.0, 0.0
         self._source, self._most, self._wait = source, most, wait
         self._waiting: deque[Arrival] = deque()
@@ -170,6 +172,7 @@ class Feed:
                         self._waiting.popleft()
                         self.dropped += 1
                     self._waiting.append(arrival)
+                    self.newest_s = self.newest_s if self._wait else arrival.time_s
                     if self._last_s:
                         step_s = arrival.arrived_s - self._last_s
                         self._usual_s += (step_s - self._usual_s) / USUAL_FRAMES if self._usual_s else step_s
