@@ -146,7 +146,8 @@ def device_frames(
 
 class Feed:
     """Reads a source in a thread. `most` frames wait at most: then the oldest is dropped, or with `wait` the source
-    waits. Iterating yields what is there, in order, and raises what the source raised. `tell` gets a line where no
+    waits. While more than half as many wait, every other frame is dropped: even steps keep the motion known. Iterating
+    yields what is there, in order, and raises what the source raised. `tell` gets a line where no
     frame comes for ten times the usual interval, a second at least, and one where they come again.
     """
 
@@ -200,6 +201,9 @@ class Feed:
                 if not self._waiting:
                     break
                 arrival = self._waiting.popleft()
+                if not self._wait and len(self._waiting) > self._most / 2:
+                    arrival = self._waiting.popleft()
+                    self.dropped += 1
                 self._changed.notify_all()
             yield arrival
         if self._fault is not None:
