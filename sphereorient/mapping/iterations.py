@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import csr_matrix, diags, vstack
 from torch import Tensor
 
 from sphereorient import so3
@@ -36,7 +36,7 @@ from sphereorient.pose.lab_light import LabLight
 from sphereorient.pose.model import Light, light_basis, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
-from sphereorient.sphere.texture_table import SIDE, texture_table
+from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
@@ -85,6 +85,7 @@ class State:
     blur_px: float
     fitter: Fitter  # of views and light; its own map is not used
     fixed: bool  # whether all instants share one position
+    weight: Tensor | None = None  # (H, 2 H) float64, of the texels in the map's last solution, see `map_weight`
     expected: Tensor | None = None  # (H, 2 H), paint without blur from which the map differs as little as it can
 
     @property
@@ -306,7 +307,28 @@ def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
     right -= tie * (stiffness(height) @ _unexpected(state).double().numpy().ravel())
     texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
-    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), chi2
+    weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight), chi2
+
+
+def extended(state: State, new: State, tie: float, unseen: TextureTable | None) -> State:
+    """Return the state with a map that also shows what new instants show, whose poses, light and blur are known.
+    What it shows already is held by the weights of its texels: this takes a tenth of an iteration. `tie`: see `State`;
+    `unseen`: paint that the map does not know yet, as in a `TextureTable`.
+    """
+    assert state.weight is not None
+    height, held = len(state.texture), state.weight.reshape(-1).sqrt().float().numpy()
+    at = linearise(new.fitter, state.texture, new.pixels, new.position_lab_mm, new.R_lab_body, new.blur_px, unseen)
+    weight = at.weight
+    if at.view.known is not None:  # by it the light is found; the rest has any grey level
+        weight = torch.where(at.view.known, weight, (new.pixels.inside & ~new.pixels.clipped).to(weight.dtype))
+    at = replace(at, weight=weight * new.use.reshape(-1, 1))
+    shown = at.by_texel(height)
+    normal = NormalMatrix(vstack([shown, diags(held)], format="csr"))
+    right = shown.T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy()
+    texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
+    sums = torch.from_numpy(normal.diagonal().reshape(height, -1))
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=sums)
 
 
 def sharp_map(state: State) -> Tensor:
