@@ -1,7 +1,7 @@
 """A map that grows with the frames as they come, of a ball that stays in its place."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,6 +22,7 @@ from sphereorient.mapping.iterations import (
     first_map,
     first_state,
     iterate,
+    iterating,
     map_height,
     optics_of,
 )
@@ -90,6 +91,7 @@ class GrowingMap:
         self._found: LiveMap | None = None  # the last one
         self._number = 0
         self._iterated, self._sized, self._trusted = 0, 0, False
+        self._iterating: Iterator[None] | None = None  # in progress
         self._judged = 0  # iterations before the last map that was judged
         self.done = 0  # iterations
         self.moved_rad = math.inf  # by the last iteration; infinite where frames came since
@@ -124,37 +126,57 @@ class GrowingMap:
         return len(self) >= FIRST_FRAMES and bool((so3.geodesic_distance(self._R, self._R[0]) > FIRST_TURN).any())
 
     def grown(self, *, idle: bool) -> LiveMap | None:
-        """Return the map with all frames, None: not yet, or nothing has changed. While frames come, they extend it,
-        until they are twice as many as in the last iteration; `idle`: there is time for another one.
+        """Return the map with all frames, None: not yet, or nothing has changed. While frames come, each call extends
+        the map by them; once they are twice as many as in the last iteration, it does a part of another one as well.
+        `idle`: there is time for a whole one.
         """
-        if not self.ready() or self.arrived:
-            return None
-        if self._trusted and not idle and len(self) < MORE * self._iterated:
+        due = idle or not self._trusted or len(self) >= MORE * self._iterated
+        if self._iterating is None and self.ready() and not self.arrived and due:
+            size = idle and self.done >= FIRST and self._sized < SIZED
+            self._sized += size
+            self._iterating = self.iterating(size=size)
+        done = self.done
+        if self._iterating is not None and (idle or not self._trusted):
+            self.finish()
+        elif self._iterating is not None:
+            next(self._iterating, None)
+        if self.done > done:
+            self._iterating = None
+        if self._trusted and self._shown < len(self):
             self.extend()
-            return self.live_map(searched=False)
-        size = idle and self.done >= FIRST and self._sized < SIZED
-        self.iterate(size=size)
-        self._sized += size
+        elif self.done == done:
+            return None
         if self.done < FIRST:
             return None
         found = self.live_map(searched=idle)
         self._trusted = found.trusted
         return found if found.trusted else None
 
+    def finish(self) -> None:
+        """Finish the iteration that is in progress."""
+        for _ in self._iterating or ():
+            pass
+        self._iterating = None
+
     def iterate(self, *, size: bool = False) -> None:
         """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
         three times as long.
         """
-        state, k = self._with_all_frames(), self.done
+        self._iterating = self.iterating(size=size)
+        self.finish()
+
+    def iterating(self, *, size: bool) -> Iterator[None]:
+        """Do what `iterate` does, with pauses in which frames may come and extend the map so far."""
+        state, k, count = self._with_all_frames(), self.done, len(self)
         before = state.R_lab_body
         if size and state.use.shape[1] == 1:
             state = _better_size(state, self._settings_of(state))
-        after, iteration = iterate(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
+        after, iteration = yield from iterating(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
-        self._state, self.done, self.moved_rad = after, k + 1, iteration.moved_rad
-        self._shown = self._iterated = len(self)
-        self._tie = after.tie
+        self._state, self._tie, self.done = after, after.tie, k + 1
+        self._shown = self._iterated = count
+        self.moved_rad = iteration.moved_rad if len(self) == count else math.inf
         self._rows, self._R_lab_map = after.frames, after.R_lab_body
         # The body frame goes on: an iteration moves that of the map.
         self._R_map_body = so3.nearest_rotation((after.R_lab_body.mT @ before @ self._R_map_body).mean(0))

@@ -1,7 +1,7 @@
 """The iterations of mapping: orientations, light and map in turn, and then poses and map together."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -170,6 +170,17 @@ def first_state(
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
     """Improve orientations, light and map once; k counts the iterations from 0."""
+    steps = iterating(state, settings, k)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            state, iteration = end.value
+            return state, iteration
+
+
+def iterating(state: State, settings: MapSettings, k: int) -> Generator[None, None, tuple[State, Iteration]]:
+    """Do what `iterate` does, and return the same, with pauses in which something else may be computed."""
     before = state.R_lab_body
     smoothest = SMOOTHEST * 0.5**k
     if k < SEPARATE_ITERATIONS:
@@ -178,11 +189,14 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
         state = _with_light(state)
     elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and isinstance(state.fitter.light, LabLight)):
         state = _lit_in_the_lab(state)
+    yield
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smoothest)
+        yield
     state, chi2 = with_map(state, smoothest)
     if k < LIGHT_ITERATIONS + LAB_ITERATIONS:
         state = _rescaled(state)
+    yield
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
         state = replace(state, blur_px=_better_blur(state))
     return state, Iteration(moved_rad=attitude_change_rad(before, state.R_lab_body), misfit=chi2, blur_px=state.blur_px)

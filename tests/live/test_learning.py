@@ -155,8 +155,10 @@ def test_frames_that_come_extend_the_map_in_its_body_frame_though_theirs_has_dri
     assert error_deg(after.R_lab_body @ found.R_map_body, (ball.R[44] @ Q)[None]) < 0.6
     for k in range(45, 60):
         growing.add(cut_out(ball.place, [ball.shots[k].picture]), ball.R[k] @ drifted)
-    growing.grown(idle=False)
-    assert (growing.done, growing.whole) == (FIRST + 1, True), "twice as many frames"
+    parts = [growing.grown(idle=False) for _ in range(4)]  # of the iteration of twice as many frames
+    assert (growing.done, growing.whole) == (FIRST + 1, True)
+    assert parts[0] is not None, "extended before"
+    assert parts[-1].number == found.number + 2
 
 
 @pytest.mark.slow
