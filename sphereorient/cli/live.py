@@ -99,9 +99,9 @@ def live(
                         for kind, output in outputs:
                             output.send(worded(kind, now, line, as_json))
                         monitor.saw(now, columns)
-                        if now.map_number > number:
+                        if number == 0 < now.map_number:
                             number = now.map_number
-                            _tell(f"frame {now.number}: orientations are by map {number} from here on")
+                            _tell(f"frame {now.number}: orientations are by the map from here on")
             finally:
                 feed.close()
             if opened.save_map is not None:
