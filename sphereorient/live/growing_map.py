@@ -65,6 +65,7 @@ class LiveMap:
     centre: FixedCentre
     search: GreySearch | None  # with its bank made; None: there was no time for it yet
     R_map_body: Tensor  # (3, 3): the body frame of the orientations handed over is that of the map times this
+    R_recent_map: Tensor  # (3, 3): likewise its inverse, by the last frames: orientations without a map drift
     seen_share: float  # of the sphere
     trusted: bool  # whether it explains pictures clearly better at right orientations than at wrong ones
 
@@ -214,9 +215,12 @@ class GrowingMap:
 
     def _R_aligned(self, rows: Tensor) -> Tensor:
         """Return R_lab_body (n, 3, 3) as handed over, in the body frame of the map by the last frames fitted to it."""
+        return self._R[rows] @ self._R_recent_map
+
+    @property
+    def _R_recent_map(self) -> Tensor:
         last = self._rows[-RECENT:]
-        Q = so3.nearest_rotation((self._R[last].mT @ self._R_lab_map[-RECENT:]).mean(0))
-        return self._R[rows] @ Q
+        return so3.nearest_rotation((self._R[last].mT @ self._R_lab_map[-RECENT:]).mean(0))
 
     def _of(self, rows: Tensor, R_lab_map: Tensor, state: State) -> State:
         """Return a state of some frames, by number, at their orientations."""
@@ -252,6 +256,7 @@ class GrowingMap:
             number=self._number,
             appearance=replace(appearance, fitter=fitter, still=fitter),
             R_map_body=self._R_map_body,
+            R_recent_map=self._R_recent_map,
             seen_share=float((areas * ~unseen).sum() / areas.sum()),
         )
         return self._found
@@ -326,6 +331,7 @@ def _judged(state: State, optics: Optics) -> LiveMap:
         centre=centre_of(fitter, state.pixels, fit, use, X[0]),
         search=None,
         R_map_body=torch.eye(3, dtype=torch.float64),
+        R_recent_map=torch.eye(3, dtype=torch.float64),
         seen_share=0.0,
         trusted=right > wrong + NO_BETTER,
     )

@@ -39,6 +39,7 @@ HANDED = 400  # frames that are handed over at most; the ball has shown its side
 LAST = 3  # poses from which following goes on with another map
 FEWEST = 6  # iterations of a map that is kept
 IDLE_S = 0.3  # without a frame: the ball shows nothing new
+PIPE_S = 0.004  # in which a full pipe is filled again
 SAVED_S = 120.0  # in which a map is finished
 
 
@@ -130,12 +131,12 @@ def _learn(frames: "Queue[Any]", maps: "SimpleQueue[Any]") -> None:
 
 
 def _waiting(frames: "Queue[Any]") -> list[_Handed | None]:
-    """Return what waits; wait a little for the first."""
+    """Return what waits; wait a little for the first, and for what does not fit into the pipe with it."""
     found: list[_Handed | None] = []
     with suppress(Empty):
         found.append(frames.get(timeout=IDLE_S))
         while True:
-            found.append(frames.get_nowait())
+            found.append(frames.get(timeout=PIPE_S))
     return found
 
 
@@ -196,7 +197,7 @@ class LearningTracker:
         """Go over to another map where the ball is found with it near `now`; return the poses of the frame."""
         online = _follower(found, self._settings)
         R_map_body = found.R_map_body @ self._R_map_first
-        online.resume([(then, _turned(poses, R_map_body.mT)) for then, poses in self._past])
+        online.resume([(then, _turned(poses, found.R_recent_map)) for then, poses in self._past])
         poses = online.followed(time_s, shots)
         if poses is None or not supported(poses):
             return now

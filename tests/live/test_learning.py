@@ -153,6 +153,7 @@ def test_frames_that_come_extend_the_map_in_its_body_frame_though_theirs_has_dri
     assert after.score > found.appearance.score_min
     assert after.score > before.score
     assert error_deg(after.R_lab_body @ found.R_map_body, (ball.R[44] @ Q)[None]) < 0.6
+    assert error_deg((drifted @ found.R_recent_map)[None], (Q @ found.R_map_body.mT)[None]) < 0.6, "frames come as drifted"
     for k in range(45, 60):
         growing.add(cut_out(ball.place, [ball.shots[k].picture]), ball.R[k] @ drifted)
     parts = [growing.grown(idle=False) for _ in range(4)]  # of the iteration of twice as many frames
@@ -208,7 +209,7 @@ def test_the_change_to_a_map_is_no_jump_and_its_number_tells_it(ball, grown):
 @pytest.mark.slow
 def test_a_map_of_another_ball_is_not_taken(ball, grown):
     found = grown[1]
-    other = replace(found, R_map_body=so3.exp(torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)))
+    other = replace(found, R_recent_map=so3.exp(torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)))
     tracker = LearningTracker(ball.place, Settings(), Known(other, LAST))
     numbers = []
     for k in range(12):
