@@ -153,7 +153,7 @@ def test_frames_that_come_extend_the_map_in_its_body_frame_though_theirs_has_dri
     assert after.score > found.appearance.score_min
     assert after.score > before.score
     assert error_deg(after.R_lab_body @ found.R_map_body, (ball.R[44] @ Q)[None]) < 0.6
-    assert error_deg((drifted @ found.R_recent_map)[None], (Q @ found.R_map_body.mT)[None]) < 0.6, "frames come as drifted"
+    assert error_deg((drifted @ found.R_recent_map)[None], (Q @ found.R_map_body.mT)[None]) < 0.6
     for k in range(45, 60):
         growing.add(cut_out(ball.place, [ball.shots[k].picture]), ball.R[k] @ drifted)
     parts = [growing.grown(idle=False) for _ in range(4)]  # of the iteration of twice as many frames
