@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sphereorient.evaluate.robustness import BenchSettings, Results
 
 EXIT_WORSE = 1  # a number got worse
+LARGEST_HZ = 1e5
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -156,9 +157,10 @@ def robustness(
 @bench.command("live")
 def live_delay(
     experiment: ExperimentPath,
-    rate: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 200.0,
+    rate: Annotated[str, typer.Option(help="Frames a second; several, one after the other: 100,200,500.")] = "200",
     seconds: Annotated[float, typer.Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0,
     loop: Annotated[bool, typer.Option("--loop", help="Show it from its begin again: it has no seam.")] = False,
+    load: Annotated[int, typer.Option(min=0, max=64, help="Other programs, each of which keeps a core busy.")] = 0,
     learnt: Annotated[Path | None, typer.Option(help="As of `live`.")] = None,
     cameras: Cameras = None,
     quiet: Quiet = False,
@@ -166,12 +168,36 @@ def live_delay(
     """Time `live`: from a picture in memory to its line on a socket, by another process. A truth.h5 beside the
     experiment tells its errors.
     """
-    from sphereorient.live.bench import delays
+    from rich.table import Table
 
+    from sphereorient.live.bench import COLUMNS, delays, neighbours
+
+    rates = [_rate_hz(part) for part in names_in(rate) or [rate]]
     options = [] if learnt is None else ["--learnt", str(learnt)]
-    with progress_bar(quiet, unit="lines") as advance:
-        found = delays(experiment, rate, seconds, options, cameras_of(cameras), advance, loop=loop)
-    echo_lines(found.summary())
+    found = []
+    with neighbours(load):
+        for rate_hz in rates:
+            with progress_bar(quiet, unit="lines") as advance:
+                found.append(delays(experiment, rate_hz, seconds, options, cameras_of(cameras), advance, loop=loop))
+    if len(found) == 1:
+        echo_lines(found[0].summary())
+        return
+    table = Table("Hz", *COLUMNS, title=f"From a picture in memory to its line, other busy programs: {load}")
+    for rate_hz, one in zip(rates, found, strict=True):
+        table.add_row(f"{rate_hz:g}", *one.row())
+    print_table(table)
+
+
+def _rate_hz(text: str) -> float:
+    """Return a frame rate; raise SettingsError for anything else."""
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = 0.0
+    if not 1.0 <= rate_hz < LARGEST_HZ:
+        do = "write e.g. --rate 100,200,500"
+        raise SettingsError(refusal("--rate", expected="frames a second, 1 at least", got=repr(text)[:40], do=do))
+    return rate_hz
 
 
 @bench.command("compare")

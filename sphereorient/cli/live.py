@@ -4,6 +4,7 @@ import gc
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,11 +17,12 @@ from sphereorient.errors import SettingsError, refusal
 
 if TYPE_CHECKING:
     from sphereorient.experiment.recording import Recording
+    from sphereorient.experiment.stream import CameraStream
     from sphereorient.live.feed import Arrival
     from sphereorient.live.outputs import Output
 
 SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
-WAITING = 16  # frames of a camera that wait at most
+WAITING = 32  # frames of a camera that wait at most
 
 
 @app.command()
@@ -56,7 +58,7 @@ def live(
     ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
     """
     from sphereorient.live.feed import Feed
-    from sphereorient.live.lines import FicTracLines, fictrac_line, worded
+    from sphereorient.live.lines import OF_JSON, FicTracLines, JsonLines, fictrac_line, worded
     from sphereorient.live.live import measured
     from sphereorient.live.monitor import Monitor
     from sphereorient.live.page import LivePage, address, open_page
@@ -64,9 +66,10 @@ def live(
     from sphereorient.live.track import TrackBlocks, TrackOutput
 
     chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
-    _check_source(source)
+    taken = _source(source)
     outputs = [_output(name) for name in to or []]
-    table = any(kind not in ("jsonl", "zmq", "h5") for kind, _ in outputs)
+    kinds = {kind for kind, _ in outputs}
+    table, json = bool(kinds - {*OF_JSON, "h5"}), bool(kinds & {*OF_JSON})
     shown = LivePage()
     server = None if page is None else open_page(shown, page)
     if server is not None:
@@ -75,16 +78,15 @@ def live(
         with open_live(experiment, chosen, named, learnt) as opened:
             recording, tracker = opened.recording, opened.tracker
             views = tracker.appearance.fitter.views
-            lines = FicTracLines(views[0].camera)
+            lines, json_lines = FicTracLines(views[0].camera), JsonLines(recording.experiment.fixed)
             for _, output in outputs:
                 if isinstance(output, TrackOutput):
-                    even = source.startswith(("movie", "-"))
-                    blocks = TrackBlocks(recording=recording, tracker=tracker, even=even)
+                    blocks = TrackBlocks(recording=recording, tracker=tracker, even=taken.even)
                     output.begin(blocks, blocks.head(chosen, command_line()))
             gc.collect()
             gc.freeze()  # what is here stays: no pause looks through it
             sys.setswitchinterval(SWITCH_S)
-            feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"), tell=_tell)
+            feed = Feed(taken.frames(recording), WAITING, wait=taken.waits, tell=_tell)
             monitor, number = Monitor(feed, _tell), tracker.number
             shown.views, shown.radius_mm, shown.monitor = views, recording.experiment.radius_mm, monitor
             shown.save_map = opened.save_map
@@ -93,12 +95,13 @@ def live(
                     for now in measured(tracker, views, monitor):
                         columns = lines.columns(now) if table or server is not None else None
                         line = fictrac_line(columns) if table and columns is not None else ""
+                        as_json = json_lines.line(now) if json else ""
                         for kind, output in outputs:
-                            output.send(worded(kind, now, line))
+                            output.send(worded(kind, now, line, as_json))
                         monitor.saw(now, columns)
-                        if now.map_number > number:
+                        if number == 0 < now.map_number:
                             number = now.map_number
-                            _tell(f"frame {now.number}: orientations are by map {number} from here on")
+                            _tell(f"frame {now.number}: orientations are by the map from here on")
             finally:
                 feed.close()
             if opened.save_map is not None:
@@ -127,34 +130,49 @@ def _tell(line: str) -> None:
     typer.echo(f"note: {line}", err=True)
 
 
-def _check_source(name: str) -> None:
-    kind, _, where = name.partition(":")
-    if name not in ("movie", "movie-fast", "-") and (kind not in ("camera", "genicam", "shared") or not where):
-        expected = "movie, movie-fast, -, camera:NUMBER, genicam:PRODUCER.cti or shared:FILE"
-        do = "choose one of these"
-        raise SettingsError(refusal("--source", expected=expected, got=name, do=do))
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    frames: "Callable[[Recording], Iterator[Arrival]]"
+    waits: bool = False  # for the tracking, instead of dropping frames
+    even: bool = False  # at the rate of the experiment
 
 
-def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
+def _source(name: str) -> _Source:
+    """Return the source of a name; raise SettingsError for an unknown one."""
     from sphereorient.live.feed import camera_pictures, device_frames, movie_frames, rate_of, raw_frames
     from sphereorient.live.genicam import genicam_pictures
     from sphereorient.live.shared import shared_frames
 
-    if name in ("movie", "movie-fast"):
-        return movie_frames(recording, paced=name == "movie")
-    if name == "-":
-        return raw_frames(sys.stdin.buffer, recording.streams, rate_of(recording))
     kind, _, where = name.partition(":")
-    if kind == "shared":
-        return shared_frames(Path(where), recording.streams)
+    match kind, bool(where):
+        case (("movie" | "movie-fast"), False):
+            paced = kind == "movie"
+            return _Source(frames=partial(movie_frames, paced=paced), waits=not paced, even=True)
+        case "-", False:
+            return _Source(
+                frames=lambda opened: raw_frames(sys.stdin.buffer, opened.streams, rate_of(opened)),
+                waits=True,
+                even=True,
+            )
+        case "shared", True:
+            return _Source(frames=lambda opened: shared_frames(Path(where), opened.streams))
+        case "genicam", True:
+            pictures = partial(genicam_pictures, where)
+            return _Source(frames=lambda opened: device_frames(name, pictures, _only_stream(opened), _tell))
+        case "camera", True:
+            device = int(where) if where.isdigit() else where
+            taken = partial(camera_pictures, device)
+            again = None if Path(where).is_file() else _tell  # a movie ends
+            return _Source(frames=lambda opened: device_frames(f"camera {where}", taken, _only_stream(opened), again))
+    expected = "movie, movie-fast, -, camera:NUMBER, genicam:PRODUCER.cti or shared:FILE"
+    raise SettingsError(refusal("--source", expected=expected, got=name, do="choose one of these"))
+
+
+def _only_stream(recording: "Recording") -> "CameraStream":
     if len(recording.streams) > 1:
         do = "add --cameras with one name"
         raise SettingsError(refusal("--source", expected="one camera", got=f"{len(recording.streams)}", do=do))
-    if kind == "genicam":
-        return device_frames(name, partial(genicam_pictures, where), recording.streams[0], _tell)
-    device = int(where) if where.isdigit() else where
-    again = None if Path(where).is_file() else _tell  # a movie ends
-    return device_frames(f"camera {where}", partial(camera_pictures, device), recording.streams[0], again)
+    return recording.streams[0]
 
 
 def _output(name: str) -> "tuple[str, Output]":

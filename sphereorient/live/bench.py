@@ -1,11 +1,13 @@
 """Delay and error of live tracking: from a picture in memory to the line on a socket, through two programs."""
 
+import os
 import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
@@ -29,6 +31,14 @@ FIRST = 50  # lines that do not count: caches fill
 NUMBER, ROTATION, TIME, SEQUENCE = 1, slice(9, 12), 22, 23
 TENTHS = 10
 EVERY = 1000  # lines from one look at the memory to the next
+# Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
+NEIGHBOUR = """
+import os, sys, cv2, numpy
+cv2.setNumThreads(1)
+picture = numpy.random.default_rng(0).integers(0, 255, (1024, 1280), "uint8")
+while os.getppid() == int(sys.argv[1]):
+    cv2.imencode(".jpg", cv2.GaussianBlur(picture, (0, 0), 2))
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,14 +51,23 @@ class Delays:
     error_deg: NDArray[np.float64]  # (n,), of the rotation since the stretch began; NaN without pose or truth
     memory_mb: NDArray[np.float64]  # of the tracker, every so often; empty where the system does not tell
 
-    def at(self, share: float) -> float:
-        """Return the delay, s, that this share of the lines keeps."""
-        return float(np.quantile(self.delay_s, share)) if len(self.delay_s) else float("nan")
+    def delays_ms(self) -> list[str]:
+        """Return the delays that half of the lines keep, 99 and 99.9 % of them, ms, in words."""
+        shares = (0.5, 0.99, 0.999)
+        return [f"{1e3 * np.quantile(self.delay_s, share):.1f}" if len(self.delay_s) else "nan" for share in shares]
+
+    def row(self) -> list[str]:
+        """Return what `COLUMNS` names."""
+        counts = [self.written, self.written - len(self.delay_s), self.lost]
+        known = np.isfinite(self.error_deg).any()
+        error = f"{np.nanmedian(self.error_deg):.3f}, {np.nanmax(self.error_deg):.3f}" if known else ""
+        memory = f"{self.memory_mb[-1]:.0f}" if len(self.memory_mb) else ""
+        return [*map(str, counts), *self.delays_ms(), error, memory]
 
     def summary(self) -> list[str]:
         """Return all of it in words."""
         came = len(self.delay_s)
-        middle, slow, slowest = (f"{1e3 * self.at(share):.1f}" for share in (0.5, 0.99, 0.999))
+        middle, slow, slowest = self.delays_ms()
         words = [f"{came} lines of {self.written} frames, {self.written - came} dropped, {self.lost} without a pose"]
         words.append(f"delay: {middle} ms (median), {slow} ms (99 %), {slowest} ms (99.9 %)")
         if np.isfinite(self.error_deg).any():
@@ -60,6 +79,22 @@ class Delays:
             first, last = self.memory_mb[0], self.memory_mb[-1]
             words.append(f"memory of the tracker: {first:.0f} MB at first, {last:.0f} MB at the end")
         return words
+
+
+COLUMNS = ("frames", "dropped", "no pose", "median (ms)", "99 %", "99.9 %", "error (\u00b0): median, largest", "MB")
+
+
+@contextmanager
+def neighbours(count: int) -> Iterator[None]:
+    """Keep this many cores busy with other programs."""
+    command = [sys.executable, "-c", NEIGHBOUR, str(os.getpid())]
+    busy = [subprocess.Popen(command) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for one in busy:
+            one.kill()
+            one.wait()
 
 
 def delays(

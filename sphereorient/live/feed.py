@@ -1,5 +1,6 @@
 """Frames as they come: from movies, from raw bytes of another program, from a camera; in a thread of its own."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -145,12 +146,14 @@ def device_frames(
 
 class Feed:
     """Reads a source in a thread. `most` frames wait at most: then the oldest is dropped, or with `wait` the source
-    waits. Iterating yields what is there, in order, and raises what the source raised. `tell` gets a line where no
+    waits. While more than half as many wait, every other frame is dropped: even steps keep the motion known. Iterating
+    yields what is there, in order, and raises what the source raised. `tell` gets a line where no
     frame comes for ten times the usual interval, a second at least, and one where they come again.
     """
 
     def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, tell: Tell = lambda line: None) -> None:
         self.dropped = 0
+        self.newest_s = -math.inf  # time of the newest frame of a source that does not wait
         self._tell, self._usual_s, self._last_s = tell, 0.0, 0.0
         self._source, self._most, self._wait = source, most, wait
         self._waiting: deque[Arrival] = deque()
@@ -170,6 +173,7 @@ class Feed:
                         self._waiting.popleft()
                         self.dropped += 1
                     self._waiting.append(arrival)
+                    self.newest_s = self.newest_s if self._wait else arrival.time_s
                     if self._last_s:
                         step_s = arrival.arrived_s - self._last_s
                         self._usual_s += (step_s - self._usual_s) / USUAL_FRAMES if self._usual_s else step_s
@@ -197,6 +201,9 @@ class Feed:
                 if not self._waiting:
                     break
                 arrival = self._waiting.popleft()
+                if not self._wait and len(self._waiting) > self._most / 2:
+                    arrival = self._waiting.popleft()
+                    self.dropped += 1
                 self._changed.notify_all()
             yield arrival
         if self._fault is not None:

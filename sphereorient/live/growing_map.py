@@ -1,7 +1,7 @@
 """A map that grows with the frames as they come, of a ball that stays in its place."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,11 +18,12 @@ from sphereorient.mapping.iterations import (
     ROW,
     SEPARATE_ITERATIONS,
     State,
+    extended,
     first_map,
     first_state,
     iterate,
+    iterating,
     map_height,
-    map_weight,
     optics_of,
 )
 from sphereorient.mapping.learn import final_map, interpolated
@@ -35,18 +36,24 @@ from sphereorient.sphere.texture_table import texture_table
 
 MOST_PIXELS = 1200  # of a disk
 MOST_FITTED = 48  # frames of an iteration, evenly spread
+FIRST = 2  # iterations before the first map
+MORE = 2.0  # times the frames of an iteration from which another one is due
+SIZED = 2  # times that the distance of the ball is sought
 COARSER = 2 / 3  # rows of the map over those of a whole movie's: an iteration must not take long
 FIRST_FRAMES, FIRST_TURN = 24, math.radians(40.0)  # from which a map is begun
-HELD_ITERATIONS = 4  # in which the place stays as the outline gave it
-BLUR_AFTER, BLUR_ITERATIONS = 1, 5  # iterations after which the blur is estimated, and until which
+HELD_ITERATIONS = 2  # in which the place stays as the outline gave it
+BLUR_ITERATIONS = 5  # in which the blur is estimated: a place found with a wrong one is off
 SIZE_STEP = 0.01  # of the distances that are tried
 LATER = 4  # number, as `iterate` counts, of the later iterations: smoothness has settled
 TRIED = 6  # number, as `iterate` counts, of iterations that try a size: light and poses anew
 MOST_LEFT = 20.0  # grey levels: what an occluder leaves counts no more
-RECENT = 10  # frames by which the body frame goes on from relative orientations
+RECENT = 6  # frames by which the body frame of those that come is known
+FITTED = 3  # iterations of such frames
+MOST_NEW = 12  # frames by which the map is extended at once, evenly spread
+TABLE_SIDE = 256  # cells of the table of the paint: 0.8 degrees, below a texel
 UNSEEN_SIDE = 128  # cells of the table of what is unseen: 1.6 degrees
 LEAST_WEIGHT = 0.05  # of a typical texel's: less is unseen
-WRONG_POSES, WRONG_ITERATIONS = 3, 3  # of each frame tried, at random orientations
+WRONG_FRAMES, WRONG_POSES, WRONG_ITERATIONS = 10, 3, 3  # tried at random orientations
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,8 +63,9 @@ class LiveMap:
     number: int  # 1, 2 .. of the maps of one run
     appearance: Appearance
     centre: FixedCentre
-    search: GreySearch
+    search: GreySearch | None  # with its bank made; None: there was no time for it yet
     R_map_body: Tensor  # (3, 3): the body frame of the orientations handed over is that of the map times this
+    R_recent_map: Tensor  # (3, 3): likewise its inverse, by the last frames: orientations without a map drift
     seen_share: float  # of the sphere
     trusted: bool  # whether it explains pictures clearly better at right orientations than at wrong ones
 
@@ -74,10 +82,18 @@ class GrowingMap:
         self._settings = settings.model_copy(update={"height": height, "pixels": pixels})
         self._place, self._crops = place, replace(place, position_lab_mm=place.position_lab_mm[:0])
         self._R = torch.zeros(0, 3, 3, dtype=torch.float64)  # R_lab_body as handed over
-        self._absolute: list[int] = []  # number of the map that each came from; 0: relative
         self._pixels: list[Pixels] = []
         self._state: State | None = None
+        self._R_map_body = torch.eye(3, dtype=torch.float64)
+        self._rows = torch.zeros(0, dtype=torch.int64)  # of the frames that were fitted to the map
+        self._R_lab_map = self._R  # their orientations
+        self._shown = 0  # frames that are in the map
+        self._tie = 0.0  # of the last iteration's map, as the state's
+        self._found: LiveMap | None = None  # the last one
         self._number = 0
+        self._iterated, self._sized, self._trusted = 0, 0, False
+        self._iterating: Iterator[None] | None = None  # in progress
+        self._judged = 0  # iterations before the last map that was judged
         self.done = 0  # iterations
         self.moved_rad = math.inf  # by the last iteration; infinite where frames came since
 
@@ -86,11 +102,16 @@ class GrowingMap:
         """Whether all frames are in the map, and the last iteration moved them by less than the setting."""
         return self.moved_rad < math.radians(self._settings.arrived_deg)
 
+    @property
+    def whole(self) -> bool:
+        """Whether no frame came since the last iteration."""
+        return math.isfinite(self.moved_rad)
+
     def __len__(self) -> int:
         return len(self._R)
 
-    def add(self, crops: Sequence[Crop], R_lab_body: Tensor, number: int) -> None:
-        """Take a frame: a crop of each camera, its orientation (3, 3), and the map that this came from, 0: none."""
+    def add(self, crops: Sequence[Crop], R_lab_body: Tensor) -> None:
+        """Take a frame: a crop of each camera, and its orientation (3, 3)."""
         known = self._crops
         self._crops = replace(
             known,
@@ -99,27 +120,86 @@ class GrowingMap:
             seen=torch.ones(len(self) + 1, len(crops), dtype=torch.bool),
         )
         self._R = torch.cat([self._R, R_lab_body[None]])
-        self._absolute.append(number)
         self.moved_rad = math.inf
 
     def ready(self) -> bool:
         """Whether the frames are enough for a map."""
         return len(self) >= FIRST_FRAMES and bool((so3.geodesic_distance(self._R, self._R[0]) > FIRST_TURN).any())
 
+    def grown(self, *, idle: bool) -> LiveMap | None:
+        """Return the map with all frames, None: not yet, or nothing has changed. While frames come, each call extends
+        the map by them; once they are twice as many as in the last iteration, it does a part of another one as well.
+        `idle`: there is time for a whole one.
+        """
+        due = idle or not self._trusted or len(self) >= MORE * self._iterated
+        if self._iterating is None and self.ready() and not self.arrived and due:
+            size = idle and self.done >= FIRST and self._sized < SIZED
+            self._sized += size
+            self._iterating = self.iterating(size=size)
+        done = self.done
+        if self._iterating is not None and (idle or not self._trusted):
+            self.finish()
+        elif self._iterating is not None:
+            next(self._iterating, None)
+        if self.done > done:
+            self._iterating = None
+        if self._trusted and self._shown < len(self):
+            self.extend()
+        elif self.done == done:
+            return None
+        if self.done < FIRST:
+            return None
+        found = self.live_map(searched=idle)
+        self._trusted = found.trusted
+        return found if found.trusted else None
+
+    def finish(self) -> None:
+        """Finish the iteration that is in progress."""
+        for _ in self._iterating or ():
+            pass
+        self._iterating = None
+
     def iterate(self, *, size: bool = False) -> None:
         """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
         three times as long.
         """
-        state, k = self._with_all_frames(), self.done
+        self._iterating = self.iterating(size=size)
+        self.finish()
+
+    def iterating(self, *, size: bool) -> Iterator[None]:
+        """Do what `iterate` does, with pauses in which frames may come and extend the map so far."""
+        state, k, count = self._with_all_frames(), self.done, len(self)
+        before = state.R_lab_body
         if size and state.use.shape[1] == 1:
             state = _better_size(state, self._settings_of(state))
-        after, iteration = iterate(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
+        after, iteration = yield from iterating(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
-        self._state, self.done, self.moved_rad = after, k + 1, iteration.moved_rad
+        self._state, self._tie, self.done = after, after.tie, k + 1
+        self._shown = self._iterated = count
+        self.moved_rad = iteration.moved_rad if len(self) == count else math.inf
+        self._rows, self._R_lab_map = after.frames, after.R_lab_body
+        # The body frame goes on: an iteration moves that of the map.
+        self._R_map_body = so3.nearest_rotation((after.R_lab_body.mT @ before @ self._R_map_body).mean(0))
+
+    def extend(self) -> None:
+        """Let the map show what the frames since then show, fitted to what it shows already."""
+        assert self._state is not None
+        assert self._found is not None
+        rows, self._shown = evenly_spread(torch.arange(self._shown, len(self)), MOST_NEW), len(self)
+        if len(rows):
+            fitter, level = self._found.appearance.fitter, self._found.appearance.fitter.optics.fine
+            new = self._of(rows, self._R_aligned(rows), self._state)
+            held = self._found.centre.precision.expand(len(rows), 3, 3)
+            fit = fitter.fit(new.pixels, new.position_lab_mm, new.R_lab_body, new.use, level, FITTED, held)
+            good = ((fit.score > self._found.appearance.score_min) | ~new.use).all(1)
+            self._rows = torch.cat([self._rows, rows[good]])
+            self._R_lab_map = torch.cat([self._R_lab_map, fit.R_lab_body[good]])
+            R = torch.where(good[:, None, None], fit.R_lab_body, self._R_aligned(rows))
+            self._state = extended(self._state, replace(new, R_lab_body=R), self._tie, level.paint.unseen)
 
     def _settings_of(self, state: State) -> MapSettings:
-        blur_px = self._settings.blur_px if BLUR_AFTER <= self.done < BLUR_ITERATIONS else state.blur_px
+        blur_px = self._settings.blur_px if self.done < BLUR_ITERATIONS else state.blur_px
         return self._settings.model_copy(update={"blur_px": blur_px})
 
     def _with_all_frames(self) -> State:
@@ -129,62 +209,64 @@ class GrowingMap:
             assert self._settings.height is not None
             first = first_map(disks, self._R[rows], self._settings.height)
             state = first_state(self._crops, rows, self._R[rows], first, self._settings)
-        else:
-            R = interpolated(self._R @ self._gauge().mT, before.frames, before.R_lab_body)
-            use, X = self._crops.seen[rows], before.position_lab_mm[:1].expand(len(rows), 3)
-            state = replace(before, frames=rows, use=use, position_lab_mm=X, R_lab_body=R[rows])
+            return self._of(rows, self._R[rows], state)
+        R = interpolated(self._R_aligned(torch.arange(len(self))), self._rows, self._R_lab_map)
+        return self._of(rows, R[rows], before)
+
+    def _R_aligned(self, rows: Tensor) -> Tensor:
+        """Return R_lab_body (n, 3, 3) as handed over, in the body frame of the map by the last frames fitted to it."""
+        return self._R[rows] @ self._R_recent_map
+
+    @property
+    def _R_recent_map(self) -> Tensor:
+        last = self._rows[-RECENT:]
+        return so3.nearest_rotation((self._R[last].mT @ self._R_lab_map[-RECENT:]).mean(0))
+
+    def _of(self, rows: Tensor, R_lab_map: Tensor, state: State) -> State:
+        """Return a state of some frames, by number, at their orientations."""
         for k in range(len(self._pixels), len(self)):
             self._pixels.append(pixels_of(self._crops, state.fitter, torch.tensor([k]), self._settings.pixels))
-        return replace(state, pixels=stacked([self._pixels[k] for k in rows.tolist()]))
-
-    def _gauge(self) -> Tensor:
-        """Return R_map_body (3, 3): of the frames that came from the newest map, or else of the last ones."""
-        assert self._state is not None
-        frames, newest = self._state.frames, max(self._absolute)
-        same = torch.tensor([self._absolute[k] == newest for k in frames.tolist()])
-        rows = torch.nonzero(same)[:, 0] if newest and bool(same.any()) else torch.arange(len(frames))[-RECENT:]
-        return so3.nearest_rotation((self._state.R_lab_body[rows].mT @ self._R[frames[rows]]).mean(0))
+        return replace(
+            state,
+            frames=rows,
+            pixels=stacked([self._pixels[k] for k in rows.tolist()]),
+            use=self._crops.seen[rows],
+            position_lab_mm=state.position_lab_mm[:1].expand(len(rows), 3),
+            R_lab_body=R_lab_map,
+        )
 
     def live_map(self, *, searched: bool = True) -> LiveMap:
-        """Return what following the ball with the present map needs; `searched`: with the bank of its search made."""
+        """Return what following the ball with the present map needs; `searched`: with a search of it, else with the
+        one before. A map that was only extended is trusted as that of the last iteration.
+        """
         assert self._state is not None
-        state = self._state
-        weight = map_weight(state)
-        unseen = weight < LEAST_WEIGHT * weight[weight > 0].median()
-        optics = _optics(state, unseen)
-        fitter = replace(state.fitter, optics=optics)
-        X, use = state.position_lab_mm, state.use
-        fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, 3)
-        fitter = replace(fitter, widest_px=WIDER * float(fitter.largest_px(X).max()))
-        right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
-        appearance = Appearance(
-            fitter=fitter,
-            still=fitter,
-            lasting=lasting_errors(state.pixels, fit, use, fitter.model(optics.fine)),
-            score_min=0.5 * (right + min(wrong, right)),
-            right_score=right,
-        )
-        search = GreySearch(state.texture.clamp(0, 1))
-        self._number += 1
-        if searched:
-            search.prepare()
+        unseen = _unseen(self._state)
+        optics = _optics(self._state, unseen)
         areas = texel_areas(len(unseen))
-        return LiveMap(
+        self._number += 1
+        if self._found is None or self._judged < self.done:
+            search = None if self._found is None else self._found.search
+            self._found, self._judged = replace(_judged(self._state, optics), search=search), self.done
+            if searched:
+                self._found = replace(self._found, search=_search(self._state))
+        appearance = self._found.appearance
+        fitter = replace(appearance.fitter, optics=optics)
+        self._found = replace(
+            self._found,
             number=self._number,
-            appearance=appearance,
-            centre=centre_of(fitter, state.pixels, fit, use, X[0]),
-            search=search,
-            R_map_body=self._gauge(),
+            appearance=replace(appearance, fitter=fitter, still=fitter),
+            R_map_body=self._R_map_body,
+            R_recent_map=self._R_recent_map,
             seen_share=float((areas * ~unseen).sum() / areas.sum()),
-            trusted=right > wrong + NO_BETTER,
         )
+        return self._found
 
     def paint(self) -> tuple[Tensor, Tensor]:
         """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H) each, in the
         body frame of the orientations handed over.
         """
         assert self._state is not None
-        texture, seen, _ = final_map(self._state, self._gauge().mT)
+        texture, seen, _ = final_map(self._state, self._R_map_body.mT)
         return texture, seen
 
 
@@ -216,16 +298,54 @@ def _left(state: State) -> float:
     return float((torch.cat(squares) * torch.cat(seen)).sum() / torch.cat(seen).sum())
 
 
+def _unseen(state: State) -> Tensor:
+    """Return which texels no picture shows well, (H, 2 H) bool."""
+    assert state.weight is not None
+    return state.weight < LEAST_WEIGHT * state.weight[state.weight > 0].median()
+
+
 def _optics(state: State, unseen: Tensor) -> Optics:
-    optics = optics_of(state.texture, state.fitter.views, state.blur_px)
+    optics = optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE)
     if bool(unseen.any()):
         optics.fine.paint.unseen = texture_table(unseen.float(), optics.fine.paint.blur_rad, UNSEEN_SIDE)
     return optics
 
 
+def _judged(state: State, optics: Optics) -> LiveMap:
+    """Return what following needs of a map whose pictures are fitted anew."""
+    fitter = replace(state.fitter, optics=optics)
+    X, use = state.position_lab_mm, state.use
+    fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, 3)
+    fitter = replace(fitter, widest_px=WIDER * float(fitter.largest_px(X).max()))
+    right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
+    appearance = Appearance(
+        fitter=fitter,
+        still=fitter,
+        lasting=lasting_errors(state.pixels, fit, use, fitter.model(optics.fine)),
+        score_min=0.5 * (right + min(wrong, right)),
+        right_score=right,
+    )
+    return LiveMap(
+        number=0,
+        appearance=appearance,
+        centre=centre_of(fitter, state.pixels, fit, use, X[0]),
+        search=None,
+        R_map_body=torch.eye(3, dtype=torch.float64),
+        R_recent_map=torch.eye(3, dtype=torch.float64),
+        seen_share=0.0,
+        trusted=right > wrong + NO_BETTER,
+    )
+
+
+def _search(state: State) -> GreySearch:
+    search = GreySearch(state.texture.clamp(0, 1))
+    search.prepare()
+    return search
+
+
 def _wrong_score(fitter: Fitter, state: State) -> float:
     """Return the score that wrong orientations reach in one picture of ten."""
-    rows = evenly_spread(torch.arange(len(state.use)), RECENT).repeat(WRONG_POSES)
+    rows = evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES)
     turns = so3.random_rotations(len(rows), generator=torch.Generator().manual_seed(0))
     fine = fitter.optics.fine
     fit = fitter.fit(state.disks(rows), state.position_lab_mm[rows], turns, state.use[rows], fine, WRONG_ITERATIONS)

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.queues import Queue
+from multiprocessing.queues import Queue, SimpleQueue
 from queue import Empty
 from typing import Any
 
@@ -36,11 +36,10 @@ from sphereorient.pose.lasting import Lasting
 
 HANDED_RAD = 0.025  # turn from one frame that is handed over to the next
 HANDED = 400  # frames that are handed over at most; the ball has shown its sides by then
-FIRST = 2  # iterations before the first map
-SIZED = 2  # times that the distance of the ball is sought
 LAST = 3  # poses from which following goes on with another map
 FEWEST = 6  # iterations of a map that is kept
-IDLE_S = 0.1
+IDLE_S = 0.3  # without a frame: the ball shows nothing new
+PIPE_S = 0.004  # in which a full pipe is filled again
 SAVED_S = 120.0  # in which a map is finished
 
 
@@ -48,7 +47,6 @@ SAVED_S = 120.0  # in which a map is finished
 class _Handed:
     crops: Sequence[Crop]  # one of each camera
     R_lab_body: NDArray[np.float64]  # (3, 3)
-    number: int  # of the map that it came from; 0: none
 
 
 class MapLearner:
@@ -61,7 +59,7 @@ class MapLearner:
         self._last: Tensor | None = None
         self._count = 0
         self._frames: Queue[Any] = context.Queue()
-        self._maps: Queue[Any] = context.Queue()
+        self._maps: SimpleQueue[Any] = context.SimpleQueue()  # a map goes whole before it is extended
         self._process = context.Process(target=_learn, args=(self._frames, self._maps), daemon=True)
         self._process.start()
         self._frames.cancel_join_thread()  # what a process that has ended does not take must hold nobody up
@@ -74,14 +72,14 @@ class MapLearner:
         self._place = place
         self._frames.put((place, settings))
 
-    def hand(self, shots: Sequence[Frame], R_lab_body: Tensor, number: int) -> None:
-        """Hand over a frame, with its orientation by map `number`, where all cameras see a ball that has turned."""
+    def hand(self, shots: Sequence[Frame], R_lab_body: Tensor) -> None:
+        """Hand over a frame, with its orientation, where all cameras see a ball that has turned."""
         still = self._last is not None and float(so3.geodesic_distance(self._last, R_lab_body)) < HANDED_RAD
         if self._place is None or still or self._count >= HANDED or not all(shot.usable for shot in shots):
             return
         self._last, self._count = R_lab_body, self._count + 1
         crops = cut_out(self._place, [shot.picture for shot in shots])
-        self._frames.put(_Handed(crops=crops, R_lab_body=R_lab_body.numpy(), number=number))
+        self._frames.put(_Handed(crops=crops, R_lab_body=R_lab_body.numpy()))
 
     def paint(self) -> tuple[Tensor, Tensor]:
         """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H); the body frame
@@ -112,37 +110,33 @@ class MapLearner:
                     self._painted.set()
 
 
-def _learn(frames: "Queue[Any]", maps: "Queue[Any]") -> None:
+def _learn(frames: "Queue[Any]", maps: "SimpleQueue[Any]") -> None:
     """Take frames and give maps; for None instead of a frame, give the paint."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking, which then asks for the paint
     torch.set_num_threads(1)
     limit_cores(1)
-    growing, sized = GrowingMap(*frames.get()), 0
+    growing = GrowingMap(*frames.get())
     while True:
         waiting = _waiting(frames)
         for one in waiting:
             if one is None:
-                while growing.ready() and growing.done < FEWEST and not growing.arrived:
+                while growing.ready() and not growing.arrived and not (growing.done >= FEWEST and growing.whole):
                     growing.iterate()
                 maps.put(growing.paint() if growing.done else None)
             else:
-                growing.add(one.crops, torch.from_numpy(one.R_lab_body), one.number)
-        if not growing.ready() or growing.arrived:
-            continue
-        size = growing.done >= FIRST and sized < SIZED and not waiting  # else a larger map is wanted first
-        growing.iterate(size=size)
-        sized += size
-        if growing.done >= FIRST and (found := growing.live_map(searched=not waiting)).trusted:
+                growing.add(one.crops, torch.from_numpy(one.R_lab_body))
+        found = growing.grown(idle=not waiting)
+        if found is not None:
             maps.put(found)
 
 
 def _waiting(frames: "Queue[Any]") -> list[_Handed | None]:
-    """Return what waits; wait a little for the first."""
+    """Return what waits; wait a little for the first, and for what does not fit into the pipe with it."""
     found: list[_Handed | None] = []
     with suppress(Empty):
         found.append(frames.get(timeout=IDLE_S))
         while True:
-            found.append(frames.get_nowait())
+            found.append(frames.get(timeout=PIPE_S))
     return found
 
 
@@ -161,6 +155,7 @@ class LearningTracker:
         self._relative = RelativeTracker(place, settings.paint)
         self._map: LiveMap | None = None
         self._online: OnlineTracker | None = None
+        self._R_map_first = torch.eye(3, dtype=torch.float64)  # the learner's body frame to that of the orientations
         self._R_map_body = torch.eye(3, dtype=torch.float64)
         self._tried = 0
         self._past: deque[tuple[float, Poses]] = deque(maxlen=LAST)  # in the body frame
@@ -174,7 +169,7 @@ class LearningTracker:
             poses = self._changed(found, time_s, shots, poses)
         if supported(poses):
             self._past.append((time_s, poses))
-            self._learner.hand(shots, poses.R_lab_body[0], self.number)
+            self._learner.hand(shots, poses.R_lab_body[0])
             if self.number:
                 self._relative.know(time_s, shots, poses.R_lab_body[0])
         else:
@@ -192,7 +187,7 @@ class LearningTracker:
         if supported(poses):
             self.number = 0
             self._online.resume([(time_s, _turned(poses, self._R_map_body.mT))])
-        elif self._map.search.made and any(shot.usable for shot in shots):
+        elif self._map.search is not None and any(shot.usable for shot in shots):
             poses, searched = self._online.next(time_s, shots)
             self.number = self._map.number
             poses = _turned(poses, self._R_map_body)
@@ -201,14 +196,17 @@ class LearningTracker:
     def _changed(self, found: LiveMap, time_s: float, shots: Sequence[Frame], now: Poses) -> Poses:
         """Go over to another map where the ball is found with it near `now`; return the poses of the frame."""
         online = _follower(found, self._settings)
-        online.resume([(then, _turned(poses, found.R_map_body.mT)) for then, poses in self._past])
+        R_map_body = found.R_map_body @ self._R_map_first
+        online.resume([(then, _turned(poses, found.R_recent_map)) for then, poses in self._past])
         poses = online.followed(time_s, shots)
         if poses is None or not supported(poses):
             return now
         if self._map is None:
             self._relative.forget()
+            R_map_body = poses.R_lab_body[0].mT @ now.R_lab_body[0]
+            self._R_map_first = found.R_map_body.mT @ R_map_body
         self._map, self._online, self.number, self.appearance = found, online, found.number, found.appearance
-        self._R_map_body = poses.R_lab_body[0].mT @ now.R_lab_body[0]
+        self._R_map_body = R_map_body
         return _turned(poses, self._R_map_body)
 
 
@@ -218,9 +216,10 @@ def _turned(poses: Poses, R: Tensor) -> Poses:
 
 
 def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
+    names = [view.name for view in found.appearance.fitter.views]
     begin = Initialiser(
         fitter=found.appearance.still,
-        proposers={view.name: found.search for view in found.appearance.fitter.views},
+        proposers={} if found.search is None else dict.fromkeys(names, found.search),
         locating=settings.locate,
         candidates=settings.refine.candidates,
     )

@@ -3,16 +3,19 @@
 import json
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
 from sphereorient.live.live import Measured
+from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
 from sphereorient.trajectory.walk import arcs, rotation_vectors, turned
 
 Floats = NDArray[np.float64]
 DIGITS = 14
+OF_JSON = ("jsonl", "zmq")
 
 
 class FicTracLines:
@@ -73,31 +76,68 @@ def fictrac_line(columns: Floats) -> str:
     return ", ".join(f"{value:.{DIGITS}g}" for value in columns.tolist())
 
 
-def json_line(now: Measured) -> str:
-    """Return a frame as JSON on one line; null for what is not known."""
-    sigma = np.sqrt(np.diag(now.covariance))
-    content = {
-        "frame": now.number,
-        "time_s": now.time_s,
-        "valid": now.valid,
-        "position_lab_mm": now.position_lab_mm.tolist(),
-        "quaternion_wxyz": quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
-        "sigma_rad": sigma[:3].tolist(),
-        "sigma_mm": sigma[3:].tolist(),
-        "map": now.map_number,
-        "found": now.found,
-        "dropped": now.dropped,
-        "reason": [str(why) for why in now.reason],
-        "latency_ms": 1e3 * now.latency_s,
-    }
-    return json.dumps({name: without_nan(value) for name, value in content.items()}, allow_nan=False)
+class JsonLines:
+    """Frames as JSON, each on a line, null for what is not known; with the angular velocity, and where the ball is not
+    held in its place (`fixed`) its velocity, from this frame and those before it. These begin anew where the ball was
+    searched for, and are not known where the orientation is relative: its errors grow, and are not stated.
+    """
+
+    def __init__(self, fixed: bool) -> None:
+        self._turning, self._moving = ForwardRate(), None if fixed else ForwardRate()
+        self._before: Measured | None = None
+
+    def line(self, now: Measured) -> str:
+        """Return the line of the next frame."""
+        sigma = np.sqrt(np.diag(now.covariance))
+        omega, velocity = self._rates(now)
+        content = {
+            "frame": now.number,
+            "time_s": now.time_s,
+            "valid": now.valid,
+            "position_lab_mm": now.position_lab_mm.tolist(),
+            "quaternion_wxyz": quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
+            "omega_rad_s": omega.value.tolist(),
+            "velocity_mm_s": velocity.value.tolist(),
+            "sigma_rad": sigma[:3].tolist(),
+            "sigma_mm": sigma[3:].tolist(),
+            "sigma_omega_rad_s": omega.sigma.tolist(),
+            "sigma_velocity_mm_s": velocity.sigma.tolist(),
+            "map": now.map_number,
+            "found": now.found,
+            "dropped": now.dropped,
+            "reason": [str(why) for why in now.reason],
+            "latency_ms": 1e3 * now.latency_s,
+        }
+        return json.dumps({name: without_nan(value) for name, value in content.items()}, allow_nan=False)
+
+    def _rates(self, now: Measured) -> tuple[Rate, Rate]:
+        before, self._before = self._before, now if _states_errors(now) else None
+        if not _states_errors(now):
+            return UNKNOWN, UNKNOWN
+        if before is None or now.found or before.map_number != now.map_number:
+            for one in (self._turning, self._moving):
+                if one is not None:
+                    one.restart()
+            before = now
+        step_s, turn = now.time_s - before.time_s, now.R_lab_body @ before.R_lab_body.T
+        rotvec = np.asarray(cv2.Rodrigues(turn)[0][:, 0], np.float64)
+        omega = self._turning.measured(step_s, rotvec, now.covariance[:3, :3], turn)
+        if self._moving is None:
+            return omega, UNKNOWN
+        moved = now.position_lab_mm - before.position_lab_mm
+        return omega, self._moving.measured(step_s, moved, now.covariance[3:, 3:])
 
 
-def worded(kind: str, now: Measured, line: str) -> object:
-    """Return what an output of a kind takes of a frame, whose FicTrac line is known."""
+def _states_errors(now: Measured) -> bool:
+    """Return whether there is a pose with errors of its own: not a relative one."""
+    return now.map_number > 0 and bool(np.isfinite(now.covariance).all())
+
+
+def worded(kind: str, now: Measured, fictrac: str, as_json: str) -> object:
+    """Return what an output of a kind takes of a frame, whose lines are known where they are wanted."""
     if kind == "h5":
         return now
-    return json_line(now) if kind in ("jsonl", "zmq") else line if kind == "dat" else f"FT, {line}"
+    return as_json if kind in OF_JSON else fictrac if kind == "dat" else f"FT, {fictrac}"
 
 
 def without_nan(value: object) -> object:

@@ -44,8 +44,8 @@ def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
 class SplineTable(TextureTable):
     """A texture map (H, 2 H) with the blur `blur_rad`, sampled by its spline exactly; records the texels read."""
 
-    def __init__(self, texture: Tensor, blur_rad: float) -> None:
-        super().__init__(torch.zeros(1, 4), blur_rad)
+    def __init__(self, texture: Tensor, blur_rad: float, unseen: TextureTable | None = None) -> None:
+        super().__init__(torch.zeros(1, 4), blur_rad, unseen)
         self.texture = texture
         self.reads: list[tuple[Tensor, Tensor]] = []  # of each look-up: texels and weights, (L, P, 16)
 
@@ -156,26 +156,30 @@ def solve_map(
     return torch.from_numpy(x.reshape(height, 2 * height))
 
 
+def dot(a: Array, b: Array) -> float:
+    """Return the dot product of (T,) and (T,), summed in float64. BLAS would use all cores, and wait for busy ones."""
+    return float(np.einsum("i,i", a, b, dtype=np.float64))
+
+
 def conjugate_gradients(
     apply: Callable[[Array], Array],
     precondition: Callable[[Array], Array],
     right: Array,
     least: float,
     iterations: int,
-    dot: Callable[[Array, Array], float] = np.dot,
 ) -> Array:
     """Solve apply(x) = right (T,) for x until the weighted square of the residual is `least` of the first one."""
     x, left = np.zeros_like(right), right
     p = z = precondition(left)
-    rz = first = float(dot(left, z))
+    rz = first = dot(left, z)
     for _ in range(iterations):
         if rz <= least * first:
             break
         q = apply(p)
-        alpha = rz / float(dot(p, q))
+        alpha = rz / dot(p, q)
         x, left = x + alpha * p, left - alpha * q
         z = precondition(left)
-        rz, before = float(dot(left, z)), rz
+        rz, before = dot(left, z), rz
         p = z + rz / before * p
     return x
 

@@ -1,13 +1,13 @@
 """The iterations of mapping: orientations, light and map in turn, and then poses and map together."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import csr_matrix, diags, vstack
 from torch import Tensor
 
 from sphereorient import so3
@@ -36,7 +36,7 @@ from sphereorient.pose.lab_light import LabLight
 from sphereorient.pose.model import Light, light_basis, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
-from sphereorient.sphere.texture_table import SIDE, texture_table
+from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
@@ -85,6 +85,7 @@ class State:
     blur_px: float
     fitter: Fitter  # of views and light; its own map is not used
     fixed: bool  # whether all instants share one position
+    weight: Tensor | None = None  # (H, 2 H) float64, of the texels in the map's last solution, see `map_weight`
     expected: Tensor | None = None  # (H, 2 H), paint without blur from which the map differs as little as it can
 
     @property
@@ -169,6 +170,17 @@ def first_state(
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
     """Improve orientations, light and map once; k counts the iterations from 0."""
+    steps = iterating(state, settings, k)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            state, iteration = end.value
+            return state, iteration
+
+
+def iterating(state: State, settings: MapSettings, k: int) -> Generator[None, None, tuple[State, Iteration]]:
+    """Do what `iterate` does, and return the same, with pauses in which something else may be computed."""
     before = state.R_lab_body
     smoothest = SMOOTHEST * 0.5**k
     if k < SEPARATE_ITERATIONS:
@@ -177,11 +189,14 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
         state = _with_light(state)
     elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and isinstance(state.fitter.light, LabLight)):
         state = _lit_in_the_lab(state)
+    yield
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smoothest)
+        yield
     state, chi2 = with_map(state, smoothest)
     if k < LIGHT_ITERATIONS + LAB_ITERATIONS:
         state = _rescaled(state)
+    yield
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
         state = replace(state, blur_px=_better_blur(state))
     return state, Iteration(moved_rad=attitude_change_rad(before, state.R_lab_body), misfit=chi2, blur_px=state.blur_px)
@@ -306,7 +321,28 @@ def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
     right -= tie * (stiffness(height) @ _unexpected(state).double().numpy().ravel())
     texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
-    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), chi2
+    weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight), chi2
+
+
+def extended(state: State, new: State, tie: float, unseen: TextureTable | None) -> State:
+    """Return the state with a map that also shows what new instants show, whose poses, light and blur are known.
+    What it shows already is held by the weights of its texels: this takes a tenth of an iteration. `tie`: see `State`;
+    `unseen`: paint that the map does not know yet, as in a `TextureTable`.
+    """
+    assert state.weight is not None
+    height, held = len(state.texture), state.weight.reshape(-1).sqrt().float().numpy()
+    at = linearise(new.fitter, state.texture, new.pixels, new.position_lab_mm, new.R_lab_body, new.blur_px, unseen)
+    weight = at.weight
+    if at.view.known is not None:  # by it the light is found; the rest has any grey level
+        weight = torch.where(at.view.known, weight, (new.pixels.inside & ~new.pixels.clipped).to(weight.dtype))
+    at = replace(at, weight=weight * new.use.reshape(-1, 1))
+    shown = at.by_texel(height)
+    normal = NormalMatrix(vstack([shown, diags(held)], format="csr"))
+    right = shown.T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy()
+    texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
+    sums = torch.from_numpy(normal.diagonal().reshape(height, -1))
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=sums)
 
 
 def sharp_map(state: State) -> Tensor:

@@ -13,6 +13,7 @@ from sphereorient.mapping.grid import READS, Array, SplineTable, conjugate_gradi
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, grey_by_pose, residuals
+from sphereorient.sphere.texture_table import TextureTable
 
 DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
 POSE = 6  # unknowns of a pose
@@ -63,13 +64,20 @@ class Linearisation(Residuals):
 
 
 def linearise(
-    fitter: Fitter, texture: Tensor, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
+    fitter: Fitter,
+    texture: Tensor,
+    pixels: Pixels,
+    position_lab_mm: Tensor,
+    R_lab_body: Tensor,
+    blur_px: float,
+    unseen: TextureTable | None = None,
 ) -> Linearisation:
     """Linearise B * C disks, adjacent cameras, about a map (H, 2 H) of their blur and poses (B, 3) mm, (B, 3, 3).
 
-    The light of each frame is at its best; the fitter gives views and light, not the map.
+    The light of each frame is at its best; the fitter gives views and light, not the map. `unseen`: as that of a
+    `TextureTable`; pixels of such paint have no weight.
     """
-    table = SplineTable(texture, 0.0)
+    table = SplineTable(texture, 0.0, unseen)
     model = replace(fitter.model(fitter.optics.fine), paint=table, blur_px=blur_px)
     at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
     return Linearisation(**vars(at), reads=table.reads, inner=pixels.inner)
@@ -149,10 +157,6 @@ def joint_step(
     def preconditioned(x: Array) -> Array:
         return unknowns(solve_pose(pose_of(x)), precondition_map * x[poses:])
 
-    def dot(a: Array, b: Array) -> float:
-        on_pose = (pose_of(a).double() * pose_of(b).double()).sum()
-        return float(on_pose) + float(a[poses:].astype(np.float64) @ b[poses:])
-
     lit = by_pose - (by_pose @ by_light.mT) @ by_light
     blocks = (lit @ lit.mT).reshape(count, cameras, POSE, POSE).sum(1)
     size = torch.tensor([LONGEST_SHARE] * 3 + [LONGEST_SHARE * radius_mm] * 3)
@@ -163,7 +167,7 @@ def joint_step(
     solve_pose = _inverse_blocks(blocks, damp, fixed)
     right = pulled(without_light(residual))
     right[poses:] -= ties @ texture.reshape(-1).float().numpy()
-    step = conjugate_gradients(applied, preconditioned, right, 1e-8, STEPS, dot)
+    step = conjugate_gradients(applied, preconditioned, right, 1e-8, STEPS)
     return _spread(pose_of(step), count, fixed).double()
 
 

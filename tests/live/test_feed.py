@@ -8,11 +8,11 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from threading import Event
+from threading import Event, Semaphore
 
 import numpy as np
 import pytest
-from live_examples import EXCERPT, LIMIT_S, arrivals
+from live_examples import EXCERPT, LIMIT_S, arrivals, until
 
 from sphereorient.errors import MovieError
 from sphereorient.experiment.recording import open_recording
@@ -26,6 +26,24 @@ def test_a_feed_that_waits_gives_all_frames_in_order():
     assert feed.dropped == 0
 
 
+def test_of_a_camera_that_is_too_fast_every_other_frame_is_dropped():
+    goes_on, numbers = Semaphore(9), []
+
+    def source() -> Iterator[Arrival]:
+        for arrival in arrivals(60):
+            goes_on.acquire()
+            yield arrival
+
+    feed = Feed(source(), 8, wait=False)
+    frames = iter(feed)
+    for newest in range(8, 58, 2):  # two frames come while one is measured
+        until(lambda at=newest: feed.newest_s == pytest.approx(0.1 * at))
+        numbers.append(next(frames).number)
+        goes_on.release(2)
+    feed.close()
+    assert np.diff(numbers)[1:].tolist() == [2] * 23
+
+
 def test_a_feed_of_a_camera_drops_the_oldest_frames_and_counts_them():
     ended = Event()
 
@@ -35,8 +53,8 @@ def test_a_feed_of_a_camera_drops_the_oldest_frames_and_counts_them():
 
     feed = Feed(source(), 3, wait=False)
     assert ended.wait(LIMIT_S)
-    assert [one.number for one in feed] == [47, 48, 49]
-    assert feed.dropped == 47
+    assert [one.number for one in feed] == [48, 49]  # three waited, more than half of three are too many
+    assert feed.dropped == 48
 
 
 def test_a_fault_of_the_source_comes_after_its_frames():

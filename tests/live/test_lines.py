@@ -14,7 +14,8 @@ from overlay_examples import true_track
 
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera
-from sphereorient.live.lines import FicTracLines, fictrac_line, json_line
+from sphereorient.live.lines import FicTracLines, JsonLines, fictrac_line
+from sphereorient.live.live import Measured
 from sphereorient.report.export_poses import fictrac_table
 from sphereorient.trajectory import Trajectory
 
@@ -46,8 +47,49 @@ def test_lines_are_the_rows_of_the_exported_table(track):
 
 
 def test_json_has_null_for_what_is_not_known(track):
-    known, lost = [json.loads(json_line(now)) for now in rows(track)][6:8]
+    lines = JsonLines(fixed=True)
+    known, lost = [json.loads(lines.line(now)) for now in rows(track)][6:8]
     assert known["valid"]
     assert known["sigma_rad"] == pytest.approx([1e-3] * 3)
     assert math.hypot(*known["quaternion_wxyz"]) == pytest.approx(1)
     assert (lost["valid"], lost["quaternion_wxyz"], lost["reason"]) == (False, [None] * 4, ["not_found"])
+
+
+def told(frames: list[Measured], fixed: bool) -> list[dict]:
+    lines = JsonLines(fixed)
+    return [json.loads(lines.line(now)) for now in frames]
+
+
+def test_json_has_the_rates_of_the_motion_so_far():
+    """Truth as if it were measured."""
+    whole = true_track()
+    frames = [
+        replace(now, position_lab_mm=X, covariance=1e-8 * np.eye(6))
+        for now, X in zip(rows(whole), whole.position, strict=True)
+    ]
+    lines = told(frames, fixed=False)
+    for line, omega, velocity in [*zip(lines, whole.omega_lab, whole.velocity, strict=True)][-10:]:
+        np.testing.assert_allclose(line["omega_rad_s"], omega, atol=5 * max(line["sigma_omega_rad_s"]))
+        np.testing.assert_allclose(line["velocity_mm_s"], 1e3 * velocity, atol=5 * max(line["sigma_velocity_mm_s"]))
+        assert max(line["sigma_omega_rad_s"]) < 0.1 * np.linalg.norm(omega)
+    assert lines[10]["omega_rad_s"] == [None] * 3
+    held = told(frames, fixed=True)
+    assert {tuple(line["velocity_mm_s"]) for line in held} == {(None,) * 3}
+    assert [line["omega_rad_s"] for line in held] == [line["omega_rad_s"] for line in lines]
+
+
+def test_rates_begin_anew_where_the_ball_was_searched_for_lost_or_measured_by_another_map():
+    frames = list(rows(true_track()))
+    frames[34] = replace(frames[34], found=True)
+    assert unknown(told(frames, fixed=True)) == [34, 35]
+    frames = list(rows(true_track()))
+    frames[34] = replace(frames[34], covariance=np.full((6, 6), np.nan))
+    assert unknown(told(frames, fixed=True)) == [34, 35, 36]
+    frames = [replace(now, map_number=1 + (k >= 34)) for k, now in enumerate(rows(true_track()))]
+    assert unknown(told(frames, fixed=True)) == [34, 35]
+    frames = [replace(now, map_number=0) for now in rows(true_track())]
+    assert len(unknown(told(frames, fixed=True))) == len(frames) - 26, "relative orientations state no error"
+
+
+def unknown(lines: list[dict]) -> list[int]:
+    return [k for k, line in enumerate(lines) if k >= 26 and line["omega_rad_s"] == [None] * 3]

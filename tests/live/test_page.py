@@ -185,17 +185,3 @@ def test_a_person_looks_and_stops(served, browser: Any, tmp_path: Path):
     assert (np.abs(picture.astype(int) - outline).max(-1) < 30).sum() > 300  # it is drawn
     tab.close()
     assert wrong == []
-
-
-def test_a_ball_that_is_not_found_is_told_once_and_its_return():
-    said: list[str] = []
-    feed = Feed(iter([Arrival(number=0, time_s=0.0, pictures=[], arrived_s=0.0)]), 1, wait=True)
-    monitor = Monitor(feed, said.append)
-    next(iter(monitor))
-    known = next(rows(true_track()))
-    lost = replace(known, position_lab_mm=np.full(3, np.nan), reason=(Reason.NOT_FOUND,))
-    for k in range(100):
-        monitor.saw(replace(known if k in (0, 5, 90) else lost, number=k, time_s=0.01 * k), None)
-    assert len(said) == 2
-    assert said[0].startswith("frame 56: the ball is not found for 0.5 s (not_found)")
-    assert said[1] == "frame 90: the ball is found again."
