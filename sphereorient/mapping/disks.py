@@ -119,7 +119,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
                 one = find_ball(shot.picture, scene.background, scene.diameter_px, locating)
             found.append(one)
             ball = one[0]
-            row.append(None if ball is None else _cut(shot.picture, ball.u_px, ball.v_px, ball.radius_px))
+            row.append(None if ball is None else cut_crop(shot.picture, ball.u_px, ball.v_px, ball.radius_px))
             progress(f"{stream.name}: ball", k + 1, 0)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         rows.append(row)
@@ -200,7 +200,8 @@ def evenly_spread(rows: Tensor, count: int) -> Tensor:
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 
-def _cut(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
+def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
+    """Cut a disk and its surroundings out of a picture."""
     reach = int(np.ceil(REACH * radius_px)) + 3
     top, left = max(0, round(v_px) - reach), max(0, round(u_px) - reach)
     grey = picture[top : round(v_px) + reach + 1, left : round(u_px) + reach + 1].copy()
@@ -213,7 +214,7 @@ def cut_out(place: Crops, pictures: Sequence[Picture]) -> list[Crop]:
     found = []
     for view, picture in zip(place.views, pictures, strict=True):
         (u, v), radius_px = view.camera.project(X)[0].tolist(), float(view.radius_px(X, place.radius_mm))
-        found.append(_cut(picture, u, v, radius_px))
+        found.append(cut_crop(picture, u, v, radius_px))
     return found
 
 

@@ -1,0 +1,220 @@
+"""Several spheres cut out of every frame: which disk is whose is told by where they are, before there are maps."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from sphereorient.cameras import Camera
+from sphereorient.errors import PaintError, refusal
+from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.locate import LocateSettings, screened_frames
+from sphereorient.locate.disks import find_disks
+from sphereorient.locate.matching import Match, match_disks, places_of
+from sphereorient.locate.outline import Outline
+from sphereorient.locate.scene import CameraScene, find_scenes
+from sphereorient.mapping.disks import Crop, Crops, cut_crop
+from sphereorient.mapping.settings import MapSettings
+from sphereorient.pose.fitter import CameraView
+
+FREE = 1.1  # sums of two radii: disks that are nearer than this are not used
+AWAY = 0.1  # of the radius, for each frame since it was seen: how far a sphere may be from where it is expected
+SIZE_SIGMA = 0.08  # relative error of a disk's radius
+FARTHEST = 9.0  # chi2 at which a sphere is rather not seen than there
+FORGOTTEN = 20  # frames after which motion is not known any more
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Instant:
+    """What all cameras see in one frame."""
+
+    disks: Sequence[Sequence[Outline]]  # C
+    crops: Sequence[Sequence[Crop]]  # of these disks
+    matches: Sequence[Match]
+    position_lab_mm: Floats  # (M, 3), of the matches
+
+
+def take_crops_of_all(
+    recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress
+) -> dict[str, Crops]:
+    """Crop each of several moving spheres in every frame, by name. Names of spheres of one size are given by chance,
+    and kept: a sphere is the one that is where it is expected. Only disks that no other one touches are used.
+
+    Raises:
+        ExperimentError: a sphere without a diameter, or one that is said to stay in its place.
+        PaintError: no frame shows as many spheres as are named, each by itself.
+    """
+    names, streams = recording.experiment.names, recording.streams
+    scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]
+    instants = []
+    movies = [
+        screened_frames(stream, scene[names[0]].background) for stream, scene in zip(streams, scenes, strict=True)
+    ]
+    radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}
+    for k, shots in enumerate(zip(*movies, strict=True)):
+        disks = [
+            find_disks(shot.picture, shot.background, [scene[name].diameter_px for name in names], locating)
+            if shot.usable and shot.background is not None
+            else []
+            for shot, scene in zip(shots, scenes, strict=True)
+        ]
+        crops = [
+            [cut_crop(shot.picture, one.u_px, one.v_px, one.radius_px) for one in seen]
+            for shot, seen in zip(shots, disks, strict=True)
+        ]
+        instants.append(_instant(disks, crops, recording.cameras, 2 * min(radius_mm.values())))
+        progress("balls", k + 1, 0)
+    chosen = _linked(instants, scenes, radius_mm, len(streams))
+    return {
+        name: _crops_of(name, chosen[:, n], instants, recording, [scene[name] for scene in scenes], radius_mm[name])
+        for n, name in enumerate(names)
+    }
+
+
+def _instant(
+    disks: Sequence[Sequence[Outline]],
+    crops: Sequence[Sequence[Crop]],
+    cameras: Mapping[str, Camera],
+    diameter_mm: float,
+) -> _Instant:
+    least = min(2, len(cameras))  # a distance by the size of one disk is not enough to know who it is
+    matches = [one for one in match_disks(disks, list(cameras.values())) if one.number >= least]
+    X = places_of(matches, cameras, diameter_mm).position_lab_mm.numpy() if matches else np.zeros((0, 3))
+    return _Instant(disks=disks, crops=crops, matches=matches, position_lab_mm=X)
+
+
+def _linked(
+    instants: Sequence[_Instant],
+    scenes: Sequence[Mapping[str, CameraScene]],
+    radius_mm: Mapping[str, float],
+    cameras: int,
+) -> NDArray[np.int64]:
+    """Return the match of each sphere in each frame, (N, K), by index; -1: none."""
+    names = list(radius_mm)
+    sizes = np.array([[scene[name].diameter_px / 2 for scene in scenes] for name in names])
+    begin = _first(instants, len(names), cameras)
+    chosen = np.full((len(instants), len(names)), -1)
+    for frames in (range(begin, len(instants)), range(begin, -1, -1)):
+        past: list[list[tuple[int, Floats]]] = [[] for _ in names]
+        for k in frames:
+            at = instants[k]
+            cost = _misfit(at, k, past, sizes, np.array(list(radius_mm.values())))
+            chosen[k] = _assigned(cost, at.matches)
+            for n, match in enumerate(chosen[k].tolist()):
+                if match >= 0:
+                    past[n] = [*past[n][-1:], (k, at.position_lab_mm[match])]
+    return chosen
+
+
+def _first(instants: Sequence[_Instant], count: int, cameras: int) -> int:
+    """Return the frame in which as many spheres as are named are seen by all cameras, and in which the fewest other
+    matches are possible.
+    """
+    rest = []
+    for at in instants:
+        whole = [one for one in at.matches if one.number == cameras]
+        apart: list[Match] = []
+        for one in whole:
+            if not any(one.shares(other) for other in apart):
+                apart.append(one)
+        rest.append(len(whole) - count if len(apart) == count else len(instants) * count)
+    best = int(np.argmin(rest))
+    if not instants or rest[best] == len(instants) * count:
+        do = "name as many spheres as the movies show, or learn each map from a movie of one ball"
+        raise PaintError(refusal("movies", expected=f"{count} balls in a frame", got="none that shows them", do=do))
+    return best
+
+
+def _misfit(
+    at: _Instant, frame: int, past: Sequence[Sequence[tuple[int, Floats]]], sizes: Floats, radius_mm: Floats
+) -> Floats:
+    """Return chi2 (K, M) of each sphere at each match: where it is expected, and of what size."""
+    cost = np.zeros((len(past), len(at.matches)))
+    for m, match in enumerate(at.matches):
+        for c, one in enumerate(match.disks):
+            if one is not None:
+                cost[:, m] += ((one.radius_px / sizes[:, c] - 1) / SIZE_SIGMA) ** 2 / match.number
+    for n, seen in enumerate(past):
+        if not seen or not len(at.matches):
+            continue
+        last, X = seen[-1]
+        gap = abs(frame - last)
+        if gap > FORGOTTEN:
+            continue
+        for (before, X_before), (now, X_now) in pairwise(seen):
+            X = X_now + (frame - now) / (now - before) * (X_now - X_before)
+        sigma = AWAY * radius_mm[n] * gap * (1 if len(seen) > 1 else 3)
+        cost[n] += np.square((at.position_lab_mm - X) / sigma).sum(1)
+    # Of two matches of one sphere the one of more cameras counts.
+    cost += np.array([len(one.chosen) - one.number for one in at.matches])
+    return cost
+
+
+def _assigned(cost: Floats, matches: Sequence[Match]) -> NDArray[np.int64]:
+    """Return the match (K,) of each sphere, -1: none, of least chi2 together; no disk is in two of them."""
+    allowed = np.ones(cost.shape, bool)
+    unseen = np.full((len(cost), len(cost)), FARTHEST)
+    while True:
+        rows, columns = linear_sum_assignment(np.hstack([np.where(allowed, cost, 1e6), unseen]))
+        found = np.full(len(cost), -1)
+        found[rows] = np.where(columns < cost.shape[1], columns, -1)
+        shared = [
+            (n, m)
+            for n in range(len(found))
+            for m in range(n)
+            if found[n] >= 0 and found[m] >= 0 and matches[found[n]].shares(matches[found[m]])
+        ]
+        if not shared:
+            return found
+        for n, m in shared:  # the one that fits worse looks for another one
+            worse = n if cost[n, found[n]] > cost[m, found[m]] else m
+            allowed[worse, found[worse]] = False
+
+
+def _crops_of(
+    name: str,
+    chosen: NDArray[np.int64],
+    instants: Sequence[_Instant],
+    recording: Recording,
+    scenes: Sequence[CameraScene],
+    radius_mm: float,
+) -> Crops:
+    count, cameras = len(instants), len(recording.streams)
+    crops: list[list[Crop | None]] = [[None] * count for _ in range(cameras)]
+    X = torch.full((count, 3), torch.nan, dtype=torch.float64)
+    seen = torch.zeros(count, cameras, dtype=torch.bool)
+    views = [
+        CameraView.of(stream.name, stream.camera, scene)
+        for stream, scene in zip(recording.streams, scenes, strict=True)
+    ]
+    for k, match in enumerate(chosen.tolist()):
+        if match < 0:
+            continue
+        at = instants[k]
+        X[k] = torch.from_numpy(at.position_lab_mm[match])
+        for c, disk in enumerate(at.matches[match].chosen):
+            if disk >= 0 and _free(disk, at.disks[c], views[c]):
+                crops[c][k], seen[k, c] = at.crops[c][disk], True
+    if not bool(seen.any()):
+        do = "learn its map from a movie of this ball alone"
+        raise PaintError(refusal(f"ball {name}", expected="frames in which nothing touches it", got="none", do=do))
+    return Crops(views=views, crops=crops, position_lab_mm=X, seen=seen, radius_mm=radius_mm, fixed=False)
+
+
+def _free(disk: int, disks: Sequence[Outline], view: CameraView) -> bool:
+    """Return whether a disk lies in the picture as a whole, and no other one touches it."""
+    one = disks[disk]
+    others = [other for k, other in enumerate(disks) if k != disk]
+    near = [
+        np.hypot(one.u_px - other.u_px, one.v_px - other.v_px) / (one.radius_px + other.radius_px) for other in others
+    ]
+    middle = torch.tensor([one.u_px, one.v_px])
+    whole: Tensor = view.shows_whole(middle, torch.tensor(one.radius_px))
+    return bool(whole) and min(near, default=np.inf) > FREE
