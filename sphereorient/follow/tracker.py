@@ -16,7 +16,7 @@ from sphereorient import so3
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
-from sphereorient.follow.initialise import Initialiser, explaining_first
+from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
@@ -247,23 +247,27 @@ class ChunkTracker:
         first = good
         within = disks_px[1] <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
-        alone: list[FittedPoses] = []
-        if not bool((good | ~within).all()):
-            # One picture without the sphere spoils the joint fit: try each camera; of two that disagree the nearer one
-            # counts.
-            alone = [
-                self._fitted(frames, X, R, _only(usable, k), precision, moved, disks_px) for k in range(use.shape[1])
+        alone: dict[int, FittedPoses] = {}
+        for some in by_decreasing_size(range(use.shape[1])):
+            if bool((good | ~within).all()):
+                break
+            # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
+            # one size, which disagree, the one nearer to the prediction counts.
+            fits = [self._fitted(frames, X, R, _only(usable, one), precision, moved, disks_px) for one in some]
+            supported = [
+                self._supported(fit_, _only(usable, one)) & usable[:, one].all(1)
+                for one, fit_ in zip(some, fits, strict=True)
             ]
-            supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
                 torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
-                for one, right in zip(alone, supported, strict=True)
+                for one, right in zip(fits, supported, strict=True)
             ]
             nearest, which = torch.stack(astray).min(0)
-            for k, one in enumerate(alone):
+            for k, one in enumerate(fits):
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
-                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
+                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, some[k]), use)
             good = good | torch.isfinite(nearest)
+            alone = {k: one for (k, *rest), one in zip(some, fits, strict=True) if not rest}
         others = torch.zeros_like(use)
         if bool((usable & ~use).any()):
             # A camera without the sphere before may see it again: test it at the joint pose.
@@ -273,12 +277,20 @@ class ChunkTracker:
             contradicts = self._contradictory(both, usable, limit)
             back = unused & self._supported(both, usable) & ~contradicts
             fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
+            several = good & ~back & ((usable & ~use).sum(1) > 1)
+            for k in range(use.shape[1] if bool(several.any()) else 0):
+                # Of several such cameras some may see it.
+                rows = several & (usable & ~use)[:, k]
+                wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
+                both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, wider, precision, moved)
+                rows &= self._supported(both, wider) & ~self._contradictory(both, wider, limit)
+                fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
             # Another camera is judged only where this frame needs it: results must not depend on the batch.
             doubtful = ~first | before.any(1) | (unused & contradicts)
             others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
-            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision, moved)
-            others[:, k] &= self._supported(one, _only(usable, k))
+            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, [k]), precision, moved)
+            others[:, k] &= self._supported(one, _only(usable, [k]))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
             [_reason(*of_camera) for of_camera in zip(used, contradicts, row, one.reason, strict=True)]
@@ -376,20 +388,25 @@ class ChunkTracker:
         return self.search.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
-        """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""
+        """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
         each = seen.expand(len(poses), -1)
         steps = ((self.search.fitter.optics.fine, 1, 4),)
-        alone = [self._looked_at(frames, poses, _only(each, k), steps) for k in range(len(seen))]
-        right = [bool(seen[k]) and bool(self._supported(one, _only(each, k))[0]) for k, one in enumerate(alone)]
-        if not any(right):
+
+        def supporting(some: Sequence[Sequence[int]]) -> dict[tuple[int, ...], FittedPoses]:
+            fits = {tuple(one): self._looked_at(frames, poses, _only(each, one), steps) for one in some}
+            return {one: fit for one, fit in fits.items() if bool(self._supported(fit, _only(each, one))[0])}
+
+        seeing = torch.nonzero(seen)[:, 0].tolist()
+        right = next(filter(None, map(supporting, by_decreasing_size(seeing))), None)
+        if right is None:
             return poses
-        main = right.index(True)
-        fit = alone[main]
-        for k, one in enumerate(alone):
-            if k != main and right[k]:
-                fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
+        main, fit = next(iter(right.items()))
+        alone = right if len(main) == 1 else supporting([[k] for k in seeing if k not in main])
+        others = {k: one for (k,), one in alone.items() if k not in main}
+        for k, one in others.items():
+            fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
         reason = [
-            Reason.OK if k == main else Reason.CONTRADICTS if right[k] else why for k, why in enumerate(poses.reason)
+            Reason.OK if k in main else Reason.CONTRADICTS if k in others else why for k, why in enumerate(poses.reason)
         ]
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
@@ -462,9 +479,9 @@ def _usable(shots: Sequence[Frame]) -> Tensor:
     return torch.tensor([shot.usable for shot in shots])
 
 
-def _only(usable: Tensor, camera: int) -> Tensor:
-    only = torch.zeros_like(usable)
-    only[:, camera] = usable[:, camera]
+def _only(usable: Tensor, cameras: Sequence[int]) -> Tensor:
+    only, some = torch.zeros_like(usable), list(cameras)
+    only[:, some] = usable[:, some]
     return only
 
 
