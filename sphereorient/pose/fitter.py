@@ -20,6 +20,7 @@ from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
+from sphereorient.pose.neighbours import DiskPlaces, Neighbours, hidden_places
 from sphereorient.pose.occluders import MOST_HIDDEN, unoccluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.pose.residuals import KNOWN
@@ -271,11 +272,13 @@ class Fitter:
         radius_px: float | None = None,
         moved: Tensor | None = None,
         disks_px: Disks | None = None,
+        neighbours: Neighbours | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
         Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. `moved` (B, 6): the
         sphere's turn (rad) and move (mm) while the shutter is open; None: unknown, as if at rest. `disks_px`: what
-        the method of this name tells of these positions, where that is known.
+        the method of this name tells of these positions, where that is known. Places that `neighbours` spoil are not
+        inside, see `hidden_places`.
         """
         middle_px, largest_px = disks_px or self.disks_px(position_lab_mm)
         middles = middle_px.nan_to_num().tolist()
@@ -291,7 +294,31 @@ class Fitter:
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
                 disks.append(cut_pixels(frame, view.background, view.sight, middles[c][b], stencil, level.extra_px))
-        return self.exposed(stacked(disks), moved)
+        pixels = self.exposed(stacked(disks), moved)
+        if neighbours is None:
+            return pixels
+        places = self.places(position_lab_mm, level, stencil, middle_px, moved)
+        hidden = hidden_places(places, neighbours)
+        return pixels if hidden is None else replace(pixels, inside=pixels.inside & ~hidden)
+
+    def places(
+        self,
+        position_lab_mm: Tensor,
+        level: PyramidLevel,
+        stencil: Stencil,
+        middle_px: Tensor,
+        moved: Tensor | None = None,
+    ) -> DiskPlaces:
+        """Return where the disks of B poses lie, for `hidden_places`; arguments as of `pixels`."""
+        return DiskPlaces(
+            sights=[view.sight for view in self.views],
+            stencil=stencil,
+            middle_px=middle_px,
+            position_lab_mm=position_lab_mm,
+            radius_mm=self.radius_mm,
+            blur_px=level.blur_px,
+            move_mm=None if moved is None or self.instants == 1 else moved[:, 3:],
+        )
 
     def exposed(self, pixels: Pixels, moved: Tensor | None) -> Pixels:
         """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""
