@@ -192,10 +192,13 @@ class Fitter:
         """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
         return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
 
-    def lit_in_the_lab(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple["Fitter", FittedPoses, Rivals]:
+    def lit_in_the_lab(
+        self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, preferred: bool = False
+    ) -> tuple["Fitter", FittedPoses, Rivals]:
         """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
         Both are learnt from every other row of `use` (B, C); what counts is what they leave in the rows between.
-        Return the fits of these rows by both where neither explains clearly more.
+        Return the fits of these rows by both where neither explains clearly more. `preferred`: where it does not
+        explain clearly less.
         """
         fine = self.optics.fine
         if len(use) < FEWEST_LIT:
@@ -209,7 +212,7 @@ class Fitter:
         for light, more in zip(lab_lights(*learning, self.model(fine)), (0.0, MORE_EXPLAINED), strict=True):
             lit = replace(self, light=light)
             gain = maps_leave - lit.left(*held)
-            if gain < more:
+            if gain < (-MORE_EXPLAINED if preferred else more):
                 return self, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
         for _ in range(4):  # the poses, too, were found with the maps
             lit = lit.lit_again(pixels, fit, use)
@@ -370,11 +373,12 @@ class Fitter:
         use: Tensor,
         place_precision: Tensor | None = None,
         held: bool = False,
+        neighbours: Neighbours | None = None,
     ) -> FittedPoses:
         """Refine B poses step by step; `held`: each from the first position."""
         X, R = position_lab_mm, R_lab_body
         for level, every, iterations in steps:
-            pixels = self.pixels(pictures, X, level).thinned(every)
+            pixels = self.pixels(pictures, X, level, neighbours=neighbours).thinned(every)
             fit = self.fit(pixels, X, R, use, level, iterations, place_precision)
             X, R = X if held else fit.position_lab_mm, fit.R_lab_body
         return fit
