@@ -1,7 +1,8 @@
 """What every camera gives: rays, projection and the covariance of its parameters; and the geometry of rays."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Protocol
 
 import torch
@@ -120,6 +121,29 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
     gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
     nan = torch.full_like(gap, torch.nan)
     return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
+
+
+def nearest_point(rays: Sequence[Rays]) -> tuple[Tensor, Tensor]:
+    """Return the point (..., 3), lab, mm, of the least sum of squared distances from two or more rays, and the largest
+    distance (...), mm, between any two of them; of two rays, those of `triangulate`. All have one leading shape; rays
+    that are NaN take no part. Both are NaN, with gradient 0, where all others are parallel, or fewer than two.
+    """
+    if len(rays) == 2:
+        return triangulate(*rays)
+    gaps = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)])
+    crossing = torch.isfinite(gaps)
+    gap = torch.where(crossing, gaps, 0.0).amax(0)
+    view = torch.eye(3, dtype=gap.dtype, device=gap.device)
+    normal, pull = view.new_zeros(*gap.shape, 3, 3), view.new_zeros(*gap.shape, 3)
+    for ray in rays:
+        there = torch.isfinite(ray.direction_lab + ray.origin_lab_mm).all(-1, keepdim=True)
+        origin, direction = (torch.where(there, part, 0.0) for part in (ray.origin_lab_mm, ray.direction_lab))
+        across = torch.where(there[..., None], view - direction[..., :, None] * direction[..., None, :], 0.0)
+        normal = normal + across
+        pull = pull + (across @ origin[..., None])[..., 0]
+    known = crossing.any(0)
+    point = torch.linalg.solve(torch.where(known[..., None, None], normal, view), pull)
+    return torch.where(known[..., None], point, torch.nan), torch.where(known, gap, torch.nan)
 
 
 def R_cam_view(direction_cam: Tensor) -> Tensor:

@@ -30,13 +30,13 @@ def synth(
     set_: Annotated[list[str] | None, typer.Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render an experiment of two cameras with exact truth."""
+    """Render an experiment with exact truth."""
     check_writable(out, folder_made=True)
     from sphereorient.methods.settings import load_synth_settings
     from sphereorient.synth import write_synthetic_experiment
 
     chosen = load_synth_settings(settings, set_ or [])
-    total = 2 * chosen.frames
+    total = chosen.cameras * chosen.frames
     with progress_bar(quiet) as advance:
         done = 0
 

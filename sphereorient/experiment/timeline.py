@@ -16,7 +16,7 @@ Rows = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 NONE = -1  # in `Timeline.rows`: no picture
-PAIR_STEPS = 0.5  # frame periods: nearer stamps of two cameras are one instant
+PAIR_STEPS = 0.5  # frame periods: nearer stamps of several cameras are one instant
 LATE_STEPS = 0.05  # frame periods: a larger median difference of stamps causes a remark
 EVEN_STEPS = 1e-3  # frame periods: tolerance of evenly spaced times
 ON_GRID = 0.02  # frame periods: tolerance of a regular grid
@@ -71,8 +71,8 @@ class Timeline:
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     """Return the times of the selected frames and the pictures of the cameras at each frame.
 
-    Times come from the frame rate, a table, or stamps of the movies; equal stamps of two cameras make one frame. MKV
-    stamps are not used: they are rounded to 1 ms.
+    Times come from the frame rate, a table, or stamps of the movies; equal stamps of several cameras make one frame.
+    MKV stamps are not used: they are rounded to 1 ms.
 
     Raises:
         ExperimentError: unreadable table of times, or one of another length.
@@ -96,8 +96,9 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         raise MovieError(refusal(name, expected="frames after start", got=got, do="correct start:"))
     count = max(there.values())
     wanted = count if experiment.frames is None else min(count, experiment.frames[1])
+    others = "the other camera has" if len(there) == 2 else "other cameras have"
     remarks = tuple(
-        f"{movies[name].path}: no pictures of frames {of_movie} to {wanted - 1}; only the other camera has them"
+        f"{movies[name].path}: no pictures of frames {of_movie} to {wanted - 1}; only {others} them"
         for name, of_movie in there.items()
         if of_movie < wanted
     )
@@ -162,25 +163,28 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
     usual_s, names = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]))), list(clocks)
-    pairs = np.arange(len(clocks[names[0]]))[:, None]
-    if len(names) == 2:
-        pairs = _paired(clocks[names[0]], clocks[names[1]], PAIR_STEPS * usual_s)
-    chosen = dict(zip(names, pairs.T, strict=True))
-    taken = np.stack([np.where(row >= 0, clocks[name][row], np.nan) for name, row in chosen.items()])
+    chosen = {names[0]: np.arange(len(clocks[names[0]]))}
+    taken = clocks[names[0]][None]
+    for name in names[1:]:
+        before, own = _paired(np.nanmean(taken, axis=0), clocks[name], PAIR_STEPS * usual_s).T
+        chosen = {one: np.where(before >= 0, row[before], NONE) for one, row in chosen.items()} | {name: own}
+        taken = np.stack([np.where(row >= 0, clocks[one][row], np.nan) for one, row in chosen.items()])
+        order = np.argsort(np.nanmean(taken, axis=0), kind="stable")
+        chosen, taken = {one: row[order] for one, row in chosen.items()}, taken[:, order]
     rows = {name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE) for name, row in chosen.items()}
     remarks = [
-        f"{movies[name].path}: {lacking} of {len(pairs)} instants have no picture"
+        f"{movies[name].path}: {lacking} of {taken.shape[1]} instants have no picture"
         for name, lacking in zip(names, np.isnan(taken).sum(1).tolist(), strict=True)
         if lacking
     ]
-    if len(names) == 2:
-        apart = np.abs(taken[0] - taken[1])
+    for k, name in enumerate(names[1:], 1):
+        apart = np.abs(taken[0] - taken[k])
         late = float(np.nanmedian(apart)) if np.isfinite(apart).any() else np.inf
         if not np.isfinite(late):
-            remarks.append(f"{experiment.path}: no picture of {names[0]} is of one instant with one of {names[1]}")
+            remarks.append(f"{experiment.path}: no picture of {names[0]} is of one instant with one of {name}")
         elif late > LATE_STEPS * usual_s:
-            remarks.append(f"{experiment.path}: the cameras' stamps differ by {late:.3g} s, usually")
-    number = np.arange(len(pairs))
+            remarks.append(f"{experiment.path}: the stamps of {names[0]} and {name} differ by {late:.3g} s, usually")
+    number = np.arange(taken.shape[1])
     return Timeline(number=number, time_s=np.nanmean(taken, axis=0), rows=rows, remarks=tuple(remarks))
 
 

@@ -1,9 +1,10 @@
 """The pose of a single frame without history: outlines, search over all rotations, fits from coarse to fine."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TypeVar
 
 import numpy as np
@@ -71,15 +72,19 @@ class Initialiser:
 
     def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
         found = self._found(shots, lambda seen, view: find_ball(seen, view.background, view.diameter_px, locating))
-        both = len(found) > 1 and all(outline is not None for outline, _ in found)
-        if both and float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm:
-            # The cameras see different things: take the one whose picture is explained better.
-            alone = [
-                [one if k == kept else (None, Reason.OUTLINE) for k, one in enumerate(found)]
-                for kept in range(len(found))
-            ]
-            return max((self._search(shots, each) for each in alone), key=_best_score)
-        return self._search(shots, found)
+        seeing = [k for k, (outline, _) in enumerate(found) if outline is not None]
+        if len(seeing) < 2 or self._meet(found):
+            return self._search(shots, found)
+        # The cameras see different things: take those whose lines of sight meet and whose pictures are explained best.
+        for some in by_decreasing_size(seeing):
+            each = [[one if k in kept else (None, Reason.OUTLINE) for k, one in enumerate(found)] for kept in some]
+            if meeting := [one for one in each if self._meet(one)]:
+                break
+        return max((self._search(shots, one) for one in meeting), key=_best_score)
+
+    def _meet(self, found: Sequence[Found]) -> bool:
+        """Return whether the lines of sight meet; that of one camera does."""
+        return not float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm
 
     def relocalise(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
@@ -211,6 +216,12 @@ def _distinct_places(places: Sequence[Place], radius_px: float) -> list[Place]:
 
 def _best_score(poses: Poses) -> float:
     return float(poses.score[0, poses.use].max()) if len(poses) else -1.0
+
+
+def by_decreasing_size(cameras: Sequence[int]) -> Iterator[list[tuple[int, ...]]]:
+    """Yield all subsets of one size, from those without one camera to those of a single one."""
+    for size in range(len(cameras) - 1, 0, -1):
+        yield list(combinations(cameras, size))
 
 
 def explaining_first(fit: FittedPoses, use: Tensor) -> Tensor:

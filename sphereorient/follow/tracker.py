@@ -2,9 +2,9 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, combinations, pairwise
 
 import numpy as np
@@ -16,13 +16,15 @@ from sphereorient import so3
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
-from sphereorient.follow.initialise import Initialiser, explaining_first
+from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown, Steps
-from sphereorient.pose.settle import settled
+from sphereorient.pose.neighbours import Neighbours, joined, visible_shares
+from sphereorient.pose.pixels import thinned_stencil
+from sphereorient.pose.settle import FIRST_EVERY, settled
 from sphereorient.pose.start import NearStart
 from sphereorient.trajectory import Reason
 
@@ -32,6 +34,9 @@ ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 LONG_STEP = 3.0  # times the step before: a longer one changes the motion
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
+LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
+HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk that others hide
+SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
@@ -50,6 +55,7 @@ class _Expected:
     rough: bool  # from one predecessor alone: the motion is unknown
     moved: Floats  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
     open_share: float  # of the time from the frame before to this one, in which the shutter is open
+    among: Neighbours | None = None  # of this one pose; None: no other sphere is in view
 
 
 @dataclass(eq=False)
@@ -225,60 +231,78 @@ class ChunkTracker:
             for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
         )
         R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
-        use = known & usable
+        use, among = known & usable, joined([one.among for one in expected])
         if any(one.rough for one in expected):
             was = X, R
-            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
+            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]), among)
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         disks_px = self._disks_px(X)
-        fit = self._fitted(frames, X, R, use, precision, moved, disks_px)
-        good = self._supported(fit, use)
+        visible = None if among is None else self._visible(X, disks_px, among)
+        if visible is not None:
+            usable = usable & (visible > LEAST_VISIBLE)
+            use = known & usable
+        start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
+        fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
+        fit = fitted(X, R, use, disks_px)
+        good = supported(fit, use)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.
             usable = torch.stack(
-                [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
+                [all_ if ok else _usable(row) & sees for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
             )
             changed = (use != (known & usable)).any(1)
             if bool(changed.any()):
                 use = known & usable
-                fit = self._fitted(frames, X, R, use, precision, moved, disks_px).where(changed, fit)
-                good = torch.where(changed, self._supported(fit, use), good)
+                fit = fitted(X, R, use, disks_px).where(changed, fit)
+                good = torch.where(changed, supported(fit, use), good)
         first = good
         within = disks_px[1] <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
-        alone: list[FittedPoses] = []
-        if not bool((good | ~within).all()):
-            # One picture without the sphere spoils the joint fit: try each camera; of two that disagree the nearer one
-            # counts.
-            alone = [
-                self._fitted(frames, X, R, _only(usable, k), precision, moved, disks_px) for k in range(use.shape[1])
+        alone: dict[int, FittedPoses] = {}
+        for some in by_decreasing_size(range(use.shape[1])):
+            if bool((good | ~within).all()):
+                break
+            # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
+            # one size, which disagree, the one nearer to the prediction counts.
+            fits = [fitted(X, R, _only(usable, one), disks_px) for one in some]
+            holds = [
+                supported(fit_, _only(usable, one)) & usable[:, one].all(1)
+                for one, fit_ in zip(some, fits, strict=True)
             ]
-            supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
                 torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
-                for one, right in zip(alone, supported, strict=True)
+                for one, right in zip(fits, holds, strict=True)
             ]
             nearest, which = torch.stack(astray).min(0)
-            for k, one in enumerate(alone):
+            for k, one in enumerate(fits):
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
-                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
+                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, some[k]), use)
             good = good | torch.isfinite(nearest)
+            alone = {k: one for (k, *rest), one in zip(some, fits, strict=True) if not rest}
         others = torch.zeros_like(use)
         if bool((usable & ~use).any()):
             # A camera without the sphere before may see it again: test it at the joint pose.
-            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision, moved)
+            both = fitted(fit.position_lab_mm, fit.R_lab_body, usable)
             unused = good & (usable & ~use).any(1)
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
             contradicts = self._contradictory(both, usable, limit)
-            back = unused & self._supported(both, usable) & ~contradicts
+            back = unused & supported(both, usable) & ~contradicts
             fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
+            several = good & ~back & ((usable & ~use).sum(1) > 1)
+            for k in range(use.shape[1] if bool(several.any()) else 0):
+                # Of several such cameras some may see it.
+                rows = several & (usable & ~use)[:, k]
+                wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
+                both = fitted(fit.position_lab_mm, fit.R_lab_body, wider)
+                rows &= supported(both, wider) & ~self._contradictory(both, wider, limit)
+                fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
             # Another camera is judged only where this frame needs it: results must not depend on the batch.
             doubtful = ~first | before.any(1) | (unused & contradicts)
             others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
-            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision, moved)
-            others[:, k] &= self._supported(one, _only(usable, k))
+            one = alone[k] if alone else fitted(X, R, _only(usable, [k]))
+            others[:, k] &= supported(one, _only(usable, [k]))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
             [_reason(*of_camera) for of_camera in zip(used, contradicts, row, one.reason, strict=True)]
@@ -288,11 +312,18 @@ class ChunkTracker:
         return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
     def _approached(
-        self, frames: Sequence[Sequence[Shown]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
+        self,
+        frames: Sequence[Sequence[Shown]],
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        precision: Tensor,
+        rough: Tensor,
+        among: Neighbours | None,
     ) -> tuple[Tensor, Tensor]:
         """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
-            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px)
+            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
             fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
             X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
             R = torch.where(rough[:, None, None], fit.R_lab_body, R)
@@ -301,32 +332,36 @@ class ChunkTracker:
     def _fitted(
         self,
         frames: Sequence[Sequence[Shown]],
+        start: Callable[..., NearStart],
         X: Tensor,
         R: Tensor,
         use: Tensor,
-        precision: Tensor,
-        moved: Tensor,
         disks_px: Disks | None = None,
     ) -> FittedPoses:
-        """Fit poses that are nearly right."""
-        begin = NearStart(
-            position_lab_mm=self._from(X),
-            R_lab_body=R,
-            use=use,
-            place_precision=precision,
-            moved=moved,
-            held=self.centre is not None,
-        )
+        """Fit poses that are nearly right; `start` knows the rest of where they begin."""
+        begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
         return settled(self.fitter, frames, begin, disks_px)
+
+    def _visible(self, X: Tensor, disks_px: Disks, among: Neighbours) -> Tensor:
+        """Return the share of the disks of B poses that the others leave to each camera, (B, C)."""
+        fine = self.fitter.optics.fine
+        stencil = thinned_stencil(self.fitter.stencil(fine, self.fitter.widest_px), FIRST_EVERY)
+        return visible_shares(self.fitter.places(X, fine, stencil, disks_px[0]), among)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
-    def _supported(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which poses have converged and explain all pictures in use well, (B,) bool."""
+    def _supported(self, fit: FittedPoses, use: Tensor, visible: Tensor | None = None) -> Tensor:
+        """Return which poses have converged and explain all pictures in use well, (B,) bool. Of disks of which others
+        leave a share `visible` (B, C), less is asked, and nothing where it is too little for a score.
+        """
         seen = use.numpy()
         explained = (fit.score.numpy() >= self.score_min) | ~seen
+        if visible is not None:
+            left, score = visible.numpy(), fit.score.numpy()
+            explained |= (score >= self.score_min - HIDDEN_LESS * (1.0 - left)) & (left < 1.0)
+            explained |= (score == 0) & (left < SILENT)
         arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
         good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
         return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
@@ -376,20 +411,25 @@ class ChunkTracker:
         return self.search.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
-        """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""
+        """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
         each = seen.expand(len(poses), -1)
         steps = ((self.search.fitter.optics.fine, 1, 4),)
-        alone = [self._looked_at(frames, poses, _only(each, k), steps) for k in range(len(seen))]
-        right = [bool(seen[k]) and bool(self._supported(one, _only(each, k))[0]) for k, one in enumerate(alone)]
-        if not any(right):
+
+        def supporting(some: Sequence[Sequence[int]]) -> dict[tuple[int, ...], FittedPoses]:
+            fits = {tuple(one): self._looked_at(frames, poses, _only(each, one), steps) for one in some}
+            return {one: fit for one, fit in fits.items() if bool(self._supported(fit, _only(each, one))[0])}
+
+        seeing = torch.nonzero(seen)[:, 0].tolist()
+        right = next(filter(None, map(supporting, by_decreasing_size(seeing))), None)
+        if right is None:
             return poses
-        main = right.index(True)
-        fit = alone[main]
-        for k, one in enumerate(alone):
-            if k != main and right[k]:
-                fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
+        main, fit = next(iter(right.items()))
+        alone = right if len(main) == 1 else supporting([[k] for k in seeing if k not in main])
+        others = {k: one for (k,), one in alone.items() if k not in main}
+        for k, one in others.items():
+            fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
         reason = [
-            Reason.OK if k == main else Reason.CONTRADICTS if right[k] else why for k, why in enumerate(poses.reason)
+            Reason.OK if k in main else Reason.CONTRADICTS if k in others else why for k, why in enumerate(poses.reason)
         ]
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
@@ -462,9 +502,9 @@ def _usable(shots: Sequence[Frame]) -> Tensor:
     return torch.tensor([shot.usable for shot in shots])
 
 
-def _only(usable: Tensor, camera: int) -> Tensor:
-    only = torch.zeros_like(usable)
-    only[:, camera] = usable[:, camera]
+def _only(usable: Tensor, cameras: Sequence[int]) -> Tensor:
+    only, some = torch.zeros_like(usable), list(cameras)
+    only[:, some] = usable[:, some]
     return only
 
 

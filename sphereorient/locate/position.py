@@ -1,4 +1,4 @@
-"""Position of the sphere in the lab: from two rays, or from one ray and the radius."""
+"""Position of the sphere in the lab: from two rays or more, or from one ray and the radius."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.cameras import Camera, Rays, triangulate
+from sphereorient.cameras import Camera, Rays, nearest_point
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate.sightings import Sightings
 from sphereorient.trajectory import Flag
@@ -20,13 +20,13 @@ class Positions:
 
     position_lab_mm: Tensor  # (N, 3), NaN without a centre
     covariance_mm2: Tensor  # (N, 3, 3), NaN if not measured
-    gap_mm: Tensor  # (N,), distance of the two rays, NaN with one
+    gap_mm: Tensor  # (N,), largest distance of two rays, NaN with one
     flags: Tensor
 
     def for_motion(self) -> Tensor:
-        """Return positions from two rays, or all if there are none, (N, 3), mm; a mixture would look like motion."""
-        two_rays = torch.isfinite(self.gap_mm)
-        return torch.where(two_rays[:, None] | ~two_rays.any(), self.position_lab_mm, torch.nan)
+        """Return positions from several rays, or all without any, (N, 3), mm; a mixture would look like motion."""
+        several = torch.isfinite(self.gap_mm)
+        return torch.where(several[:, None] | ~several.any(), self.position_lab_mm, torch.nan)
 
     @property
     def measured(self) -> Tensor:
@@ -37,28 +37,27 @@ class Positions:
 def find_positions(
     sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
 ) -> Positions:
-    """Return the sphere's positions in N frames from the outlines of one or two cameras; in radii without a diameter.
+    """Return the sphere's positions in N frames from the outlines of the cameras; in radii without a diameter.
 
     A centre's sigma is its outline's rms. With one outline the distance comes from its radius: flag `ONE_CAMERA`.
 
     Raises:
-        ExperimentError: two cameras and an unknown diameter.
+        ExperimentError: several cameras and an unknown diameter.
 
     Source: paper section III A (triangulation).
     """
     if diameter_mm is None and len(sightings) > 1:
-        do = "give the diameter, or track with one camera"
-        raise ExperimentError(refusal("sphere.diameter", expected="a number of mm", got="null, two cameras", do=do))
+        got, do = f"null, {len(sightings)} cameras", "give the diameter, or track with one camera"
+        raise ExperimentError(refusal("sphere.diameter", expected="a number of mm", got=got, do=do))
     radius_mm = 1.0 if diameter_mm is None else diameter_mm / 2
     views = [_view(seen, cameras[name], radius_mm) for name, seen in sightings.items()]
     placed = torch.stack([seen.placed for seen in sightings.values()])
-    alone = views[-1].from_size_mm
-    if len(views) == 1:
-        position, gap = alone, torch.full_like(alone[:, 0], torch.nan)
-    else:
-        alone = torch.where(placed[0][:, None], views[0].from_size_mm, alone)
-        crossing, gap = triangulate(views[0].rays, views[1].rays)
-        position = torch.where(placed.all(0)[:, None], crossing, alone)
+    position, gap = views[-1].from_size_mm, torch.full_like(views[-1].from_size_mm[:, 0], torch.nan)
+    for view, ok in reversed(list(zip(views, placed, strict=True))):
+        position = torch.where(ok[:, None], view.from_size_mm, position)
+    if len(views) > 1:
+        crossing, gap = nearest_point([view.rays for view in views])
+        position = torch.where((placed.sum(0) > 1)[:, None], crossing, position)
     one = placed.sum(0) == 1
     flags = torch.where(one, int(Flag.ONE_CAMERA), 0)
     information = torch.zeros(len(position), 3, 3, dtype=position.dtype)

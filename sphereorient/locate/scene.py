@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.cameras import Camera, triangulate
+from sphereorient.cameras import Camera, nearest_point
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
@@ -61,7 +61,7 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
 
 
 def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:
-    """Return the sphere's diameter, px, at the middle of the volume: nearest point of two axes, or lab origin.
+    """Return the sphere's diameter, px, at the middle of the volume: nearest point of all axes, or lab origin.
 
     Raises:
         SettingsError: diameter unknown, or a single uncalibrated camera.
@@ -71,9 +71,9 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     if diameter_mm is None:
         raise SettingsError(refusal("sphere.diameter", expected="a number of mm", got="null", do=do))
     middle = torch.zeros(3, dtype=torch.float64)
-    if len(cameras) == 2:
+    if len(cameras) > 1:
         axes = [each.rays((torch.tensor(each.image_size, dtype=torch.float64) - 1) / 2) for each in cameras.values()]
-        middle, _ = triangulate(axes[0], axes[1])
+        middle, _ = nearest_point(axes)
     right_lab = camera.R_cam_lab[0] * diameter_mm / 2
     rim = camera.project(torch.stack([middle - right_lab, middle + right_lab]))
     diameter_px = float((rim[1] - rim[0]).norm())

@@ -28,6 +28,15 @@ class Neighbours:
         return Neighbours(**parts)
 
 
+def joined(each: Sequence[Neighbours | None]) -> Neighbours | None:
+    """Return the neighbours of all poses; None where none has any."""
+    known = [one for one in each if one is not None]
+    if not known:
+        return None
+    parts: dict[str, Any] = {name: torch.cat([getattr(one, name) for one in known]) for name in vars(known[0])}
+    return Neighbours(**parts)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DiskPlaces:
     """Where the disks of B poses lie before C cameras; made by `Fitter`."""

@@ -47,9 +47,9 @@ def _compiled(
     middle_px, _ = disks_px or fitter.disks_px(begin.position_lab_mm)
     stencil = fitter.stencil(fitter.optics.fine, fitter.widest_px)
     hidden = None
-    if begin.neighbours is not None:
+    if begin.among is not None:
         places = fitter.places(begin.position_lab_mm, fitter.optics.fine, stencil, middle_px, begin.moved)
-        hidden = hidden_places(places, begin.neighbours)
+        hidden = hidden_places(places, begin.among)
     done = compiled.settled(
         _decoded(fitter, frames, middle_px, stencil),
         [(view.sight, view.background) for view in fitter.views],
@@ -90,7 +90,7 @@ def _settled_in_torch(
     fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None
 ) -> FittedPoses:
     fine, moved = fitter.optics.fine, begin.moved
-    others = begin.neighbours
+    others = begin.among
     pixels = fitter.pixels(frames, begin.position_lab_mm, fine, fitter.widest_px, moved, disks_px, others)
     fit, far = _step(fitter, pixels.thinned(FIRST_EVERY), begin, MORE[0])
     there = begin.after(fit.position_lab_mm, fit.R_lab_body)

@@ -24,13 +24,13 @@ class NearStart(PoseStart):
     place_precision: Tensor  # (B, 3, 3), 1/mm^2; counts where not all cameras see the sphere, and where it is held
     moved: Tensor  # (B, 6), turn (rad) and move (mm) while the shutter is open
     held: bool  # whether each step begins at the given position
-    neighbours: Neighbours | None = None  # None: no other sphere is in view
+    among: Neighbours | None = None  # None: no other sphere is in view
 
     def of(self, rows: Tensor) -> "NearStart":
         """Return some of the poses, by index."""
         parts = {name: part[rows] for name, part in vars(self).items() if isinstance(part, Tensor)}
-        others = None if self.neighbours is None else self.neighbours.of(rows)
-        return NearStart(**parts, held=self.held, neighbours=others)
+        others = None if self.among is None else self.among.of(rows)
+        return NearStart(**parts, held=self.held, among=others)
 
     def after(self, position_lab_mm: Tensor, R_lab_body: Tensor) -> "NearStart":
         """Return the start of a further fit, after one that ended there."""

@@ -1,4 +1,4 @@
-"""Synthetic movies with exact truth: random motion and paint, the scene of two cameras, degradations."""
+"""Synthetic movies with exact truth: random motion and paint, the scene of one to four cameras, degradations."""
 
 from sphereorient.synth.degrade import degrade
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track, smoothed_track

@@ -174,7 +174,7 @@ def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -
 
 
 def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float], seed: int = 0) -> Mapping[str, Camera]:
-    """Return cameras whose principal points are off in opposite directions, along the diagonal.
+    """Return cameras whose principal points are off along the diagonal, in opposite directions by turns.
 
     One is also rotated about the lab origin, whose pixel stays, and shifted along its own x: the second with an even
     seed, the first with an odd one.
@@ -185,8 +185,8 @@ def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float], se
     wrong = {}
     for k, (name, camera) in enumerate(cameras.items()):
         assert isinstance(camera, TsaiCamera)
-        wrong[name] = replace(camera, centre_px=camera.centre_px + (1 - 2 * k) * off_px / math.sqrt(2))
-    name = list(cameras)[1 - seed % 2]
+        wrong[name] = replace(camera, centre_px=camera.centre_px + (-1) ** k * off_px / math.sqrt(2))
+    name = list(cameras)[(1 - seed % 2) % len(cameras)]
     moved = wrong[name]
     turn = so3.exp(torch.full((3,), math.radians(degrees) / math.sqrt(3), dtype=torch.float64))
     right = torch.tensor([shift_mm, 0.0, 0.0], dtype=torch.float64)

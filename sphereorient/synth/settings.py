@@ -21,6 +21,7 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     omega_time: float = Field(0.03, gt=0, description="correlation time of the angular velocity, s")
     periodic: bool = Field(False, description="a motion without a seam: whole turns about one axis in the movie")
     volume_mm: float = Field(45.0, gt=0, description="the centre stays within about this distance from the origin")
+    cameras: int = Field(2, ge=1, le=4, description="number of cameras, at right angles; the fourth looks aslant")
     image_size: tuple[int, int] = Field((650, 650), description="width and height, px")
     distance_mm: float = Field(520.0, gt=0, description="of the cameras from the origin")
     diameter_px: float = Field(78.0, gt=8, description="of the sphere's picture at the origin")

@@ -123,7 +123,7 @@ _ROWS: tuple[tuple[tuple[str, Place, float | None, str, Values], str, str], ...]
     ),
     (
         ("centre_error", "reported", 0.0, "px", (0.25, 0.5, 1.0, 2.0, 4.0)),
-        "The cameras' principal points are reported wrong, in opposite directions for the two cameras.",
+        "The cameras' principal points are reported wrong, in opposite directions by turns.",
         "a quarter is a poor calibration; lines of sight miss each other by 1.4 times as much",
     ),
     (
@@ -138,7 +138,7 @@ _ROWS: tuple[tuple[tuple[str, Place, float | None, str, Values], str, str], ...]
     ),
     (
         ("camera_shift", "reported", 0.0, "mm", (0.05, 0.1, 0.3, 1.0, 3.0)),
-        "One camera (even seeds: the second) is reported shifted along its own x, which both cameras see.",
+        "One camera (even seeds: the second) is reported shifted along its own x, which the others see.",
         "someone touched the tripod; at 3 lines of sight pass each other by a third of a radius",
     ),
     (

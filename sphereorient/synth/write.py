@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -28,13 +29,15 @@ PIXEL_PITCH_MM = 0.02
 
 
 def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
-    """Return two Tsai cameras with slight distortion: cam1 looks along lab +y, cam2 along lab -z."""
+    """Return Tsai cameras, slightly distorted: cam1 looks along lab +y, cam2 along -z, cam3 along -x, cam4 aslant."""
     f64 = partial(torch.tensor, dtype=torch.float64)
     focal_mm = settings.diameter_px * PIXEL_PITCH_MM * settings.distance_mm / settings.diameter_mm
     width, height = settings.image_size
     looks = {
-        "cam1": [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
-        "cam2": [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]],
+        "cam1": ([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], 2e-4),
+        "cam2": ([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], -1.5e-4),
+        "cam3": ([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]], 1e-4),
+        "cam4": ([[0.6, -0.8, 0.0], [0.48, 0.36, -0.8], [0.64, 0.48, 0.6]], -1e-4),
     }
     return {
         name: TsaiCamera(
@@ -47,7 +50,7 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
             R_cam_lab=f64(R),
             T_cam_lab_mm=f64((0.0, 0.0, settings.distance_mm)),
         )
-        for (name, R), kappa1 in zip(looks.items(), (2e-4, -1.5e-4), strict=True)
+        for name, (R, kappa1) in islice(looks.items(), settings.cameras)
     }
 
 
@@ -69,7 +72,7 @@ def write_synthetic_experiment(
     progress: Callable[[int], None] = lambda done: None,
     values: Mapping[str, float] = MappingProxyType({}),
 ) -> Path:
-    """Render a two-camera experiment with exact truth in `folder` and return the path of experiment.yaml.
+    """Render an experiment with exact truth in `folder` and return the path of experiment.yaml.
 
     The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5; old files are replaced.
     `progress` receives the number of frames rendered since the last call. `values` maps degradations to physical

@@ -106,7 +106,10 @@ FAULTS = {
     "start of no movie": (FULL.replace("start: {cam2", "start: {cam3"), "start: .*got 'cam3'; write 'cam"),
     "mask of no movie": (FULL.replace("masks: {cam1", "masks: {side"), "masks: expected one of cam1, cam2, got 'side'"),
     "movie without camera": (SHORT.replace("{cam1:", "{cam9:"), "camera of movie cam9: expected one of cam1, cam2"),
-    "three cameras": (SHORT.replace("{cam1: cam1.npy}", "{a: a.mkv, b: b.mkv, c: c.mkv}"), "movies: .*at most 2"),
+    "nine cameras": (
+        SHORT.replace("{cam1: cam1.npy}", f"{{{', '.join(f'c{k}: c{k}.mkv' for k in range(9))}}}"),
+        "movies: .*at most 8",
+    ),
     "both keys": (SHORT + "spheres: {a: {diameter: 14}}\n", "sphere: expected either sphere or spheres, got both"),
     "no ball": (SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {}"), "spheres: .*at least 1"),
     "one name twice": (

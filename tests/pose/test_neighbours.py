@@ -100,12 +100,12 @@ def test_fits_look_past_the_other_ball_compiled_or_not_and_without_one_keep_thei
         moved=torch.zeros(COUNT, 6, dtype=torch.float64),
         held=False,
     )
-    plain, past = settled(fitter, frames, begin), settled(fitter, frames, replace(begin, neighbours=others))
+    plain, past = settled(fitter, frames, begin), settled(fitter, frames, replace(begin, among=others))
     off = [torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)) for fit in (plain, past)]
     assert float(off[1].max()) < 0.3
     assert float(off[1][:-1].max()) < 0.7 * float(off[0][:-1].max())
     assert torch.equal(past.R_lab_body[-1], plain.R_lab_body[-1])
     assert torch.equal(past.covariance[-1], plain.covariance[-1])
     monkeypatch.setattr(compiled, "library", lambda: None)
-    slow = settled(fitter, frames, replace(begin, neighbours=others))
+    slow = settled(fitter, frames, replace(begin, among=others))
     assert float(torch.rad2deg(so3.geodesic_distance(slow.R_lab_body, past.R_lab_body)).max()) < 2e-3

@@ -27,6 +27,7 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
     together: int = Field(1, ge=0, description="scenes by level and seed with several degradations at once")
     at_once: int = Field(3, ge=2, description="number of these degradations, drawn by the seed")
     frames: int = Field(24, ge=12, description="of each movie")
+    cameras: int = Field(2, ge=1, le=4, description="of each scene")
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -46,7 +47,7 @@ FULL = BenchSettings(levels=LEVELS, seeds=(0, 1, 2), together=2, frames=60)
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkScene:
-    """A movie of two cameras with truth; made by `scenes_of`, rendered by `write_scene`."""
+    """An experiment with truth; made by `scenes_of`, rendered by `write_scene`."""
 
     kind: str  # a degradation's name, "clean", or "together"
     level: int  # 0 for clean
@@ -54,6 +55,7 @@ class BenchmarkScene:
     number: int  # among those of the same kind, level and seed
     degradations: Mapping[str, int]  # level by name
     frames: int
+    cameras: int = 2
 
     @property
     def name(self) -> str:
@@ -64,7 +66,15 @@ class BenchmarkScene:
 def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
     """Return all scenes, clean ones first; the same settings give the same scenes."""
     return [
-        BenchmarkScene(kind=kind, level=level, seed=seed, number=number, degradations=mixed, frames=settings.frames)
+        BenchmarkScene(
+            kind=kind,
+            level=level,
+            seed=seed,
+            number=number,
+            degradations=mixed,
+            frames=settings.frames,
+            cameras=settings.cameras,
+        )
         for seed in settings.seeds
         for kind, level, number, mixed in _of_seed(settings, seed)
     ]
@@ -86,6 +96,11 @@ def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int
 def write_scene(folder: Path, scene: BenchmarkScene) -> Path:
     """Render a scene into a folder, with truth.h5 (docs/data-format.md); return the path of experiment.yaml."""
     base = SynthSettings(
-        name=scene.name, frames=scene.frames, image_size=(SIDE_PX, SIDE_PX), volume_mm=VOLUME_MM, seed=scene.seed
+        name=scene.name,
+        frames=scene.frames,
+        cameras=scene.cameras,
+        image_size=(SIDE_PX, SIDE_PX),
+        volume_mm=VOLUME_MM,
+        seed=scene.seed,
     )
     return write_degraded(folder, base, scene.degradations)
