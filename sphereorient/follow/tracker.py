@@ -239,17 +239,16 @@ class ChunkTracker:
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         disks_px = self._disks_px(X)
         visible = None if among is None else self._visible(X, disks_px, among)
-        if visible is not None:
-            usable = usable & (visible > LEAST_VISIBLE)
-            use = known & usable
+        sees = torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE
+        usable, use = usable & sees, use & sees
         start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
         fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
         fit = fitted(X, R, use, disks_px)
         good = supported(fit, use)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.
-            usable = torch.stack(
-                [all_ if ok else _usable(row) & sees for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
+            usable = sees & torch.stack(
+                [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
             )
             changed = (use != (known & usable)).any(1)
             if bool(changed.any()):
