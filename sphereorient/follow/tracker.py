@@ -164,12 +164,12 @@ class ChunkTracker:
             now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
             frames = {chunk.first: [movie[chunk.first + k] for movie in shots] for chunk in now}
             here = list(self._step(now, k, frames))
-            for chunk, poses, turn in zip(now, here, self._turns(now, here), strict=True):
+            for chunk, poses, turn in zip(now, here, self.turns(now, here), strict=True):
                 chunk.saw(chunk.first + k, poses, turn)
                 found[chunk.first + k] = poses
         yield from (found[k] for k in range(sum(batch)))
 
-    def _turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Floats:
+    def turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Floats:
         """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
         turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
         for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
@@ -195,17 +195,17 @@ class ChunkTracker:
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {chunk.first: self._ahead(chunk, chunk.first + k) for chunk in chunks}
+        expected = {chunk.first: self.ahead(chunk, chunk.first + k) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
-        followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
+        followed = dict(zip(ahead, self.follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         if lost := [chunk.first for chunk in chunks if followed.get(chunk.first) is None]:
             followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
         for chunk in chunks:
             poses = followed[chunk.first]
             assert poses is not None  # a search returns one that may be empty
-            yield self._stated(poses)
+            yield self.stated(poses)
 
-    def _ahead(self, chunk: _Chunk, frame: int) -> _Expected | None:
+    def ahead(self, chunk: _Chunk, frame: int) -> _Expected | None:
         """Return what the frames before say of a frame of a chunk."""
         pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
         if pose is None or self.centre is None:
@@ -213,11 +213,11 @@ class ChunkTracker:
         place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
         return replace(pose, position_lab_mm=place, place_spread=spread)
 
-    def _stated(self, poses: Poses) -> Poses:
+    def stated(self, poses: Poses) -> Poses:
         """Return poses with the errors of a fixed centre."""
         return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
-    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
+    def follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
@@ -402,12 +402,42 @@ class ChunkTracker:
         fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
-    def _looked_at(self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps) -> FittedPoses:
+    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours | None) -> Poses:
+        """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
+        those whose pictures support none are left out.
+        """
+        fitter, count = self.search.fitter, len(poses)
+        frames, use = [shot.picture for shot in shots], poses.use
+        visible = torch.ones(1, len(use), dtype=torch.float64)
+        if among is not None:
+            X = poses.position_lab_mm[:1]
+            visible = self._visible(X, fitter.disks_px(X), among)
+            use = use & (visible[0] > LEAST_VISIBLE)
+            among = among.of([0] * count)
+        if not bool(use.any()):
+            return replace(poses, use=use)
+        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), among)
+        order = explaining_first(fit, use).argsort(stable=True)
+        best = fit.of(order[:1])
+        seen = use & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible[0]))
+        reason = [
+            Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
+            for now, why in zip(seen.tolist(), poses.reason, strict=True)
+        ]
+        if bool(seen.any()) and not bool((seen == use).all()):
+            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), among)
+            order = explaining_first(fit, seen).argsort(stable=True)
+        return poses_of(fit, order, seen, reason)
+
+    def _looked_at(
+        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps, among: Neighbours | None = None
+    ) -> FittedPoses:
         """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
         X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
         held = self.centre is not None
-        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
+        use = use.expand(count, -1)
+        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use, known, held, among)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
@@ -469,11 +499,11 @@ class OnlineTracker:
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
             self._forget()
         self._time_s[self._number] = time_s
-        tracker, ahead = self._tracker, self._tracker._ahead(self._chunk, self._number)
-        (followed,) = [None] if ahead is None else tracker._follow([ahead], [shots])
+        tracker, ahead = self._tracker, self._tracker.ahead(self._chunk, self._number)
+        (followed,) = [None] if ahead is None else tracker.follow([ahead], [shots])
         if followed is None:
             return None
-        poses = tracker._stated(followed)
+        poses = tracker.stated(followed)
         self._saw(poses)
         return poses
 
@@ -482,7 +512,7 @@ class OnlineTracker:
         followed = self.followed(time_s, shots)
         if followed is not None:
             return followed, False
-        poses = self._tracker._stated(self._tracker._search(shots))
+        poses = self._tracker.stated(self._tracker._search(shots))
         self._forget()  # what was before says nothing of the motion from here
         self._saw(poses)
         return poses, True
@@ -492,7 +522,7 @@ class OnlineTracker:
         self._chunk.turns.clear()
 
     def _saw(self, poses: Poses) -> None:
-        self._chunk.saw(self._number, poses, self._tracker._turns([self._chunk], [poses])[0])
+        self._chunk.saw(self._number, poses, self._tracker.turns([self._chunk], [poses])[0])
         self._number += 1
         self._time_s.pop(self._number - 4, None)
 
