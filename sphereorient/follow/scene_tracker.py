@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.follow.tracker import ChunkTracker, _Chunk, _Expected
 from sphereorient.locate import Frame
-from sphereorient.pose.neighbours import Neighbours
+from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.trajectory import Reason
 
 # Finds balls in a frame of each view without history: those named, given the positions (3,), mm, of the others that are
@@ -126,17 +127,31 @@ class SceneTracker:
 
     def _among(self, name: str, places: Mapping[str, _Place]) -> Neighbours | None:
         """Return the neighbours of one ball in one frame; None where there is one ball."""
-        others = [other for other in self.balls if other != name]
-        if not others:
-            return None
-        nowhere = _Place(torch.full((3,), torch.nan, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-        there = [places.get(other, nowhere) for other in others]
-        radii = [self.balls[other].fitter.radius_mm for other in others]
-        return Neighbours(
-            position_lab_mm=torch.stack([one.position_lab_mm for one in there])[None],
-            radius_mm=torch.tensor([radii], dtype=torch.float64),
-            move_mm=torch.stack([one.move_mm for one in there])[None],
-        )
+        radii = {other: tracker.fitter.radius_mm for other, tracker in self.balls.items() if other != name}
+        return _neighbours(radii, places) if radii else None
+
+
+def among(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
+    """Return the neighbours of balls, each given by its name and the poses of its frame, as if at rest."""
+    each = []
+    for name, there in rows:
+        places = {other: _found_place(poses, None) for other, poses in there.items() if len(poses)}
+        radii = {other: one.fitter.radius_mm for other, one in balls.items() if other != name}
+        each.append(_neighbours(radii, places))
+    found = joined(each)
+    assert found is not None
+    return found
+
+
+def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, _Place]) -> Neighbours:
+    """Return the neighbours, by name, of one pose."""
+    nowhere = _Place(torch.full((3,), torch.nan, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    there = [places.get(name, nowhere) for name in radius_mm]
+    return Neighbours(
+        position_lab_mm=torch.stack([one.position_lab_mm for one in there])[None],
+        radius_mm=torch.tensor([list(radius_mm.values())], dtype=torch.float64),
+        move_mm=torch.stack([one.move_mm for one in there])[None],
+    )
 
 
 def _expected_place(one: _Expected) -> _Place:
@@ -147,3 +162,8 @@ def _found_place(poses: Poses, before: _Place | None) -> _Place:
     """Return the place of a frame's best pose, with the motion that was expected of it."""
     still = torch.zeros(3, dtype=torch.float64)
     return _Place(poses.position_lab_mm[0], still if before is None else before.move_mm)
+
+
+def start_of(balls: Mapping[str, Initialiser]) -> Start:
+    """Return the start of frames."""
+    raise NotImplementedError

@@ -84,6 +84,11 @@ def open_views(
         return views, base.result(), search
 
 
+def open_scene(recording: Recording, settings: Settings, progress: Progress) -> list[CameraView]:
+    """Estimate the cameras' backgrounds of a movie of several balls."""
+    raise NotImplementedError
+
+
 def open_view(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> CameraView:
     """Estimate one camera's background."""
     stage = f"{stream.name}: background"
