@@ -7,7 +7,6 @@ from sphereorient.cameras.camera import (
     R_lab_view,
     Rays,
     centre_lab_mm,
-    meeting_point,
     nearest_point,
     sphere_disk_px,
     sphere_radius_px,

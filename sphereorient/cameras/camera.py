@@ -123,48 +123,27 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
     return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
 
 
-def meeting_point(rays: Sequence[Rays]) -> tuple[Tensor, Tensor]:
-    """Return the point (..., 3), lab, mm, nearest to two or more rays, and the largest distance (...), mm, between any
-    two of them; of two rays, those of `triangulate`. All have one leading shape; rays that are NaN take no part. Both
-    are NaN, with gradient 0, where all others are parallel, or fewer than two.
+def nearest_point(rays: Sequence[Rays]) -> tuple[Tensor, Tensor]:
+    """Return the point (..., 3), lab, mm, of the least sum of squared distances from two or more rays, and the largest
+    distance (...), mm, between any two of them; of two rays, those of `triangulate`. All have one leading shape; rays
+    that are NaN take no part. Both are NaN, with gradient 0, where all others are parallel, or fewer than two.
     """
     if len(rays) == 2:
         return triangulate(*rays)
     gaps = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)])
     crossing = torch.isfinite(gaps)
-    origin, direction = (
-        torch.stack([getattr(ray, name) for ray in rays], -2) for name in ("origin_lab_mm", "direction_lab")
-    )
-    there = torch.isfinite(origin + direction).all(-1).to(direction)
-    point, _ = nearest_point(Rays(origin_lab_mm=origin, direction_lab=direction), there)
-    known = crossing.any(0)
     gap = torch.where(crossing, gaps, 0.0).amax(0)
+    view = torch.eye(3, dtype=gap.dtype, device=gap.device)
+    normal, pull = view.new_zeros(*gap.shape, 3, 3), view.new_zeros(*gap.shape, 3)
+    for ray in rays:
+        there = torch.isfinite(ray.direction_lab + ray.origin_lab_mm).all(-1, keepdim=True)
+        origin, direction = (torch.where(there, part, 0.0) for part in (ray.origin_lab_mm, ray.direction_lab))
+        across = torch.where(there[..., None], view - direction[..., :, None] * direction[..., None, :], 0.0)
+        normal = normal + across
+        pull = pull + (across @ origin[..., None])[..., 0]
+    known = crossing.any(0)
+    point = torch.linalg.solve(torch.where(known[..., None, None], normal, view), pull)
     return torch.where(known[..., None], point, torch.nan), torch.where(known, gap, torch.nan)
-
-
-def nearest_point(rays: Rays, weight: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return the point (..., 3), lab, mm, nearest to n rays (..., n), and its distance (..., n), mm, from each of them.
-    Least squares of the distances, each with `weight` (..., n), 1 / mm^2; None: all alike. A ray of weight 0 is left
-    out, and may be NaN. The point is NaN, with gradient 0, for fewer than two rays and for parallel ones.
-    """
-    check_points("rays.origin_lab_mm", rays.origin_lab_mm, 3)
-    check_points("rays.direction_lab", rays.direction_lab, 3)
-    origin, along = torch.broadcast_tensors(rays.origin_lab_mm, rays.direction_lab)
-    weight = torch.ones_like(along[..., 0]) if weight is None else weight.to(along).expand(along.shape[:-1])
-    used = (weight > 0)[..., None]
-    share = weight[..., None] / weight.sum(-1)[..., None, None].clamp_min(torch.finfo(along.dtype).tiny)
-    at, to = torch.where(used, origin, 0.0), torch.where(used, along, 0.0)
-    eye = torch.eye(3, dtype=along.dtype, device=along.device)
-    across = share[..., None] * (eye - to[..., :, None] * to[..., None, :])
-    normal = across.sum(-3)
-    middle = (share * at).sum(-2)  # lengths count from here: no cancellation far from the lab's origin
-    toward = (across @ (at - middle[..., None, :])[..., None]).sum(-3)
-    # The least eigenvalue is about the mean square of the angles between the rays; below this it is rounding.
-    meeting = torch.linalg.eigvalsh(normal.detach())[..., :1] > 16 * torch.finfo(along.dtype).eps
-    point = middle + torch.linalg.solve(torch.where(meeting[..., None], normal, eye), toward)[..., 0]
-    away = torch.linalg.cross(point[..., None, :] - origin, along).norm(dim=-1)
-    nan = point.new_tensor(torch.nan)
-    return torch.where(meeting, point, nan), torch.where(meeting, away, nan)
 
 
 def R_cam_view(direction_cam: Tensor) -> Tensor:

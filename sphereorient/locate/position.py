@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.cameras import Camera, Rays, meeting_point
+from sphereorient.cameras import Camera, Rays, nearest_point
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate.sightings import Sightings
 from sphereorient.trajectory import Flag
@@ -56,7 +56,7 @@ def find_positions(
     for view, ok in reversed(list(zip(views, placed, strict=True))):
         position = torch.where(ok[:, None], view.from_size_mm, position)
     if len(views) > 1:
-        crossing, gap = meeting_point([view.rays for view in views])
+        crossing, gap = nearest_point([view.rays for view in views])
         position = torch.where((placed.sum(0) > 1)[:, None], crossing, position)
     one = placed.sum(0) == 1
     flags = torch.where(one, int(Flag.ONE_CAMERA), 0)

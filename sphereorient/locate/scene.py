@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.cameras import Camera, meeting_point
+from sphereorient.cameras import Camera, nearest_point
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
@@ -73,7 +73,7 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     middle = torch.zeros(3, dtype=torch.float64)
     if len(cameras) > 1:
         axes = [each.rays((torch.tensor(each.image_size, dtype=torch.float64) - 1) / 2) for each in cameras.values()]
-        middle, _ = meeting_point(axes)
+        middle, _ = nearest_point(axes)
     right_lab = camera.R_cam_lab[0] * diameter_mm / 2
     rim = camera.project(torch.stack([middle - right_lab, middle + right_lab]))
     diameter_px = float((rim[1] - rim[0]).norm())

@@ -7,7 +7,7 @@ import torch
 from camera_examples import f64, tsai, turned
 from conftest import assert_close
 
-from sphereorient.cameras import Rays, nearest_point, triangulate
+from sphereorient.cameras import Rays, triangulate
 from sphereorient.errors import ShapeError
 
 A = tsai(R_cam_lab=turned((0.1, 0.2, 0.3)))
@@ -110,62 +110,3 @@ def test_another_shape_is_refused():
     bad = Rays(origin_lab_mm=torch.zeros(4, 2), direction_lab=torch.zeros(4, 2))
     with pytest.raises(ShapeError, match="rays_a"):
         triangulate(bad, bad)
-
-
-def together(*rays: Rays) -> Rays:
-    return Rays(
-        origin_lab_mm=torch.stack([one.origin_lab_mm for one in rays], -2),
-        direction_lab=torch.stack([one.direction_lab for one in rays], -2),
-    )
-
-
-def lines(rng: torch.Generator, *shape: int) -> Rays:
-    direction = torch.randn(*shape, 3, generator=rng, dtype=torch.float64)
-    return Rays(origin_lab_mm=points(rng, *shape), direction_lab=direction / direction.norm(dim=-1, keepdim=True))
-
-
-def test_the_point_nearest_to_two_rays_is_that_of_triangulate(rng):
-    x_lab_mm = points(rng, 100)
-    rays_a, rays_b = seen(x_lab_mm)
-    rays_b = Rays(origin_lab_mm=rays_b.origin_lab_mm + 0.3, direction_lab=rays_b.direction_lab)
-    point, away = nearest_point(together(rays_a, rays_b))
-    crossing, gap = triangulate(rays_a, rays_b)
-    assert_close(point, crossing, atol=1e-9)
-    assert_close(away, (gap[:, None] / 2).expand(-1, 2), atol=1e-9)
-
-
-def test_the_nearest_point_minimises_the_weighted_squares(rng):
-    rays, weight = lines(rng, 20, 4), torch.rand(20, 4, generator=rng, dtype=torch.float64)
-    point, away = nearest_point(rays, weight)
-    beside = point[:, None] + 1e-3 * torch.randn(20, 50, 3, generator=rng, dtype=torch.float64)
-    along = (beside[..., None, :] - rays.origin_lab_mm[:, None]) * rays.direction_lab[:, None]
-    square = (beside[..., None, :] - rays.origin_lab_mm[:, None]).square().sum(-1) - along.sum(-1).square()
-    assert (((weight[:, None] * square).sum(-1)) >= (weight * away.square()).sum(-1)[:, None] - 1e-9).all()
-
-
-def test_a_ray_of_weight_zero_is_left_out(rng):
-    rays = lines(rng, 5, 3)
-    nothing = Rays(**{name: torch.cat([part, part[:, :1] * torch.nan], 1) for name, part in vars(rays).items()})
-    point, away = nearest_point(nothing, torch.tensor([1.0, 1.0, 1.0, 0.0]))
-    assert_close(point, nearest_point(rays)[0])
-    assert away[:, 3].isnan().all()
-
-
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 1, 3)])
-def test_the_nearest_points_of_a_batch_are_the_stack_of_single_ones(rng, shape):
-    rays = lines(rng, *shape, 3)
-    point, away = nearest_point(rays)
-    each = zip(rays.origin_lab_mm.reshape(-1, 3, 3), rays.direction_lab.reshape(-1, 3, 3), strict=True)
-    single = [nearest_point(Rays(origin_lab_mm=at, direction_lab=to))[0] for at, to in each]
-    assert point.shape == away.shape == (*shape, 3)
-    assert_close(point.reshape(-1, 3), torch.stack(single) if single else point.reshape(-1, 3))
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_parallel_rays_have_no_nearest_point(count, dtype):
-    direction = torch.tensor([0.6, 0.0, 0.8], dtype=dtype).requires_grad_()
-    rays = Rays(origin_lab_mm=torch.randn(count, 3).to(dtype), direction_lab=direction.expand(count, 3))
-    point, away = nearest_point(rays)
-    assert torch.cat([point, away]).isnan().all()
-    (gradient,) = torch.autograd.grad(torch.nan_to_num(point).sum() + torch.nan_to_num(away).sum(), direction)
-    assert torch.isfinite(gradient).all()

@@ -106,10 +106,6 @@ FAULTS = {
     "start of no movie": (FULL.replace("start: {cam2", "start: {cam3"), "start: .*got 'cam3'; write 'cam"),
     "mask of no movie": (FULL.replace("masks: {cam1", "masks: {side"), "masks: expected one of cam1, cam2, got 'side'"),
     "movie without camera": (SHORT.replace("{cam1:", "{cam9:"), "camera of movie cam9: expected one of cam1, cam2"),
-    "nine cameras": (
-        SHORT.replace("{cam1: cam1.npy}", f"{{{', '.join(f'c{k}: c{k}.mkv' for k in range(9))}}}"),
-        "movies: .*at most 8",
-    ),
     "both keys": (SHORT + "spheres: {a: {diameter: 14}}\n", "sphere: expected either sphere or spheres, got both"),
     "no ball": (SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {}"), "spheres: .*at least 1"),
     "one name twice": (
@@ -131,6 +127,10 @@ FAULTS = {
     "several balls, one of unknown diameter": (
         SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diameter: 14}, b: {diameter: null}}"),
         r"spheres\.b\.diameter: expected a number \(mm\), got none",
+    ),
+    "nine cameras": (
+        SHORT.replace("{cam1: cam1.npy}", f"{{{', '.join(f'c{k}: c{k}.mkv' for k in range(9))}}}"),
+        "movies: .*at most 8",
     ),
     "no movies": (SHORT.replace("{cam1: cam1.npy}", "{}"), "movies: .*at least 1"),
     "movies as a list": (SHORT.replace("{cam1: cam1.npy}", "[cam1.npy]"), "movies: expected a valid dictionary"),
