@@ -67,7 +67,7 @@ def write_report(
         OutputError: `out` cannot be written, or contains something else.
     """
     known = match_experiments(tracks, experiments)
-    around = surroundings_of(experiments)
+    around = surroundings_of([experiment for experiment in known.values() if experiment is not None])
     names = list(tracks)
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     summary = summarise(
@@ -97,13 +97,14 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track by its name, or None; a single one belongs to a single track.
+    """Return the experiment of each track by its name, or None, of its sphere alone; a single one belongs to a single
+    track.
 
     Raises:
-        ExperimentError: an experiment without a track, or two of one name.
+        ExperimentError: an experiment without a track or without its sphere, or two of one name.
     """
     if len(tracks) == 1 and len(experiments) == 1:
-        return dict.fromkeys(tracks, experiments[0])
+        return {name: experiments[0].of(track.sphere) for name, track in tracks.items()}
     known: dict[str, Experiment] = {}
     wanted = {track.experiment for track in tracks.values()}
     for experiment in experiments:
@@ -118,7 +119,10 @@ def match_experiments(
             do = "pass the experiment.yaml that the track was measured from"
             expected = f"the name of one of {', '.join(sorted(wanted)[:5])}"
             raise ExperimentError(refusal(str(experiment.path), expected=expected, got=name, do=do))
-    return {name: known.get(track.experiment) for name, track in tracks.items()}
+    return {
+        name: known[track.experiment].of(track.sphere) if track.experiment in known else None
+        for name, track in tracks.items()
+    }
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:

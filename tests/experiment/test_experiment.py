@@ -250,7 +250,7 @@ def test_the_experiment_of_one_ball_is_that_of_a_file_with_only_this_ball(folder
 def test_what_holds_for_one_ball_is_refused_for_several(folder):
     experiment = load_experiment(written(folder, BALLS))
     for name in ("sphere", "diameter_mm", "texture_path", "fixed", "radius_mm"):
-        with pytest.raises(ExperimentError, match=r"spheres: expected one ball, got b, a; pick one: --sphere NAME"):
+        with pytest.raises(ExperimentError, match=r"spheres: expected one ball, got b, a; name a file with one"):
             getattr(experiment, name)
     with pytest.raises(ExperimentError, match="spheres: expected one of b, a, got 'c'"):
         experiment.of("c")
