@@ -3,8 +3,13 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.assemble.identity import same_balls
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Among, Appearance, Following, estimate_appearance
@@ -12,7 +17,7 @@ from sphereorient.follow.follower import Follower, frames_at, sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_tracker import SceneTracker, among, start_of
-from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.follow.tracker import ChunkTracker, supported
 from sphereorient.locate import Frame, known_diameter_px
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
@@ -21,7 +26,11 @@ from sphereorient.pose import CameraView
 from sphereorient.pose.fitter import FIRST_BLUR_PX, Fitter, first_fitter, widest_px
 from sphereorient.pose.neighbours import visible_shares
 from sphereorient.sphere.texture_table import TextureTable
+from sphereorient.trajectory import Flag
 
+Floats = NDArray[np.float64]
+
+SURE = 0.99  # probability from which a ball has its name
 MOSTLY_SEEN = 0.5  # share of a disk that others must leave to each camera, of the frames that light is learnt from
 WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
 
@@ -113,10 +122,34 @@ def join(job: Job, follower: Follower | None, measured: Iterable[Measured], prog
     for batch in measured:
         for name, poses in batch.items():
             frames[name] += poses
-    return {
-        name: precise.joined(job.of(name), appearance, [frames[name]])
-        for name, appearance in follower.appearances.items()
-    }
+    sure: dict[str, Floats] = {}
+    for names in alike(job):
+        if len(names) > 1:
+            sure |= _named(names, frames, job, follower)
+    found: dict[str, Joined] = {}
+    for name, appearance in follower.appearances.items():
+        track, learnt = precise.joined(job.of(name), appearance, [frames[name]])
+        if name in sure:
+            flags = np.where(sure[name] < SURE, np.uint32(Flag.IDENTITY), np.uint32(0))
+            track = replace(track, identity=sure[name], flags=track.flags | flags)
+        found[name] = track, learnt
+    return found
+
+
+def _named(names: Sequence[str], frames: dict[str, list[Poses]], job: Job, follower: Follower) -> dict[str, Floats]:
+    """Give balls that look alike the same names in all `frames`; return how sure that is, see `same_balls`."""
+    clock = job.recording.clock.numpy()
+    seen = np.array([[supported(poses) for poses in frames[name]] for name in names])
+    X, R = np.zeros((*seen.shape, 3)), np.tile(np.eye(3), (*seen.shape, 1, 1))
+    for k, name in enumerate(names):
+        for n in np.flatnonzero(seen[k]):
+            X[k, n], R[k, n] = (getattr(frames[name][n], part)[0].numpy() for part in ("position_lab_mm", "R_lab_body"))
+    breaks = [end for batch in follower.batches for end in accumulate((batch.first, *batch.lengths))]
+    order, sure = same_balls(X, R, seen, clock, breaks)
+    before = {name: frames[name] for name in names}
+    for k, name in enumerate(names):
+        frames[name] = [before[names[row]][n] for n, row in enumerate(order[k])]
+    return dict(zip(names, sure, strict=True))
 
 
 def alike(job: Job) -> list[list[str]]:
