@@ -107,8 +107,8 @@ def _voted(edges: Edges, shape: tuple[int, ...], diameters_px: Sequence[float], 
         column, row = (start + np.float32(radius) * inward).astype(np.int32).T
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         count = np.bincount((row * width + column)[inside], minlength=height * width).reshape(height, width)
-        votes = cv2.GaussianBlur(count.astype(np.float32), (0, 0), SCATTER_PX / SHRINK)
-        votes *= np.float32(4 * (SCATTER_PX / SHRINK) ** 2 / radius)
+        share = count.astype(np.float32) * np.float32(4 * (SCATTER_PX / SHRINK) ** 2 / radius)  # of a rim
+        votes = cv2.GaussianBlur(share, (0, 0), SCATTER_PX / SHRINK)
         row, column = np.nonzero((votes > LEAST_VOTES) & (votes >= cv2.dilate(votes, beside)))
         found.append(np.column_stack([column, row, np.full(len(row), radius), votes[row, column]]))
     circles = np.concatenate(found)
@@ -135,7 +135,9 @@ def _fitted(edges: Edges, voted: Circle, least_px: float) -> Outline | None:
         distance = np.maximum(np.hypot(across[:, 0], across[:, 1]), 1e-9)
         outward = across / distance[:, None]
         offset = distance - circle[2]
-        rim = np.flatnonzero((-(outward * edges.inward).sum(1) > RADIAL) & (np.abs(offset) < max(near * circle[2], least_px)))
+        rim = np.flatnonzero(
+            (-(outward * edges.inward).sum(1) > RADIAL) & (np.abs(offset) < max(near * circle[2], least_px))
+        )
         if len(rim) < FEWEST:
             return None
         rim = rim[_outermost(outward[rim], offset[rim])]
@@ -208,4 +210,3 @@ def cover(mask: NDArray[Any], disk: Outline, share: float, value: int) -> None:
     window = mask[top : max(0, int(disk.v_px + reach) + 2), left : max(0, int(disk.u_px + reach) + 2)]
     row, column = np.ogrid[: window.shape[0], : window.shape[1]]
     window[(row + top - disk.v_px) ** 2 + (column + left - disk.u_px) ** 2 <= reach**2] = value
-
