@@ -18,7 +18,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_tracker import SceneTracker, among, start_of
 from sphereorient.follow.tracker import ChunkTracker, supported
-from sphereorient.locate import Frame, known_diameter_px
+from sphereorient.locate import Frame
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, finest_table, open_scene
@@ -43,8 +43,9 @@ def learn(job: Job, progress: Progress) -> Follower:
     recording, refine = job.recording, job.settings.refine
     views = open_scene(recording, job.settings, progress)
     progress("appearance", 0, 1)
-    frames, places = sample_frames(recording, views, 2 * refine.appearance_frames)
-    paints = [_Paint.of(job, names, views) for names in alike(job)]
+    any_views = next(iter(views.values()))
+    frames, places = sample_frames(recording, any_views, 2 * refine.appearance_frames)
+    paints = [_Paint.of(job, names, views[names[0]]) for names in alike(job)]
     first = {name: paint.first for paint in paints for name in paint.names}
     start = start_of(first)
     found = [start(shots, list(first), {}) for shots in frames]
@@ -61,7 +62,7 @@ def learn(job: Job, progress: Progress) -> Follower:
         if open_share is not None:
             numbers = [beside[k] for k, _ in rows]
             followed = Following(
-                shots=partial(_frames_of, job, views, numbers),
+                shots=partial(_frames_of, job, any_views, numbers),
                 open_share=open_share[[k for k, _ in rows]],
             )
         among_others = Among(
@@ -171,8 +172,6 @@ class _Paint:
     @classmethod
     def of(cls, job: Job, names: Sequence[str], views: Sequence[CameraView]) -> "_Paint":
         one, settings = job.recording.of(names[0]), job.settings
-        diameters_px = [known_diameter_px(one, view.name, settings.locate) or view.diameter_px for view in views]
-        views = [replace(view, diameter_px=px) for view, px in zip(views, diameters_px, strict=True)]
         diameter_px = widest_px(views)
         base = finest_table(one.texture, diameter_px, one.unseen)
         blur_px = settings.refine.blur_px or FIRST_BLUR_PX
