@@ -1,7 +1,15 @@
 """Locating the sphere: background, blob, outline, gaps, position in the lab."""
 
 from sphereorient.locate.background import Background, Frame, screened, screened_frames
+from sphereorient.locate.disks import find_disks
 from sphereorient.locate.position import Positions, find_positions
-from sphereorient.locate.scene import CameraScene, expected_diameter_px, find_scene, known_diameter_px, learn_background
+from sphereorient.locate.scene import (
+    CameraScene,
+    expected_diameter_px,
+    find_scene,
+    find_scenes,
+    known_diameter_px,
+    learn_background,
+)
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import Found, Sightings, check_seen, fill_gaps, find_ball, sightings_of, size_of

@@ -109,14 +109,19 @@ class Outline:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Edges:
+class Edges:
     """Edge pixels (E, 2), px, and unit vectors from dark to bright (E, 2)."""
 
     point: NDArray[np.float64]
     inward: NDArray[np.float64]
 
+    def where(self, kept: NDArray[np.bool_]) -> "Edges":
+        """Return some of the edges, by a mask (E,)."""
+        return Edges(point=self.point[kept], inward=self.inward[kept])
 
-def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
+
+def edge_points(window: NDArray[np.float32], steepness: float) -> Edges:
+    """Return the edges of a picture (H, W) that rise by at least `steepness` per px."""
     du = cv2.Scharr(window, cv2.CV_32F, 1, 0) / 32
     dv = cv2.Scharr(window, cv2.CV_32F, 0, 1) / 32
     scale = 8192 / max(float(np.abs(du).max()), float(np.abs(dv).max()), 1e-6)
@@ -127,7 +132,7 @@ def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
     norm = np.linalg.norm(gradient, axis=1, keepdims=True)
     keep = norm[:, 0] > 0
     point = np.stack([columns, rows], axis=1).astype(np.float64)[keep]
-    return _Edges(point=point, inward=gradient[keep] / norm[keep])
+    return Edges(point=point, inward=gradient[keep] / norm[keep])
 
 
 def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -154,7 +159,7 @@ def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([p[:, 0] + offset, np.linalg.norm(offset, axis=1)])
 
 
-def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> NDArray[np.float64]:
+def support(circles: NDArray[np.float64], edges: Edges, tolerance: float) -> NDArray[np.float64]:
     """Count directions with an edge on the circle, less half of those with one just outside: the rim is outermost."""
     across, down = (edges.point[:, k] - circles[:, k : k + 1] for k in (0, 1))
     distance = np.sqrt(across**2 + down**2)
@@ -196,7 +201,7 @@ def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
 
 
 def _best_circle(
-    edges: _Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
+    edges: Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
 ) -> NDArray[np.float64] | None:
     """Return the best supported circle of an allowed size (RANSAC, fixed seed)."""
     if len(edges.point) < 8:
@@ -213,12 +218,12 @@ def _best_circle(
     circles = circles[outwards.all(1)][:tries]
     if not len(circles):
         return None
-    best: NDArray[np.float64] = circles[int(_support(circles, edges, tolerance).argmax())]
+    best: NDArray[np.float64] = circles[int(support(circles, edges, tolerance).argmax())]
     return best
 
 
 def _ball_circle(
-    edges: _Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
+    edges: Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
 ) -> tuple[NDArray[np.float64] | None, bool]:
     """Return the best circle that may be the sphere, and whether it is painted; remove rims of other objects."""
     for _ in range(SET_ASIDE + 1):
@@ -227,7 +232,7 @@ def _ball_circle(
         if circle is None or painted or _alone(window, circle):
             return circle, painted
         away = np.abs(np.linalg.norm(edges.point - circle[:2], axis=1) - circle[2]) > tolerance
-        edges = _Edges(point=edges.point[away], inward=edges.inward[away])
+        edges = edges.where(away)
     return None, False
 
 
@@ -361,9 +366,8 @@ def fit_outline(
     # A step blurred by sigma has steepness contrast / (sigma sqrt(2 pi)); the floor excludes noise.
     floor = NOISE_STEEPNESS * noise**0.5
     steepness = max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor)
-    edges = _edge_points(window, steepness)
-    kept = _in_the_clear(edges.point, clear)
-    edges = _Edges(point=edges.point[kept], inward=edges.inward[kept])
+    edges = edge_points(window, steepness)
+    edges = edges.where(_in_the_clear(edges.point, clear))
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
     circle, painted = _ball_circle(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px)
     if circle is None:

@@ -1,4 +1,4 @@
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
 from sphereorient.locate.background import Background, measure_background, without_ball
+from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
@@ -60,6 +61,24 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
     return CameraScene(background=background, diameter_px=diameter_px)
 
 
+def find_scenes(
+    recording: Recording, stream: CameraStream, count: int, settings: LocateSettings
+) -> dict[str, CameraScene]:
+    """Return one camera's scene for each sphere, by name: one background, expected diameters of their own.
+    Raises as `find_scene`, which is what a single sphere gets.
+    """
+    each = {name: recording.of(name) for name in recording.experiment.names}
+    if len(each) == 1:
+        return {name: find_scene(one, stream, count, settings) for name, one in each.items()}
+    diameters_px = {
+        name: expected_diameter_px(stream.name, one.cameras, one.experiment.diameter_mm) for name, one in each.items()
+    }
+    empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
+    pictures = stream.spread(count)
+    background = learn_background(pictures, tuple(diameters_px.values()), settings, empty, stream.shown)
+    return {name: CameraScene(background=background, diameter_px=size) for name, size in diameters_px.items()}
+
+
 def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:
     """Return the sphere's diameter, px, at the middle of the volume: nearest point of all axes, or lab origin.
 
@@ -85,38 +104,40 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
 
 def learn_background(
     pictures: NDArray[Any],
-    diameter_px: float,
+    diameter_px: float | Sequence[float],
     settings: LocateSettings,
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
 ) -> Background:
-    """Estimate the background of frames (n, H, W): average, find the sphere, measure its pixels from other frames.
+    """Estimate the background of frames (n, H, W): average, find the spheres, measure their pixels from other frames.
 
-    With `empty` (H, W), a given background, only the noise is measured. `shown` is False where the sphere is hidden.
+    `diameter_px` is that of the sphere, or those of all. With `empty` (H, W), a given background, only the noise is
+    measured. `shown` is False where the sphere is hidden.
     """
+    sizes = tuple(diameter_px) if isinstance(diameter_px, Sequence) else (diameter_px,)
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
-        return _quieter(background, pictures, diameter_px, settings)
+        return _quieter(background, pictures, sizes, settings)
     first, before = background, 0
     for _ in range(ROUNDS):
-        covered = _covered(pictures, background, diameter_px, settings)
-        background = without_ball(first, pictures, covered)
-        found = int(covered.any(axis=(1, 2)).sum())
-        if found <= before or found == len(pictures):
+        disks = [_disks(picture, background, sizes, settings) for picture in pictures]
+        background = without_ball(first, pictures, _covered(pictures, disks))
+        found = sum(len(some) for some in disks)
+        if found <= before or found == len(pictures) * len(sizes):
             break
         before = found
     return background
 
 
 def _quieter(
-    background: Background, pictures: NDArray[Any], diameter_px: float, settings: LocateSettings
+    background: Background, pictures: NDArray[Any], sizes: Sequence[float], settings: LocateSettings
 ) -> Background:
-    """Limit the noise to the frame-to-frame change if a sphere that never leaves its pixels is not found otherwise."""
+    """Limit the noise to the frame-to-frame change if spheres that never leave their pixels are not found otherwise."""
     loud = background.noise > LOUD * background.typical_noise
-    if loud.sum() < LOUD_SHARE * np.pi / 4 * diameter_px**2:
+    if loud.sum() < LOUD_SHARE * np.pi / 4 * min(sizes) ** 2:
         return background
-    found = [find_ball(picture, background, diameter_px, settings)[0] is not None for picture in pictures]
-    if 2 * sum(found) >= len(pictures):
+    found = sum(len(_disks(picture, background, sizes, settings)) for picture in pictures)
+    if 2 * found >= len(pictures) * len(sizes):
         return background
     values = pictures[:, loud].astype(np.float32)
     changed = np.median(np.abs(np.diff(values, axis=0)), axis=0) / CHANGE_SIGMAS
@@ -125,20 +146,22 @@ def _quieter(
     return replace(background, noise=noise)
 
 
-def _covered(
-    pictures: NDArray[Any], background: Background, diameter_px: float, settings: LocateSettings
-) -> NDArray[np.bool_]:
-    """Return the sphere's pixels in frames (n, H, W); all False where it was not found."""
+def _disks(
+    picture: NDArray[Any], background: Background, sizes: Sequence[float], settings: LocateSettings
+) -> list[Outline]:
+    """Return the disk of a single sphere, if it is found, or all that may be spheres."""
+    if len(sizes) > 1:
+        return find_disks(picture, background, sizes, settings)
+    outline, _ = find_ball(picture, background, sizes[0], settings)
+    return [] if outline is None else [outline]
+
+
+def _covered(pictures: NDArray[Any], disks: Sequence[Sequence[Outline]]) -> NDArray[np.bool_]:
+    """Return the spheres' pixels in frames (n, H, W), by the disks of each frame."""
     covered = np.zeros(pictures.shape, bool)
-    for picture, mask in zip(pictures, covered, strict=True):
-        outline, _ = find_ball(picture, background, diameter_px, settings)
-        if outline is None:
-            continue
-        reach = RIM * outline.radius_px + 1
-        left, top = max(0, int(outline.u_px - reach)), max(0, int(outline.v_px - reach))
-        window = mask[top : int(outline.v_px + reach) + 2, left : int(outline.u_px + reach) + 2]
-        row, column = np.ogrid[: window.shape[0], : window.shape[1]]
-        window[...] = (row + top - outline.v_px) ** 2 + (column + left - outline.u_px) ** 2 <= reach**2
+    for mask, some in zip(covered, disks, strict=True):
+        for disk in some:
+            cover(mask, disk, RIM, True)
     return covered
 
 

@@ -14,6 +14,14 @@ from sphereorient.trajectory import datasets
 from sphereorient.trajectory.trajectory import AGAIN, SCHEMA_OF_SEVERAL, SPHERES, Trajectory, opened_track
 
 
+def one_track(found: "Trajectory | Tracks") -> Trajectory:
+    """Return the track of an only sphere; raise TrackError for those of several."""
+    if isinstance(found, Trajectory):
+        return found
+    got, do = ", ".join(found), "pick one by its name"
+    raise TrackError(refusal("tracks", expected="one sphere", got=got, do=do))
+
+
 class Tracks(Mapping[str, Trajectory]):
     """Trajectories of the spheres of one recording, by name: `tracks["a"]`. The name of a sphere under the key `sphere`
     of experiment.yaml is empty. All have the same times.
