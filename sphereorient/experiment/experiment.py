@@ -63,7 +63,7 @@ class Experiment:
         return tuple(sphere.name for sphere in self.spheres)
 
     def of(self, name: str) -> "Experiment":
-        """Return the experiment of one sphere alone, as if the file had it under `sphere:`; else ExperimentError."""
+        """Return the experiment of one sphere alone; ExperimentError if it has none of this name."""
         if name == "":
             return replace(self, spheres=(self.sphere,))
         if self.names == ("",):
@@ -71,7 +71,7 @@ class Experiment:
             raise ExperimentError(refusal(f"{self.path}, spheres", expected=f"a ball {name}", got=got, do=do))
         if name not in self.names:
             raise ExperimentError(refuse_unknown(name, self.names, f"{self.path}, spheres"))
-        return replace(self, spheres=(replace(self.spheres[self.names.index(name)], name=""),))
+        return replace(self, spheres=(self.spheres[self.names.index(name)],))
 
     def with_sphere(self, **changes: Any) -> "Experiment":
         """Return the experiment with other fields of its only sphere; ExperimentError if it has several."""

@@ -126,11 +126,16 @@ def match_experiments(
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
-    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other."""
+    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other. Of spheres of
+    one recording that differ in size, no diameter is known.
+    """
     known: dict[str, float] = {}
+    sizes: dict[Path, set[float | None]] = {}
+    for experiment in experiments:
+        sizes.setdefault(experiment.path, set()).add(experiment.diameter_mm)
     for experiment in experiments:
         found = {FLOW_KEYS[key]: value for key, value in experiment.flow.items() if key in FLOW_KEYS}
-        if experiment.diameter_mm is not None:
+        if experiment.diameter_mm is not None and len(sizes[experiment.path]) == 1:
             found["diameter_mm"] = experiment.diameter_mm
         for key, value in found.items():
             if known.setdefault(key, value) != value:
@@ -145,11 +150,18 @@ Plan = tuple[str, str, str, Callable[[], Figure]]  # name, title, caption, funct
 
 def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
-    of = "" if len(tracks) == 1 else f" of {name}"
     caption = "As measured (dots) and smooth, with bands of two standard errors."
-    yield "track", f"Track{of}", caption, lambda: plots.track_figure(track)
+    together = {
+        key: one
+        for key, one in tracks.items()
+        if one is track or (track.sphere and key.removesuffix(one.sphere) == name.removesuffix(track.sphere))
+    }
+    for number, (key, one) in enumerate(together.items()):
+        of = "" if len(tracks) == 1 else f" of {key}"
+        yield f"track_{number + 1}" if number else "track", f"Track{of}", caption, partial(plots.track_figure, one)
     if not track.held:
-        yield "path", f"Path{of}", "With the sphere's axes.", lambda: plots.path_figure(track)
+        of = "" if len(tracks) == 1 else f" of {', '.join(together)}"
+        yield "path", f"Path{of}", "With the sphere's axes.", partial(plots.path_figure, *together.values())
     if any(len(one.distance_rad) for one in distances):
         caption = "PDF of the angle between the two cameras' own orientations."
         yield "camera_distance", "Distance of the cameras", caption, lambda: plots.camera_distance_figure(distances)

@@ -23,8 +23,8 @@ def one_track(found: "Trajectory | Tracks") -> Trajectory:
 
 
 class Tracks(Mapping[str, Trajectory]):
-    """Trajectories of the spheres of one recording, by name: `tracks["a"]`. The name of an only sphere, the one under
-    the key `sphere` of experiment.yaml, is empty. All have the same times.
+    """Trajectories of the spheres of one recording, by name: `tracks["a"]`. The name of a sphere under the key `sphere`
+    of experiment.yaml is empty. All have the same times.
     """
 
     def __init__(self, tracks: Mapping[str, Trajectory]) -> None:
@@ -56,13 +56,13 @@ class Tracks(Mapping[str, Trajectory]):
 
     def save(self, path: str | Path) -> None:
         """Write HDF5 of schema sphereorient-track/2: a group /spheres/NAME each, as `Trajectory.save` writes a file. Of
-        an only sphere without name, write the file that this writes.
+        an only sphere, write the file that this writes.
 
         Raises:
             OutputError: the file cannot be written.
         """
-        if list(self) == [""]:
-            self[""].save(path)
+        if len(self) == 1:
+            next(iter(self.values())).save(path)
             return
         with whole_hdf5(Path(path)) as file:
             file.attrs["schema"] = SCHEMA_OF_SEVERAL
@@ -72,7 +72,7 @@ class Tracks(Mapping[str, Trajectory]):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by `Tracks.save` or `Trajectory.save`; of the latter the name of the sphere is empty.
+        """Read a file written by `Tracks.save` or `Trajectory.save`.
 
         Raises:
             TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.

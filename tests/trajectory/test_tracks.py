@@ -76,6 +76,12 @@ def test_one_of_several_is_picked_by_name() -> None:
     assert "ball a" in repr(several())
 
 
+def test_one_ball_with_a_name_keeps_it_in_the_file_of_a_trajectory(tmp_path: Path) -> None:
+    several().picked("a").save(tmp_path / "track.h5")
+    same(Trajectory.load(tmp_path / "track.h5"), several()["a"])
+    assert Tracks.load(tmp_path / "track.h5")["a"].bits["IDENTITY"] == 1024
+
+
 def test_equal_tracks_give_equal_bytes(tmp_path: Path) -> None:
     several().save(tmp_path / "one.h5")
     several().save(tmp_path / "two.h5")
