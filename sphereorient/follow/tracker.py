@@ -304,8 +304,8 @@ class ChunkTracker:
             others[:, k] &= supported(one, _only(usable, [k]))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
-            [_reason(*of_camera) for of_camera in zip(used, contradicts, row, one.reason, strict=True)]
-            for used, contradicts, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
+            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
+            for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
@@ -552,9 +552,11 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
     return replace(fit, **told)
 
 
-def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
+def _reason(used: bool, contradicts: bool, sees: bool, shot: Frame, before: Reason) -> Reason:
     if used:
         return Reason.OK
+    if not sees:
+        return Reason.HIDDEN
     if contradicts:
         return Reason.CONTRADICTS
     if not shot.usable:
