@@ -141,25 +141,32 @@ class Initialiser:
         cameras = {view.name: view.camera for view in self.fitter.views}
         return find_positions(seen, cameras, 2 * self.fitter.radius_mm)
 
+    def proposals(self, camera: int, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor]:
+        """Return rotations (M, 3, 3), lab, in which a disk of a camera's picture may show the ball, and their scores
+        (M,), best first.
+        """
+        view = self.fitter.views[camera]
+        proposer = self.proposers[view.name]
+        crop = crop_disk(picture, disk.u_px, disk.v_px, disk.radius_px, proposer.size_px)
+        found = proposer.propose(torch.from_numpy(crop)[None])
+        ray = view.camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
+        R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
+        return R_lab_view @ found.R_view_body[: self.candidates], found.score[: self.candidates]
+
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
+        seen = [(k, shot, outline) for k, (shot, (outline, _)) in enumerate(zip(shots, found, strict=True)) if outline]
+        starts = [self.proposals(k, shot.picture, outline)[0] for k, shot, outline in seen]
+        return self.fitted(shots, found, torch.cat([torch.zeros(0, 3, 3, dtype=torch.float64), *starts]))
+
+    def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
+        """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():
             return no_pose(len(views), reason)
-        placed = self._placed(found)
-        starts = [torch.zeros(0, 3, 3, dtype=torch.float64)]
-        for view, shot, (outline, _) in zip(views, shots, found, strict=True):
-            if outline is None:
-                continue
-            proposer = self.proposers[view.name]
-            disk = crop_disk(shot.picture, outline.u_px, outline.v_px, outline.radius_px, proposer.size_px)
-            proposals = proposer.propose(torch.from_numpy(disk)[None])
-            ray = view.camera.rays(torch.tensor([outline.u_px, outline.v_px], dtype=torch.float64)).direction_lab
-            R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
-            starts.append(R_lab_view @ proposals.R_view_body[: self.candidates])
-        R = torch.cat(starts)
         if not len(R):
             return no_pose(len(views), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+        placed = self._placed(found)
         slack = torch.nan_to_num(placed.covariance_mm2[0])
         slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
         if int(use.sum()) == 1:
