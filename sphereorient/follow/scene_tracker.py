@@ -119,7 +119,8 @@ class SceneTracker:
                 reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
                 done[name] = no_pose(len(shots), reason)
             else:
-                done[name] = self.balls[name].looked_past(poses, shots, self._among(name, places))
+                among = self._among(name, places)
+                done[name] = poses if among is None else self.balls[name].looked_past(poses, shots, among)
         return {name: self.balls[name].stated(done[name]) for name in self.balls}
 
     def _among(self, name: str, places: Mapping[str, _Place]) -> Neighbours | None:
@@ -128,7 +129,7 @@ class SceneTracker:
         return _neighbours(radii, places) if radii else None
 
 
-def among(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
+def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
     """Return the neighbours of balls, each given by its name and the poses of its frame, as if at rest."""
     each = []
     for name, there in rows:

@@ -17,7 +17,7 @@ from sphereorient.follow.follower import Follower, frames_at, sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import SceneStart
-from sphereorient.follow.scene_tracker import SceneTracker, among
+from sphereorient.follow.scene_tracker import SceneTracker, among_found
 from sphereorient.follow.tracker import ChunkTracker, supported
 from sphereorient.locate import Frame
 from sphereorient.methods import precise
@@ -68,7 +68,7 @@ def learn(job: Job, progress: Progress) -> Follower:
             )
         among_others = Among(
             found=[found[k][name] for k, name in rows],
-            neighbours=among([(name, found[k]) for k, name in rows], first),
+            neighbours=among_found([(name, found[k]) for k, name in rows], first),
         )
         one = estimate_appearance(paint.first, [frames[k] for k, _ in rows], paint.base, refine, followed, among_others)
         appearances |= dict.fromkeys(paint.names, one)
@@ -200,7 +200,7 @@ def _mostly_seen(
             X = poses.position_lab_mm[:1]
             middle_px, radius_px = fitter.disks_px(X)
             places = fitter.places(X, fine, fitter.stencil(fine, float(radius_px)), middle_px)
-            share = visible_shares(places, among([(name, there)], first))[0]
+            share = visible_shares(places, among_found([(name, there)], first))[0]
             if bool((share[poses.use] > MOSTLY_SEEN).all()):
                 rows.append((k, name))
     return rows
