@@ -141,21 +141,29 @@ class Initialiser:
         cameras = {view.name: view.camera for view in self.fitter.views}
         return find_positions(seen, cameras, 2 * self.fitter.radius_mm)
 
-    def proposals(self, camera: int, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor]:
-        """Return rotations (M, 3, 3), lab, in which a disk of a camera's picture may show the ball, and their scores
-        (M,), best first.
+    def proposals(self, disks: Sequence[tuple[int, Picture, Outline]]) -> list[tuple[Tensor, Tensor]]:
+        """Return rotations (M, 3, 3), lab, in which each disk of a camera's picture may show the ball, and their scores
+        (M,), best first. Disks of one proposer are looked at together.
         """
-        view = self.fitter.views[camera]
-        proposer = self.proposers[view.name]
-        crop = crop_disk(picture, disk.u_px, disk.v_px, disk.radius_px, proposer.size_px)
-        found = proposer.propose(torch.from_numpy(crop)[None])
-        ray = view.camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
-        R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
-        return R_lab_view @ found.R_view_body[: self.candidates], found.score[: self.candidates]
+        crops: dict[int, list[Tensor]] = {}
+        for k, picture, disk in disks:
+            one = self.proposers[self.fitter.views[k].name]
+            crop = crop_disk(picture, disk.u_px, disk.v_px, disk.radius_px, one.size_px)
+            crops.setdefault(id(one), []).append(torch.from_numpy(crop))
+        proposers = {id(one): one for one in self.proposers.values()}
+        found = {each: iter(proposers[each].propose(torch.stack(some)).each()) for each, some in crops.items()}
+        rows = []
+        for k, _, disk in disks:
+            view = self.fitter.views[k]
+            own = next(found[id(self.proposers[view.name])])
+            ray = view.camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
+            R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
+            rows.append((R_lab_view @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
+        return rows
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
-        seen = [(k, shot, outline) for k, (shot, (outline, _)) in enumerate(zip(shots, found, strict=True)) if outline]
-        starts = [self.proposals(k, shot.picture, outline)[0] for k, shot, outline in seen]
+        seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
+        starts = [self.proposals([one])[0][0] for one in seen]  # one by one: sums depend on how many are added
         return self.fitted(shots, found, torch.cat([torch.zeros(0, 3, 3, dtype=torch.float64), *starts]))
 
     def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:

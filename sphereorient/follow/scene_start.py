@@ -11,7 +11,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import sphere_disk_px
+from sphereorient.cameras import Camera, sphere_disk_px
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.locate import Frame, Match, find_disks, match_disks, places_of
@@ -19,6 +19,7 @@ from sphereorient.locate.outline import Outline
 from sphereorient.trajectory import Reason
 
 Floats = NDArray[np.float64]
+Kind = tuple[float, ...]  # the same for balls that are alike
 
 EXPLAINED = 0.35  # of the radius: a disk whose middle is that near to a known ball is its own
 PATCHES = 40.0  # of paint on a disk that say something of their own
@@ -26,6 +27,7 @@ NO_PAINT = 0.65  # score from which a picture speaks for a paint: right ones 0.7
 ALIKE_RAD = 0.26  # rotations nearer than this are the same: proposals err by some degrees
 ANOTHER = 1.0  # price of a disk that shows another rotation than the others of its match
 NOT_SEEN = 3.0  # price of a ball that is not found
+MISSED = 4.0  # price of a picture that holds the place of a ball but not its disk: else a ball would count as two
 SIZE_SIGMA = 0.06  # relative, of the radius of a disk
 DEPTH_SIGMA = 0.15  # relative, of the distance of a ball of which one camera alone tells
 PROPOSED_RAD, PLACED_SHARE = 0.05, 0.1  # errors of proposals and, in radii, of matches beside a prediction
@@ -77,8 +79,8 @@ class SceneStart:
         disks = self._unexplained(shots, known)
         matches = match_disks(disks, list(self.cameras.values()))
         looks = {self._kind[name]: self._looks(name, shots, disks, matches) for name in names}
-        cost = np.stack([self._costs(name, matches, looks, (past or {}).get(name)) for name in names])
-        fits: dict[tuple[object, int], Poses] = {}
+        cost = np.stack([self._costs(name, shots, matches, looks, (past or {}).get(name)) for name in names])
+        fits: dict[tuple[Kind, int], Poses] = {}
         while True:
             pairs = [(self._kind[names[row]], n, names[row]) for row, n in assigned(cost, matches)]
             for kind, n, name in pairs:
@@ -118,17 +120,17 @@ class SceneStart:
     ) -> list[_Look]:
         """Return how the paint of a ball looks at each match."""
         ball = self.balls[name]
-        each = [
-            [ball.proposals(k, shot.picture, disk) for disk in seen]
-            for k, (shot, seen) in enumerate(zip(shots, disks, strict=True))
-        ]
-        return [_look([each[k][n] for k, n in enumerate(match.chosen) if n >= 0]) for match in matches]
+        where = [(k, n) for k, seen in enumerate(disks) for n in range(len(seen))]
+        proposed = ball.proposals([(k, shots[k].picture, disks[k][n]) for k, n in where])
+        each = dict(zip(where, proposed, strict=True))
+        return [_look([each[k, n] for k, n in enumerate(match.chosen) if n >= 0]) for match in matches]
 
     def _costs(
         self,
         name: str,
+        shots: Sequence[Frame],
         matches: Sequence[Match],
-        looks: Mapping[tuple[object, ...], Sequence[_Look]],
+        looks: Mapping[Kind, Sequence[_Look]],
         ahead: Ahead | None,
     ) -> Floats:
         """Return the cost (N,) of each match for a ball: negative log-likelihood beside that of not seeing it."""
@@ -138,8 +140,13 @@ class SceneStart:
         places = places_of(matches, self.cameras, 2 * ball.fitter.radius_mm)
         X = places.position_lab_mm
         cost = np.array([0.5 * match.chi2 - one.gain for match, one in zip(matches, look, strict=True)]) - NOT_SEEN
-        for k, view in enumerate(ball.fitter.views):
-            radius = torch.tensor([math.nan if m.disks[k] is None else m.disks[k].radius_px for m in matches])
+        for k, (view, shot) in enumerate(zip(ball.fitter.views, shots, strict=True)):
+            if shot.usable:
+                missed = [match.chosen[k] < 0 for match in matches] & in_picture(view.camera, X).numpy()
+                cost += MISSED * missed
+            radius = torch.tensor(
+                [math.nan if (disk := match.disks[k]) is None else disk.radius_px for match in matches]
+            )
             off = (radius / view.radius_px(X, ball.fitter.radius_mm) - 1) / SIZE_SIGMA
             alone = (2 * radius / view.diameter_px - 1) / DEPTH_SIGMA
             one = torch.tensor([match.number == 1 for match in matches])
@@ -148,6 +155,12 @@ class SceneStart:
             R = torch.stack([one.R_lab_body[0] if len(one.R_lab_body) else ahead.R_lab_body for one in look])
             cost += _surprise(ahead, X, places.covariance_mm2, R, ball.fitter.radius_mm)
         return cost
+
+
+def in_picture(camera: Camera, position_lab_mm: Tensor) -> Tensor:
+    """Return whether the picture of a camera holds positions (..., 3), mm, (...) bool."""
+    place = camera.project(position_lab_mm)
+    return ((place >= 0) & (place <= place.new_tensor(camera.image_size) - 1)).all(-1)
 
 
 def _gain(score: Tensor) -> Tensor:
