@@ -1,6 +1,6 @@
 """Poses of several balls: each frame of all of them together, each ball fitted with the others where they are."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
@@ -10,14 +10,11 @@ from torch import Tensor
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.follow.scene_start import SceneStart
 from sphereorient.follow.tracker import ChunkTracker, _Chunk, _Expected
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.trajectory import Reason
-
-# Finds balls in a frame of each view without history: those named, given the positions (3,), mm, of the others that are
-# known; a ball that it does not return is not found.
-Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor]], Mapping[str, Poses]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +30,7 @@ class SceneTracker:
     where they are expected. See `ChunkTracker`, which tracks each of them.
     """
 
-    def __init__(self, balls: Mapping[str, ChunkTracker], start: Start) -> None:
+    def __init__(self, balls: Mapping[str, ChunkTracker], start: SceneStart) -> None:
         self.balls = dict(balls)
         self.start = start
 
@@ -122,7 +119,8 @@ class SceneTracker:
                 reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
                 done[name] = no_pose(len(shots), reason)
             else:
-                done[name] = self.balls[name].looked_past(poses, shots, self._among(name, places))
+                among = self._among(name, places)
+                done[name] = poses if among is None else self.balls[name].looked_past(poses, shots, among)
         return {name: self.balls[name].stated(done[name]) for name in self.balls}
 
     def _among(self, name: str, places: Mapping[str, _Place]) -> Neighbours | None:
@@ -131,7 +129,7 @@ class SceneTracker:
         return _neighbours(radii, places) if radii else None
 
 
-def among(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
+def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
     """Return the neighbours of balls, each given by its name and the poses of its frame, as if at rest."""
     each = []
     for name, there in rows:
@@ -162,8 +160,3 @@ def _found_place(poses: Poses, before: _Place | None) -> _Place:
     """Return the place of a frame's best pose, with the motion that was expected of it."""
     still = torch.zeros(3, dtype=torch.float64)
     return _Place(poses.position_lab_mm[0], still if before is None else before.move_mm)
-
-
-def start_of(balls: Mapping[str, Initialiser]) -> Start:
-    """Return the start of frames."""
-    raise NotImplementedError

@@ -304,8 +304,8 @@ class ChunkTracker:
             others[:, k] &= supported(one, _only(usable, [k]))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
-            [_reason(*of_camera) for of_camera in zip(used, contradicts, row, one.reason, strict=True)]
-            for used, contradicts, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
+            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
+            for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
@@ -402,30 +402,26 @@ class ChunkTracker:
         fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
-    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours | None) -> Poses:
+    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours) -> Poses:
         """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
         those whose pictures support none are left out.
         """
         fitter, count = self.search.fitter, len(poses)
-        frames, use = [shot.picture for shot in shots], poses.use
-        visible = torch.ones(1, len(use), dtype=torch.float64)
-        if among is not None:
-            X = poses.position_lab_mm[:1]
-            visible = self._visible(X, fitter.disks_px(X), among)
-            use = use & (visible[0] > LEAST_VISIBLE)
-            among = among.of([0] * count)
+        frames, X = [shot.picture for shot in shots], poses.position_lab_mm[:1]
+        visible = self._visible(X, fitter.disks_px(X), among)[0]
+        use, every = poses.use & (visible > LEAST_VISIBLE), among.of([0] * count)
         if not bool(use.any()):
             return replace(poses, use=use)
-        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), among)
+        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), every)
         order = explaining_first(fit, use).argsort(stable=True)
         best = fit.of(order[:1])
-        seen = use & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible[0]))
+        seen = use & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
         reason = [
             Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
             for now, why in zip(seen.tolist(), poses.reason, strict=True)
         ]
         if bool(seen.any()) and not bool((seen == use).all()):
-            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), among)
+            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), every)
             order = explaining_first(fit, seen).argsort(stable=True)
         return poses_of(fit, order, seen, reason)
 
@@ -552,9 +548,11 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
     return replace(fit, **told)
 
 
-def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
+def _reason(used: bool, contradicts: bool, sees: bool, shot: Frame, before: Reason) -> Reason:
     if used:
         return Reason.OK
+    if not sees:
+        return Reason.HIDDEN
     if contradicts:
         return Reason.CONTRADICTS
     if not shot.usable:

@@ -16,7 +16,8 @@ from sphereorient.follow.appearance import Among, Appearance, Following, estimat
 from sphereorient.follow.follower import Follower, frames_at, sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
-from sphereorient.follow.scene_tracker import SceneTracker, among, start_of
+from sphereorient.follow.scene_start import SceneStart
+from sphereorient.follow.scene_tracker import SceneTracker, among_found
 from sphereorient.follow.tracker import ChunkTracker, supported
 from sphereorient.locate import Frame
 from sphereorient.methods import precise
@@ -47,7 +48,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     frames, places = sample_frames(recording, any_views, 2 * refine.appearance_frames)
     paints = [_Paint.of(job, names, views[names[0]]) for names in alike(job)]
     first = {name: paint.first for paint in paints for name in paint.names}
-    start = start_of(first)
+    start = SceneStart(first)
     found = [start(shots, list(first), {}) for shots in frames]
     open_share = None
     if precise.exposure_s(job) > 0 and len(recording.clock) > 1:
@@ -67,7 +68,7 @@ def learn(job: Job, progress: Progress) -> Follower:
             )
         among_others = Among(
             found=[found[k][name] for k, name in rows],
-            neighbours=among([(name, found[k]) for k, name in rows], first),
+            neighbours=among_found([(name, found[k]) for k, name in rows], first),
         )
         one = estimate_appearance(paint.first, [frames[k] for k, _ in rows], paint.base, refine, followed, among_others)
         appearances |= dict.fromkeys(paint.names, one)
@@ -111,7 +112,7 @@ def follower(job: Job, appearances: Mapping[str, Appearance]) -> Follower:
         name: ChunkTracker(one.on(job.device), begin[name], settings.refine, precise.exposure_s(job))
         for name, one in appearances.items()
     }
-    return Follower(recording=job.recording, appearances=appearances, tracker=SceneTracker(balls, start_of(begin)))
+    return Follower(recording=job.recording, appearances=appearances, tracker=SceneTracker(balls, SceneStart(begin)))
 
 
 def join(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
@@ -199,7 +200,7 @@ def _mostly_seen(
             X = poses.position_lab_mm[:1]
             middle_px, radius_px = fitter.disks_px(X)
             places = fitter.places(X, fine, fitter.stencil(fine, float(radius_px)), middle_px)
-            share = visible_shares(places, among([(name, there)], first))[0]
+            share = visible_shares(places, among_found([(name, there)], first))[0]
             if bool((share[poses.use] > MOSTLY_SEEN).all()):
                 rows.append((k, name))
     return rows
