@@ -141,25 +141,40 @@ class Initialiser:
         cameras = {view.name: view.camera for view in self.fitter.views}
         return find_positions(seen, cameras, 2 * self.fitter.radius_mm)
 
+    def proposals(self, disks: Sequence[tuple[int, Picture, Outline]]) -> list[tuple[Tensor, Tensor]]:
+        """Return rotations (M, 3, 3), lab, in which each disk of a camera's picture may show the ball, and their scores
+        (M,), best first. Disks of one proposer are looked at together.
+        """
+        crops: dict[int, list[Tensor]] = {}
+        for k, picture, disk in disks:
+            one = self.proposers[self.fitter.views[k].name]
+            crop = crop_disk(picture, disk.u_px, disk.v_px, disk.radius_px, one.size_px)
+            crops.setdefault(id(one), []).append(torch.from_numpy(crop))
+        proposers = {id(one): one for one in self.proposers.values()}
+        found = {each: iter(proposers[each].propose(torch.stack(some)).each()) for each, some in crops.items()}
+        rows = []
+        for k, _, disk in disks:
+            view = self.fitter.views[k]
+            own = next(found[id(self.proposers[view.name])])
+            ray = view.camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
+            R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
+            rows.append((R_lab_view @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
+        return rows
+
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
+        seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
+        starts = [self.proposals([one])[0][0] for one in seen]  # one by one: sums depend on how many are added
+        return self.fitted(shots, found, torch.cat([torch.zeros(0, 3, 3, dtype=torch.float64), *starts]))
+
+    def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
+        """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():
             return no_pose(len(views), reason)
-        placed = self._placed(found)
-        starts = [torch.zeros(0, 3, 3, dtype=torch.float64)]
-        for view, shot, (outline, _) in zip(views, shots, found, strict=True):
-            if outline is None:
-                continue
-            proposer = self.proposers[view.name]
-            disk = crop_disk(shot.picture, outline.u_px, outline.v_px, outline.radius_px, proposer.size_px)
-            proposals = proposer.propose(torch.from_numpy(disk)[None])
-            ray = view.camera.rays(torch.tensor([outline.u_px, outline.v_px], dtype=torch.float64)).direction_lab
-            R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
-            starts.append(R_lab_view @ proposals.R_view_body[: self.candidates])
-        R = torch.cat(starts)
         if not len(R):
             return no_pose(len(views), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+        placed = self._placed(found)
         slack = torch.nan_to_num(placed.covariance_mm2[0])
         slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
         if int(use.sum()) == 1:

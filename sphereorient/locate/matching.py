@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sphereorient.cameras import Camera, nearest_point
@@ -13,6 +14,8 @@ from sphereorient.locate.position import Positions, find_positions
 from sphereorient.locate.sightings import sightings_of
 from sphereorient.trajectory import Reason
 
+Numbers = NDArray[np.int64]
+Floats = NDArray[np.float64]
 MISSED = 1e-4  # share of right matches that may be lost
 
 
@@ -59,20 +62,18 @@ def match_disks(disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -
 def places_of(matches: Sequence[Match], cameras: Mapping[str, Camera], diameter_mm: float) -> Positions:
     """Return the positions of a sphere of a diameter, mm, at N matches of the cameras' disks; see `find_positions`."""
     seen = {
-        name: sightings_of(
-            (one.disks[k], Reason.NOT_FOUND if one.disks[k] is None else Reason.OK) for one in matches
-        )
+        name: sightings_of((one.disks[k], Reason.NOT_FOUND if one.disks[k] is None else Reason.OK) for one in matches)
         for k, name in enumerate(cameras)
     }
     return find_positions(seen, cameras, diameter_mm)
 
 
-def _most(chosen: np.ndarray) -> np.ndarray:
+def _most(chosen: Numbers) -> Floats:
     """Return the largest chi2 (N,) of a match, by its degrees of freedom."""
     return np.asarray(chi2.isf(MISSED, np.maximum(2 * (chosen >= 0).sum(1) - 3, 1)))
 
 
-def _misfit(chosen: np.ndarray, disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -> np.ndarray:
+def _misfit(chosen: Numbers, disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -> Floats:
     """Return chi2 (N,) of the middles of chosen disks (N, C) about the point nearest to their lines of sight."""
     if len(cameras) == 1 or not len(chosen):
         return np.zeros(len(chosen))
@@ -82,5 +83,8 @@ def _misfit(chosen: np.ndarray, disks: Sequence[Sequence[Outline]], cameras: Seq
         for seen, index in zip(disks, torch.from_numpy(chosen).T, strict=True)
     ]
     X, _ = nearest_point([camera.rays(row[:, :2]) for camera, row in zip(cameras, rows, strict=True)])
-    away = [(camera.project(X) - row[:, :2]).square().sum(-1) / row[:, 2].square() for camera, row in zip(cameras, rows, strict=True)]
+    away = [
+        (camera.project(X) - row[:, :2]).square().sum(-1) / row[:, 2].square()
+        for camera, row in zip(cameras, rows, strict=True)
+    ]
     return torch.stack(away).nan_to_num().sum(0).numpy()

@@ -1,0 +1,222 @@
+"""The start of a frame of several balls: disks, their matches over cameras, the paint of each, one assignment."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, milp
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras import Camera, sphere_disk_px
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.locate import Frame, Match, find_disks, match_disks, places_of
+from sphereorient.locate.outline import Outline
+from sphereorient.trajectory import Reason
+
+Floats = NDArray[np.float64]
+Kind = tuple[float, ...]  # the same for balls that are alike
+
+EXPLAINED = 0.35  # of the radius: a disk whose middle is that near to a known ball is its own
+PATCHES = 40.0  # of paint on a disk that say something of their own
+NO_PAINT = 0.65  # score from which a picture speaks for a paint: right ones 0.73 to 0.98, wrong ones up to 0.6
+ALIKE_RAD = 0.26  # rotations nearer than this are the same: proposals err by some degrees
+ANOTHER = 1.0  # price of a disk that shows another rotation than the others of its match
+NOT_SEEN = 3.0  # price of a ball that is not found
+MISSED = 4.0  # price of a picture that holds the place of a ball but not its disk: else a ball would count as two
+SIZE_SIGMA = 0.06  # relative, of the radius of a disk
+DEPTH_SIGMA = 0.15  # relative, of the distance of a ball of which one camera alone tells
+PROPOSED_RAD, PLACED_SHARE = 0.05, 0.1  # errors of proposals and, in radii, of matches beside a prediction
+FREEDOM = 6.0  # of a pose; predictions err by more than normal errors now and then
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ahead:
+    """What the frames before say of the pose of a ball."""
+
+    position_lab_mm: Tensor  # (3,)
+    R_lab_body: Tensor  # (3, 3)
+    covariance: Tensor  # (6, 6), of rotation (rad) and position (mm), lab
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A paint at a match: the gain of its log-likelihood over an unknown one, and the rotations from which to fit."""
+
+    gain: float
+    R_lab_body: Tensor  # (M, 3, 3), best first
+
+
+class SceneStart:
+    """Finds balls in frames in which no prediction can be fitted. `balls` are all of the scene; those of the same
+    proposers and radius are alike: no picture tells them apart.
+    """
+
+    def __init__(self, balls: Mapping[str, Initialiser]) -> None:
+        self.balls = dict(balls)
+        views = next(iter(self.balls.values())).fitter.views
+        self.cameras = {view.name: view.camera for view in views}
+        self._kind = {
+            name: (*(id(each) for each in one.proposers.values()), one.fitter.radius_mm)
+            for name, one in self.balls.items()
+        }
+
+    def __call__(
+        self,
+        shots: Sequence[Frame],
+        names: Sequence[str],
+        known: Mapping[str, Tensor],
+        past: Mapping[str, Ahead] | None = None,
+    ) -> dict[str, Poses]:
+        """Find the named balls in the pictures of one instant, `shots` of C views. `known`: positions (3,), lab, mm, of
+        other balls in this frame; `past`: what is expected of those looked for. Without it balls that are alike come in
+        any order. A ball that is not found has no pose, but each camera's reason.
+        """
+        disks = self._unexplained(shots, known)
+        matches = match_disks(disks, list(self.cameras.values()))
+        looks = {self._kind[name]: self._looks(name, shots, disks, matches) for name in names}
+        cost = np.stack([self._costs(name, shots, matches, looks, (past or {}).get(name)) for name in names])
+        fits: dict[tuple[Kind, int], Poses] = {}
+        while True:
+            pairs = [(self._kind[names[row]], n, names[row]) for row, n in assigned(cost, matches)]
+            for kind, n, name in pairs:
+                if (kind, n) not in fits:
+                    found = [
+                        (disk, Reason.OK if disk else Reason.NOT_FOUND if shot.usable else shot.reason)
+                        for disk, shot in zip(matches[n].disks, shots, strict=True)
+                    ]
+                    fits[kind, n] = self.balls[name].fitted(shots, found, looks[kind][n].R_lab_body)
+            wrong = {(kind, n) for kind, n, _ in pairs if not _explains(fits[kind, n])}
+            if not wrong:
+                break
+            for row, name in enumerate(names):
+                cost[row, [n for kind, n in wrong if kind == self._kind[name]]] = np.inf
+        found_ = {name: fits[kind, n] for kind, n, name in pairs}
+        reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
+        return {name: found_[name] if name in found_ else no_pose(len(shots), reason) for name in names}
+
+    def _unexplained(self, shots: Sequence[Frame], known: Mapping[str, Tensor]) -> list[list[Outline]]:
+        """Return the disks of each picture without those of balls at known positions."""
+        of_balls = [one.fitter.views for one in self.balls.values()]
+        disks = []
+        for k, shot in enumerate(shots):
+            views = [views[k] for views in of_balls]
+            first = next(iter(self.balls.values()))
+            sizes = [view.diameter_px for view in views]
+            seen = find_disks(shot.picture, views[0].background, sizes, first.locating) if shot.usable else []
+            for name, X in known.items():
+                middle, radius = sphere_disk_px(views[0].camera, X, self.balls[name].fitter.radius_mm)
+                u, v, reach = *middle.tolist(), EXPLAINED * float(radius)
+                seen = [disk for disk in seen if not math.hypot(disk.u_px - u, disk.v_px - v) < reach]
+            disks.append(seen)
+        return disks
+
+    def _looks(
+        self, name: str, shots: Sequence[Frame], disks: Sequence[Sequence[Outline]], matches: Sequence[Match]
+    ) -> list[_Look]:
+        """Return how the paint of a ball looks at each match."""
+        ball = self.balls[name]
+        where = [(k, n) for k, seen in enumerate(disks) for n in range(len(seen))]
+        proposed = ball.proposals([(k, shots[k].picture, disks[k][n]) for k, n in where])
+        each = dict(zip(where, proposed, strict=True))
+        return [_look([each[k, n] for k, n in enumerate(match.chosen) if n >= 0]) for match in matches]
+
+    def _costs(
+        self,
+        name: str,
+        shots: Sequence[Frame],
+        matches: Sequence[Match],
+        looks: Mapping[Kind, Sequence[_Look]],
+        ahead: Ahead | None,
+    ) -> Floats:
+        """Return the cost (N,) of each match for a ball: negative log-likelihood beside that of not seeing it."""
+        if not matches:
+            return np.zeros(0)
+        ball, look = self.balls[name], looks[self._kind[name]]
+        places = places_of(matches, self.cameras, 2 * ball.fitter.radius_mm)
+        X = places.position_lab_mm
+        cost = np.array([0.5 * match.chi2 - one.gain for match, one in zip(matches, look, strict=True)]) - NOT_SEEN
+        for k, (view, shot) in enumerate(zip(ball.fitter.views, shots, strict=True)):
+            if shot.usable:
+                missed = [match.chosen[k] < 0 for match in matches] & in_picture(view.camera, X).numpy()
+                cost += MISSED * missed
+            radius = torch.tensor(
+                [math.nan if (disk := match.disks[k]) is None else disk.radius_px for match in matches]
+            )
+            off = (radius / view.radius_px(X, ball.fitter.radius_mm) - 1) / SIZE_SIGMA
+            alone = (2 * radius / view.diameter_px - 1) / DEPTH_SIGMA
+            one = torch.tensor([match.number == 1 for match in matches])
+            cost += 0.5 * torch.where(one, alone, off).square().nan_to_num().numpy()
+        if ahead is not None:
+            R = torch.stack([one.R_lab_body[0] if len(one.R_lab_body) else ahead.R_lab_body for one in look])
+            cost += _surprise(ahead, X, places.covariance_mm2, R, ball.fitter.radius_mm)
+        return cost
+
+
+def in_picture(camera: Camera, position_lab_mm: Tensor) -> Tensor:
+    """Return whether the picture of a camera holds positions (..., 3), mm, (...) bool."""
+    place = camera.project(position_lab_mm)
+    return ((place >= 0) & (place <= place.new_tensor(camera.image_size) - 1)).all(-1)
+
+
+def _gain(score: Tensor) -> Tensor:
+    """Return by how much the log-likelihood of a paint exceeds that of an unknown one, for scores of pictures."""
+    return 0.5 * PATCHES * ((1 - NO_PAINT) / (1 - score.clamp(-1.0, 0.99))).log()
+
+
+def _look(proposed: Sequence[tuple[Tensor, Tensor]]) -> _Look:
+    """Return the look of the disks of a match, each with its proposals: rotations (M, 3, 3), scores (M,)."""
+    R = torch.cat([each for each, _ in proposed])
+    if not len(R):
+        return _Look(-math.inf, R)
+    total = torch.zeros(len(R), dtype=torch.float64)
+    for own, score in proposed:
+        if not len(own):
+            total -= ANOTHER
+            continue
+        alike = so3.geodesic_distance(R[:, None], own[None]) < ALIKE_RAD
+        best = torch.where(alike, _gain(score.double()), -torch.inf).amax(1)
+        total += torch.where(torch.isfinite(best), best, -ANOTHER)
+    order = total.argsort(descending=True, stable=True)
+    return _Look(float(total[order[0]]), R[order])
+
+
+def _explains(poses: Poses) -> bool:
+    """Return whether the paint of a ball explains the pictures in use better than an unknown one."""
+    return len(poses) > 0 and float(_gain(poses.score[0, poses.use]).sum()) > 0
+
+
+def _surprise(ahead: Ahead, X: Tensor, covariance_mm2: Tensor, R: Tensor, radius_mm: float) -> Floats:
+    """Return negative log-likelihoods (N,) of positions (N, 3) and rotations (N, 3, 3) after a prediction."""
+    away = torch.cat([so3.log(R @ ahead.R_lab_body.mT), X - ahead.position_lab_mm], dim=-1)
+    spread = ahead.covariance.expand(len(X), 6, 6).clone()
+    spread[:, :3, :3] += PROPOSED_RAD**2 * torch.eye(3)
+    spread[:, 3:, 3:] += covariance_mm2.nan_to_num() + (PLACED_SHARE * radius_mm) ** 2 * torch.eye(3)
+    chi2 = (away[:, None] @ torch.linalg.solve(spread, away[..., None]))[:, 0, 0]
+    return np.asarray(0.5 * FREEDOM * torch.log1p(chi2 / FREEDOM).numpy())
+
+
+def assigned(cost: Floats, matches: Sequence[Match]) -> list[tuple[int, int]]:
+    """Return pairs (ball, match) of the least sum of costs (n, N): each ball at most once, and each disk for at most
+    one ball. Pairs of cost 0 or more are left out.
+    """
+    ball, match = np.nonzero(cost < 0)
+    if not len(ball):
+        return []
+    disks = sorted({(k, disk) for one in matches for k, disk in enumerate(one.chosen) if disk >= 0})
+    rows = np.zeros((len(cost) + len(disks), len(ball)))
+    rows[ball, np.arange(len(ball))] = 1
+    for row, (k, disk) in enumerate(disks, len(cost)):
+        rows[row] = [matches[n].chosen[k] == disk for n in match.tolist()]
+    found = milp(
+        cost[ball, match],
+        integrality=np.ones(len(ball), np.int64),
+        bounds=Bounds(0, 1),
+        constraints=LinearConstraint(rows, ub=1),
+    )
+    assert found.x is not None  # leaving all out is a solution
+    return [(int(ball[n]), int(match[n])) for n in np.flatnonzero(found.x > 0.5)]
