@@ -54,14 +54,20 @@ def map_(
     no_cache: NoCache = False,
     quiet: Quiet = False,
 ) -> None:
-    """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""
+    """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed. Of several
+    balls each gets one, OUT_NAME.png.
+    """
     check_ending(out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
-    for path in _files_of(out):
-        check_writable(path)
+    from sphereorient.experiment import load_experiment
     from sphereorient.methods.map import learn_map
     from sphereorient.run.store import FolderStore, Request
     from sphereorient.sphere import load_texture
 
+    spheres = load_experiment(experiment).names
+    outs = {name: out.with_name(f"{out.stem}_{name}{out.suffix}") if name else out for name in spheres}
+    for one in outs.values():
+        for path in _files_of(one):
+            check_writable(path)
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
     chosen, begun = settings_of(settings, overrides, "map"), time.perf_counter()
     old = None if init is None else load_texture(init)
@@ -71,22 +77,36 @@ def map_(
     store = FolderStore(request.parts)
     with store.held(request, resume=resume), progress_bar(quiet, unit="iterations") as advance:
         kept = store.folder / "map.h5"
-        result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command)
-        advance("figure", 0, 1)
-        files = _write(result, old, out)
-        advance("figure", 1, 1)
+        found = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command)
+        results = found if isinstance(found, dict) else {"": found}
+        advance("figure", 0, len(results))
+        files = []
+        for done, (name, result) in enumerate(results.items(), start=1):
+            files += _write(result, old, outs[name])
+            advance("figure", done, len(results))
         store.remove()
     if quiet:
         return
-    echo_lines(f"note: {remark}" for remark in result.remarks)
+    echo_lines(f"note: {remark}" for remark in next(iter(results.values())).remarks)
+    for name, result in results.items():
+        _print_result(name, result, init)
+    typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
+    typer.echo("Wrote " + ", ".join(str(file) for file in files))
+    for name, result in results.items():
+        if result.experiment.texture_path != outs[name]:
+            place = f"the ball {name} under spheres:" if name else "sphere:"
+            typer.echo(
+                f"next: write texture: {outs[name].name} in {place} of the experiment, then `sphereorient track`"
+            )
+
+
+def _print_result(name: str, result: "MapResult", init: Path | None) -> None:
+    if name:
+        typer.echo(f"ball {name}")
     _print(result.learnt)
     if result.comparison is not None:
         _print_moved(result.comparison, f"against {init}")
         typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
-    typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
-    typer.echo("Wrote " + ", ".join(str(file) for file in files))
-    if result.experiment.texture_path != out:
-        typer.echo(f"next: write texture: {out.name} under sphere: in the experiment, then `sphereorient track`")
 
 
 def _files_of(out: Path) -> list[Path]:

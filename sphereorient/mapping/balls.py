@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ FREE = 1.1  # sums of two radii: disks that are nearer than this are not used
 AWAY = 0.1  # of the radius, for each frame since it was seen: how far a sphere may be from where it is expected
 SIZE_SIGMA = 0.08  # relative error of a disk's radius
 FARTHEST = 9.0  # chi2 at which a sphere is rather not seen than there
+NEVER = 1e6  # chi2 of what is not possible
 FORGOTTEN = 20  # frames after which motion is not known any more
 
 Floats = NDArray[np.float64]
@@ -71,9 +72,20 @@ def take_crops_of_all(
         ]
         instants.append(_instant(disks, crops, recording.cameras, 2 * min(radius_mm.values())))
         progress("balls", k + 1, 0)
-    chosen = _linked(instants, scenes, radius_mm, len(streams))
+    chosen = _linked(instants, scenes, radius_mm)
+    places = [_places(chosen[:, n], instants) for n in range(len(names))]
     return {
-        name: _crops_of(name, chosen[:, n], instants, recording, [scene[name] for scene in scenes], radius_mm[name])
+        name: _crops_of(
+            name,
+            chosen[:, n],
+            instants,
+            [
+                CameraView.of(stream.name, stream.camera, scene[name])
+                for stream, scene in zip(streams, scenes, strict=True)
+            ],
+            radius_mm,
+            [places[n], *(place for m, place in enumerate(places) if m != n)],
+        )
         for n, name in enumerate(names)
     }
 
@@ -94,12 +106,11 @@ def _linked(
     instants: Sequence[_Instant],
     scenes: Sequence[Mapping[str, CameraScene]],
     radius_mm: Mapping[str, float],
-    cameras: int,
 ) -> NDArray[np.int64]:
     """Return the match of each sphere in each frame, (N, K), by index; -1: none."""
     names = list(radius_mm)
     sizes = np.array([[scene[name].diameter_px / 2 for scene in scenes] for name in names])
-    begin = _first(instants, len(names), cameras)
+    begin = _first(instants, len(names))
     chosen = np.full((len(instants), len(names)), -1)
     for frames in (range(begin, len(instants)), range(begin, -1, -1)):
         past: list[list[tuple[int, Floats]]] = [[] for _ in names]
@@ -113,21 +124,26 @@ def _linked(
     return chosen
 
 
-def _first(instants: Sequence[_Instant], count: int, cameras: int) -> int:
-    """Return the frame in which as many spheres as are named are seen by all cameras, and in which the fewest other
+def _first(instants: Sequence[_Instant], count: int) -> int:
+    """Return the frame in which as many spheres as are named are seen by most cameras, and in which the fewest other
     matches are possible.
     """
-    rest = []
-    for at in instants:
-        whole = [one for one in at.matches if one.number == cameras]
+    best, ranks = -1, [(0, 0)]
+    for k, at in enumerate(instants):
         apart: list[Match] = []
-        for one in whole:
+        for one in at.matches:  # those of most cameras come first
             if not any(one.shares(other) for other in apart):
                 apart.append(one)
-        rest.append(len(whole) - count if len(apart) == count else len(instants) * count)
-    best = int(np.argmin(rest))
-    if not instants or rest[best] == len(instants) * count:
-        do = "name as many spheres as the movies show, or learn each map from a movie of one ball"
+        if len(apart) < count:
+            continue
+        least = apart[count - 1].number
+        others = sum(one.number >= least for one in at.matches) - count
+        rank = sum(one.number for one in apart[:count]), -others
+        if best < 0 or rank > max(ranks):
+            best = k
+        ranks.append(rank)
+    if best < 0:
+        do = "name as many balls as the movies show, or learn each map from a movie of one ball"
         raise PaintError(refusal("movies", expected=f"{count} balls in a frame", got="none that shows them", do=do))
     return best
 
@@ -153,68 +169,75 @@ def _misfit(
         sigma = AWAY * radius_mm[n] * gap * (1 if len(seen) > 1 else 3)
         cost[n] += np.square((at.position_lab_mm - X) / sigma).sum(1)
     # Of two matches of one sphere the one of more cameras counts.
-    cost += np.array([len(one.chosen) - one.number for one in at.matches])
+    cost += np.array([len(one.chosen) - one.number + one.chi2 / max(2 * one.number - 3, 1) for one in at.matches])
     return cost
 
 
 def _assigned(cost: Floats, matches: Sequence[Match]) -> NDArray[np.int64]:
     """Return the match (K,) of each sphere, -1: none, of least chi2 together; no disk is in two of them."""
-    allowed = np.ones(cost.shape, bool)
     unseen = np.full((len(cost), len(cost)), FARTHEST)
-    while True:
-        rows, columns = linear_sum_assignment(np.hstack([np.where(allowed, cost, 1e6), unseen]))
-        found = np.full(len(cost), -1)
-        found[rows] = np.where(columns < cost.shape[1], columns, -1)
-        shared = [
-            (n, m)
-            for n in range(len(found))
-            for m in range(n)
-            if found[n] >= 0 and found[m] >= 0 and matches[found[n]].shares(matches[found[m]])
-        ]
-        if not shared:
-            return found
-        for n, m in shared:  # the one that fits worse looks for another one
-            worse = n if cost[n, found[n]] > cost[m, found[m]] else m
-            allowed[worse, found[worse]] = False
+
+    def solved(allowed: NDArray[np.bool_], most: float) -> tuple[float, NDArray[np.int64]]:
+        rows, columns = linear_sum_assignment(np.hstack([np.where(allowed, cost, NEVER), unseen]))
+        found = np.where(columns < cost.shape[1], columns, -1)[np.argsort(rows)]
+        whole = float(sum(cost[n, m] if m >= 0 else FARTHEST for n, m in enumerate(found.tolist())))
+        if whole >= most:
+            return np.inf, found
+        for n, m in combinations(np.flatnonzero(found >= 0).tolist(), 2):
+            if matches[found[n]].shares(matches[found[m]]):
+                best = np.inf, found
+                for k in (n, m):  # one of them has another match
+                    rest = allowed.copy()
+                    rest[k, found[k]] = False
+                    best = min(best, solved(rest, min(most, best[0])), key=lambda one: one[0])
+                return best
+        return whole, found
+
+    return solved(np.ones(cost.shape, bool), np.inf)[1]
+
+
+def _places(chosen: NDArray[np.int64], instants: Sequence[_Instant]) -> Floats:
+    """Return where a sphere is in each frame, (N, 3), mm; between frames in which it is seen on a straight line."""
+    seen = np.flatnonzero(chosen >= 0)
+    X = np.array([instants[k].position_lab_mm[chosen[k]] for k in seen.tolist()]).reshape(-1, 3)
+    every = np.arange(len(instants))
+    return np.stack([np.interp(every, seen, X[:, axis]) if len(seen) else every * np.nan for axis in range(3)], axis=1)
 
 
 def _crops_of(
     name: str,
     chosen: NDArray[np.int64],
     instants: Sequence[_Instant],
-    recording: Recording,
-    scenes: Sequence[CameraScene],
-    radius_mm: float,
+    views: Sequence[CameraView],
+    radius_mm: Mapping[str, float],
+    places: Sequence[Floats],
 ) -> Crops:
-    count, cameras = len(instants), len(recording.streams)
-    crops: list[list[Crop | None]] = [[None] * count for _ in range(cameras)]
+    """Return the crops of a sphere; `places` (N, 3), mm, are its own and those of the others."""
+    count = len(instants)
+    crops: list[list[Crop | None]] = [[None] * count for _ in views]
     X = torch.full((count, 3), torch.nan, dtype=torch.float64)
-    seen = torch.zeros(count, cameras, dtype=torch.bool)
-    views = [
-        CameraView.of(stream.name, stream.camera, scene)
-        for stream, scene in zip(recording.streams, scenes, strict=True)
-    ]
+    seen = torch.zeros(count, len(views), dtype=torch.bool)
+    radii = [radius_mm[name], *(radius for other, radius in radius_mm.items() if other != name)]
+    free = torch.stack([_free(view, [torch.from_numpy(place) for place in places], radii) for view in views], dim=1)
     for k, match in enumerate(chosen.tolist()):
         if match < 0:
             continue
         at = instants[k]
         X[k] = torch.from_numpy(at.position_lab_mm[match])
         for c, disk in enumerate(at.matches[match].chosen):
-            if disk >= 0 and _free(disk, at.disks[c], views[c]):
+            if disk >= 0 and free[k, c]:
                 crops[c][k], seen[k, c] = at.crops[c][disk], True
     if not bool(seen.any()):
         do = "learn its map from a movie of this ball alone"
         raise PaintError(refusal(f"ball {name}", expected="frames in which nothing touches it", got="none", do=do))
-    return Crops(views=views, crops=crops, position_lab_mm=X, seen=seen, radius_mm=radius_mm, fixed=False)
+    return Crops(views=views, crops=crops, position_lab_mm=X, seen=seen, radius_mm=radii[0], fixed=False)
 
 
-def _free(disk: int, disks: Sequence[Outline], view: CameraView) -> bool:
-    """Return whether a disk lies in the picture as a whole, and no other one touches it."""
-    one = disks[disk]
-    others = [other for k, other in enumerate(disks) if k != disk]
-    near = [
-        np.hypot(one.u_px - other.u_px, one.v_px - other.v_px) / (one.radius_px + other.radius_px) for other in others
-    ]
-    middle = torch.tensor([one.u_px, one.v_px])
-    whole: Tensor = view.shows_whole(middle, torch.tensor(one.radius_px))
-    return bool(whole) and min(near, default=np.inf) > FREE
+def _free(view: CameraView, places: Sequence[Tensor], radii_mm: Sequence[float]) -> Tensor:
+    """Return in which frames the disk of the first sphere lies in the picture as a whole, and no other touches it."""
+    middle = [view.camera.project(place) for place in places]
+    radius = [view.radius_px(place, size) for place, size in zip(places, radii_mm, strict=True)]
+    free: Tensor = view.shows_whole(middle[0], radius[0])
+    for other, size in zip(middle[1:], radius[1:], strict=True):
+        free = free & ((middle[0] - other).norm(dim=-1) > FREE * (radius[0] + size))
+    return free
