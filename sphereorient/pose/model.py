@@ -287,13 +287,15 @@ class FromLimb:
     edge: Tensor  # (L, P), how far within the limb, standard deviations of the aperture
 
 
-def from_limb(pixels: Sights, position_lab_mm: Tensor, radius_mm: float, blur_px: float) -> FromLimb:
-    """Return where the pixels' lines of sight pass spheres at position_lab_mm (L, 3) through a Gaussian aperture."""
+def from_limb(pixels: Sights, position_lab_mm: Tensor, radius_mm: float | Tensor, blur_px: float) -> FromLimb:
+    """Return where the pixels' lines of sight pass spheres at position_lab_mm (L, 3), of one radius or of their own
+    (L, 1), through a Gaussian aperture; one disk's lines of sight may stand for all.
+    """
     d = pixels.direction
     # In double precision, once: half a metre less half a metre.
     to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
     aside = nearest_approach(to_centre, d, 1)
-    nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
+    nearest = torch.maximum((aside * aside).sum(1).sqrt(), torch.as_tensor(1e-6 * radius_mm))
     outward = aside / nearest[:, None]
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
