@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sphereorient.run.stages import track_movies
     from sphereorient.search import TemplateBank
     from sphereorient.sphere import SphereRenderer, load_texture
-    from sphereorient.trajectory import Trajectory
+    from sphereorient.trajectory import Tracks, Trajectory
 
 __version__ = "0.1.0"
 # Public name -> module, and its name there; a room itself has none.
@@ -25,6 +25,7 @@ _HOMES = {
     "Settings": ("methods.settings", "Settings"),
     "SphereRenderer": ("sphere", "SphereRenderer"),
     "TemplateBank": ("search", "TemplateBank"),
+    "Tracks": ("trajectory", "Tracks"),
     "Trajectory": ("trajectory", "Trajectory"),
     "calibrate": ("calibration", "calibrate_cameras"),
     "cameras": ("cameras", ""),
@@ -45,6 +46,7 @@ __all__ = [
     "Settings",
     "SphereRenderer",
     "TemplateBank",
+    "Tracks",
     "Trajectory",
     "calibrate",
     "cameras",

@@ -20,6 +20,7 @@ NAMES = [
     "load_settings",
     "load_texture",
     "Experiment",
+    "Tracks",
     "Trajectory",
     "Settings",
     "so3",

@@ -83,7 +83,7 @@ def check_cameras_command(
     from sphereorient.calibration.table import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
     from sphereorient.run.stages import track_movies
-    from sphereorient.trajectory import Trajectory
+    from sphereorient.trajectory import Trajectory, one_track
 
     known = load_experiment(experiment)
     if len(known.cameras) < 2:
@@ -93,7 +93,7 @@ def check_cameras_command(
         result = Trajectory.load(track)
     else:
         with progress_bar(quiet) as advance:
-            result = track_movies(known, progress=advance)
+            result = one_track(track_movies(known, progress=advance))
     lines = check_lines(check_cameras(known.cameras, result)) or ["no frame in which two cameras see the sphere"]
     echo_lines([*lines, *contradiction_lines(result)])
 

@@ -9,9 +9,11 @@ import typer
 
 if TYPE_CHECKING:
     from sphereorient.methods.settings import Settings
+    from sphereorient.trajectory import Tracks
 
 ExperimentPath = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
 TrackPath = Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
+SphereName = Annotated[str | None, typer.Option("--sphere", help="Of several balls, only this one.")]
 Cameras = Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
 SettingsPath = Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")]
 Overrides = Annotated[
@@ -46,6 +48,13 @@ def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> 
     for remark in loaded.remarks:
         typer.echo(f"note: {remark}", err=True)
     return loaded.settings
+
+
+def tracks_in(path: Path, sphere: str | None) -> "Tracks":
+    """Read the tracks of a file, or that of one sphere."""
+    from sphereorient.trajectory import Tracks
+
+    return Tracks.load(path).picked(sphere)
 
 
 def names_in(text: str) -> list[str]:

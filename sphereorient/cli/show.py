@@ -1,16 +1,27 @@
 """`sphereorient report`, `overlay`, `export` and `view`: what a track is looked at with."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
-from sphereorient.cli.options import ExperimentPath, Quiet, SettingsPath, TrackPath, cameras_of, frames_of, settings_of
+from sphereorient.cli.options import (
+    ExperimentPath,
+    Quiet,
+    SettingsPath,
+    SphereName,
+    TrackPath,
+    cameras_of,
+    frames_of,
+    settings_of,
+    tracks_in,
+)
 from sphereorient.errors import OutputError, SettingsError, TrackError, refusal
 
 if TYPE_CHECKING:
-    from sphereorient.trajectory import Trajectory
+    from sphereorient.trajectory import Tracks, Trajectory
 
 
 @app.command()
@@ -25,6 +36,7 @@ def report(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set statistics.min_frames=30.")
     ] = None,
+    sphere: SphereName = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, only warnings.")] = False,
 ) -> None:
     """Write statistics of tracks with error bars, figures, and a page with the findings."""
@@ -34,7 +46,7 @@ def report(
 
     chosen = settings_of(settings, set_, "report").statistics
     known = [load_experiment(path) for path in experiment or ()]
-    loaded, command = _load(tracks), command_line()
+    loaded, command = _load(tracks, sphere), command_line()
     with progress_bar(quiet, unit="") as advance:
         words = write_report(loaded, out, experiments=known, settings=chosen, progress=advance, command=command)
     for verdict in words:
@@ -45,10 +57,8 @@ def report(
         typer.echo(f"Wrote {out / 'index.html'}")
 
 
-def _load(paths: list[Path]) -> "dict[str, Trajectory]":
-    """Read the tracks; the name of each is the shortest unique end of its path."""
-    from sphereorient.trajectory import Trajectory
-
+def _load(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
+    """Read the tracks; the name of each is the shortest unique end of its path, and the name of its sphere."""
     whole = [path.resolve() for path in paths]
     for path in whole:
         if whole.count(path) > 1:
@@ -60,7 +70,11 @@ def _load(paths: list[Path]) -> "dict[str, Trajectory]":
         unique = (size for size in sizes if [one.parts[-size:] for one in whole].count(path.parts[-size:]) == 1)
         return "/".join(path.parts[-next(unique) :])
 
-    return {name(path): Trajectory.load(path) for path in whole}
+    return {
+        f"{name(path)}:{ball}" if ball else name(path): track
+        for path in whole
+        for ball, track in tracks_in(path, sphere).items()
+    }
 
 
 @app.command()
@@ -76,15 +90,15 @@ def overlay(
         Path | None, typer.Option(help="Contact sheet to write of the worst frames, with the reasons (.png, .pdf).")
     ] = None,
     count: Annotated[int, typer.Option(min=1, max=120, help="Frames on that sheet.")] = 24,
+    sphere: SphereName = None,
     quiet: Quiet = False,
 ) -> None:
     """Draw a track on its movies: outline, body axes, re-rendered sphere, residual; and a sheet of the worst frames."""
     if out is None and worst is None:
         do = "add --out overlay.mp4 or --worst sheet.png"
         raise OutputError(refusal("overlay", expected="something to write", got="neither --out nor --worst", do=do))
-    for path in (out, worst):
-        if path is not None:
-            check_writable(path)
+    if out is not None:
+        check_writable(out)
     first, last = frames_of(frames) or (0, 0)
     if first is not None and last is not None and first >= last:
         do = "write e.g. --frames 100:200"
@@ -92,20 +106,32 @@ def overlay(
     from sphereorient.experiment import load_experiment
     from sphereorient.report.gallery import worst_frames
     from sphereorient.report.overlay import FrameSelection, overlay_movie
-    from sphereorient.trajectory import Trajectory
 
-    loaded, seen = load_experiment(experiment), Trajectory.load(track)
-    names = cameras_of(cameras)
+    loaded, seen = load_experiment(experiment), tracks_in(track, sphere)
+    names, sheets = cameras_of(cameras), {} if worst is None else _paths(worst, seen)
+    bad = {}
     with progress_bar(quiet) as advance:
         if out is not None:
             chosen = FrameSelection(cameras=names, first=first, last=last, every=every)
             shown = overlay_movie(seen, loaded, out, chosen, fps, lambda *at: advance("overlay", *at))
-        if worst is not None:
-            bad = worst_frames(seen, loaded, worst, count, cameras=names, progress=lambda *at: advance("worst", *at))
+        for ball, sheet in sheets.items():
+            told = partial(advance, f"worst {ball}".strip())
+            bad[sheet] = len(worst_frames(seen[ball], loaded, sheet, count, cameras=names, progress=told))
     if not quiet and out is not None:
         typer.echo(f"Wrote {out}: {shown} frames")
-    if not quiet and worst is not None:
-        typer.echo(f"Wrote {worst}: {len(bad)} frames" + ("" if bad else "; none is bad"))
+    for sheet, frames_shown in bad.items() if not quiet else ():
+        typer.echo(f"Wrote {sheet}: {frames_shown} frames" + ("" if frames_shown else "; none is bad"))
+
+
+def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
+    """Return the file of each sphere by name, checked: `out` of the only one without name, else out_NAME."""
+    from sphereorient.report.columns import plain_names
+
+    plain = plain_names(tracks, "ball")
+    paths = {name: out.with_name(f"{out.stem}_{plain[name]}{out.suffix}") if name else out for name in tracks}
+    for path in paths.values():
+        check_writable(path)
+    return paths
 
 
 @app.command()
@@ -122,24 +148,28 @@ def export(
     experiment: Annotated[
         Path | None, typer.Option(help="experiment.yaml of the track: FicTrac's table needs the camera.")
     ] = None,
+    sphere: SphereName = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a track for other programs: tables, MATLAB, FicTrac's table, poses (TUM), ParaView, NWB, netCDF."""
+    """Write a track for other programs: tables, MATLAB, FicTrac's table, poses (TUM), ParaView, NWB, netCDF.
+    Of several balls, write a file each, with the ball's name at the end of its own.
+    """
     from sphereorient.report.export import export_track, format_of
-    from sphereorient.trajectory import Trajectory
 
     to = format_of(out, to)
-    check_writable(out)
-    loaded = Trajectory.load(track)
+    loaded = tracks_in(track, sphere)
+    paths = _paths(out, loaded)
     camera = None
     if experiment is not None:
         from sphereorient.experiment import load_experiment
 
         camera = next(iter(load_experiment(experiment).cameras.values()))
     with progress_bar(quiet) as advance:
-        export_track(loaded, out, to, lambda *at: advance("export", *at), camera)
-    if not quiet:
-        typer.echo(f"Wrote {out}: {len(loaded)} frames")
+        for ball, path in paths.items():
+            told = partial(advance, f"export {ball}".strip())
+            export_track(loaded[ball], path, to, told, camera)
+    for ball, path in paths.items() if not quiet else ():
+        typer.echo(f"Wrote {path}: {len(loaded[ball])} frames")
 
 
 @app.command()
@@ -151,6 +181,7 @@ def view(
     save: Annotated[Path | None, typer.Option(help="Write this .rrd instead of opening a window.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Include the pictures of one of so many frames.")] = 1,
     pictures: Annotated[bool, typer.Option(help="Include the pictures of the movies.")] = True,
+    sphere: SphereName = None,
     quiet: Quiet = False,
 ) -> None:
     """Show a track in space and time with Rerun: cameras, pictures, the sphere, its motion, its warnings."""
@@ -158,9 +189,8 @@ def view(
         check_writable(save)
     from sphereorient.experiment import load_experiment
     from sphereorient.report.recording import view_track
-    from sphereorient.trajectory import Trajectory
 
-    measured = Trajectory.load(track)
+    measured = tracks_in(track, sphere)
     seen = None if experiment is None else load_experiment(experiment)
     with progress_bar(quiet) as advance:
         view_track(
@@ -172,4 +202,5 @@ def view(
             progress=lambda *at: advance("pictures", *at),
         )
     if not quiet and save is not None:
-        typer.echo(f"Wrote {save}: {len(measured)} frames; look at it with `rerun {save}`")
+        frames = len(next(iter(measured.values())))
+        typer.echo(f"Wrote {save}: {frames} frames; look at it with `rerun {save}`")

@@ -69,6 +69,7 @@ def track(
     from sphereorient.run import FolderStore, Request, run
     from sphereorient.run.many import tracks_of
     from sphereorient.run.stages import with_proposer
+    from sphereorient.trajectory import Trajectory
 
     overrides = [*(set_ or ()), *(["refine.learn_paint=false"] if no_learn_paint else ())]
     chosen = with_proposer(settings_of(settings, overrides, method), proposer)
@@ -93,7 +94,9 @@ def track(
     with _kept(requests), progress_bar(quiet) as advance:
         result = run(requests[0], FolderStore(requests[0].parts), resume=resume, progress=advance)
     if not quiet:
-        _print_summary(result, out)
+        for name, track in ({"": result} if isinstance(result, Trajectory) else result).items():
+            _print_summary(track, name)
+        typer.echo(f"Wrote {out}")
 
 
 @contextmanager
@@ -143,14 +146,15 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
     print_table(table)
 
 
-def _print_summary(result: "Trajectory", out: Path) -> None:
+def _print_summary(result: "Trajectory", name: str) -> None:
     """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
     from sphereorient.calibration.table import contradiction_lines
 
     summary = result.summary()
     echo_lines(f"note: {remark}" for remark in result.provenance.get("remarks", []))
-    typer.echo(f"{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
+    ball = f"ball {name}: " if name else ""
+    typer.echo(f"{ball}{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")
-    echo_lines([*contradiction_lines(result), f"Wrote {out}"])
+    echo_lines(contradiction_lines(result))

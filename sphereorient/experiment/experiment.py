@@ -63,10 +63,15 @@ class Experiment:
         return tuple(sphere.name for sphere in self.spheres)
 
     def of(self, name: str) -> "Experiment":
-        """Return the experiment of one sphere alone, as if the file had it under `sphere:`; else ExperimentError."""
+        """Return the experiment of one sphere alone; ExperimentError if it has none of this name."""
+        if name == "":
+            return replace(self, spheres=(self.sphere,))
+        if self.names == ("",):
+            got, do = "one without name", "name the experiment of the track"
+            raise ExperimentError(refusal(f"{self.path}, spheres", expected=f"a ball {name}", got=got, do=do))
         if name not in self.names:
             raise ExperimentError(refuse_unknown(name, self.names, f"{self.path}, spheres"))
-        return replace(self, spheres=(replace(self.spheres[self.names.index(name)], name=""),))
+        return replace(self, spheres=(self.spheres[self.names.index(name)],))
 
     def with_sphere(self, **changes: Any) -> "Experiment":
         """Return the experiment with other fields of its only sphere; ExperimentError if it has several."""
@@ -76,7 +81,8 @@ class Experiment:
     def sphere(self) -> Sphere:
         """The only sphere; ExperimentError if there are several."""
         if len(self.spheres) > 1:
-            got, do = ", ".join(self.names), "pick one: --sphere NAME, or experiment.of(NAME) in Python"
+            do = "name a file with one of them under `sphere`, or take experiment.of(NAME) in Python"
+            got = ", ".join(self.names)
             raise ExperimentError(refusal(f"{self.path}, spheres", expected="one ball", got=got, do=do))
         return self.spheres[0]
 

@@ -42,7 +42,8 @@ class Recording:
 
     def of(self, name: str) -> "Recording":
         """Return the recording of one sphere alone, with the same movies; ExperimentError for an unknown name."""
-        return replace(self, experiment=self.experiment.of(name), maps={"": self.maps[name]})
+        alone = self.experiment.of(name)
+        return replace(self, experiment=alone, maps={alone.sphere.name: self.maps[alone.sphere.name]})
 
     @property
     def texture(self) -> Tensor:

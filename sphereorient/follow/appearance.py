@@ -32,6 +32,7 @@ from sphereorient.pose.fitter import (
     widest_px,
 )
 from sphereorient.pose.lasting import Lasting, lasting_errors
+from sphereorient.pose.neighbours import Neighbours
 from sphereorient.pose.occluders import USUALLY_HIDDEN
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.worn import CHANGED, without, worn_cells, worn_share
@@ -120,16 +121,26 @@ class Following:
     open_share: Tensor  # (n,), exposure over the time from each studied frame to that beside it; negative: it is before
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Among:
+    """Poses of n frames, found beforehand, of balls that others are beside; the same frame may stand for two balls."""
+
+    found: Sequence[Poses]
+    neighbours: Neighbours  # of the n poses
+
+
 def estimate_appearance(
     first: Initialiser,
     frames: Sequence[Sequence[Frame]],
     base: TextureTable,
     settings: RefineSettings,
     following: Following | None = None,
+    among: Among | None = None,
 ) -> Appearance:
     """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
     `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
-    the motion while the shutter is open counts as blur.
+    the motion while the shutter is open counts as blur. `among`: of several balls, with poses that are known; then
+    cameras that see another ball do not disagree, and one light in the lab counts where it explains about as much.
 
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
@@ -139,12 +150,15 @@ def estimate_appearance(
     if defocus_radii(fitter.optics.blur_px, diameter_px):
         first = replace(first, score_min=ALWAYS)
 
-    found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
     pictures = [[shot.picture for shot in frame] for frame in frames]
+    if among is None:
+        found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
+    else:
+        found = list(among.found)
     if not _clear(found):
         raise _nothing(found)
-    gain, gap_px = _apart(fitter, pictures, found)
-    looked = found
+    gain, gap_px = _apart(fitter, pictures, found) if among is None else (1.0, 0.0)
+    looked, others = found, None
     if gain > APART_GAIN or gap_px > APART_PX:
         # A pose between those of disagreeing cameras would give a wrong light.
         alone = [replace(first, fitter=fitter.of(k)) for k in range(len(fitter.views))]
@@ -158,7 +172,8 @@ def estimate_appearance(
     else:
         X, R, use = best_poses([found[k] for k in _clear(found)])
         shown = [pictures[k] for k in _clear(found)]
-    whole = fitter.pixels(shown, X, fitter.optics.fine)
+        others = None if among is None else among.neighbours.of(_clear(found))
+    whole = fitter.pixels(shown, X, fitter.optics.fine, neighbours=others)
     thin = max(1, round(whole.grey.shape[1] / ENOUGH))
     pixels = whole.thinned(thin)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
@@ -169,7 +184,7 @@ def estimate_appearance(
         matched = replace(first, fitter=replace(first.fitter, optics=Optics(base, blur_px, diameter_px)))
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
             settings = settings.model_copy(update={"blur_px": blur_px})
-            return estimate_appearance(matched, frames, base, settings, following)
+            return estimate_appearance(matched, frames, base, settings, following, among)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, highest = _scores(looked)
     if best < highest + NO_BETTER and _times_better(looked) < TELLING:
@@ -184,7 +199,7 @@ def estimate_appearance(
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
     blurred, moved, sharper = fitter.optics, None, False
     if following is not None and looked is found:
-        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following)
+        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following, others)
     if moved is not None:
         smeared, known = open_.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         open_, there = _light_and_blur(open_, paint, smeared, fit, known, given=False)
@@ -193,7 +208,7 @@ def estimate_appearance(
             fitter, fit, pixels, use = open_, there, smeared, known
         else:  # sharper than the exposure allows: it is not that of these pictures
             moved, sharper = None, more > MORE_LEFT
-    fitter, fit, rivals = fitter.lit_in_the_lab(pixels, fit, use)
+    fitter, fit, rivals = fitter.lit_in_the_lab(pixels, fit, use, preferred=among is not None)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
     hidden = 1.0 - free.inside.sum(-1) / pixels.inside.sum(-1).clamp_min(1)
@@ -216,7 +231,7 @@ def estimate_appearance(
         score_min = min(score_min, _clear_of(right))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine))
-    claimed = sum(count > 1 for count in side_by_side(first.claimants, frames))
+    claimed = 0 if among is not None else sum(count > 1 for count in side_by_side(first.claimants, frames))
     return Appearance(
         fitter=fitter,
         still=still,
@@ -359,11 +374,17 @@ def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
 
 
 def _exposed(
-    search: Initialiser, paint: TextureTable, fit: FittedPoses, use: Tensor, rows: Sequence[int], following: Following
+    search: Initialiser,
+    paint: TextureTable,
+    fit: FittedPoses,
+    use: Tensor,
+    rows: Sequence[int],
+    following: Following,
+    others: Neighbours | None,
 ) -> tuple[Fitter, Tensor | None]:
     """Return a fitter that renders as many instants of the exposure as B poses need, with the blur that is left of the
     `paint`, and their turn and move (B, 6) while the shutter is open, NaN where it is not known; None, and the same
-    fitter, where it hardly blurs the pictures.
+    fitter, where it hardly blurs the pictures. `others`: of the B poses, about where they are in the frames beside.
     """
     fitter = search.fitter
 
@@ -376,7 +397,8 @@ def _exposed(
         def from_poses(these: Tensor, X: Tensor, R: Tensor) -> Tensor:
             pictures = [[shot.picture for shot in shots[k]] for k in these.tolist()]
             known, shown, was = seen[these], usable[these], before.of(these)
-            there = fitter.fit_through(fitter.optics.steps, pictures, X, R, known & shown)
+            beside = None if others is None else others.of(some[these])
+            there = fitter.fit_through(fitter.optics.steps, pictures, X, R, known & shown, neighbours=beside)
             right = ((1 - there.score <= CLEAR * (1 - was.score)) | ~known).all(1) & (shown | ~known).all(1)
             turn = so3.log(there.R_lab_body @ was.R_lab_body.mT)
             way = torch.cat([turn, there.position_lab_mm - was.position_lab_mm], dim=-1)
@@ -384,7 +406,7 @@ def _exposed(
 
         way = from_poses(torch.arange(len(some)), before.position_lab_mm, before.R_lab_body)
         # Of a ball that turns far between frames the next pose has to be searched for.
-        lost = [k for k in torch.nonzero(way.isnan().any(1))[:, 0].tolist() if bool(usable[k].all())]
+        lost = [k for k in torch.nonzero(way.isnan().any(1))[:, 0].tolist() if others is None and bool(usable[k].all())]
         found = dict(zip(lost, search.all_poses([shots[k] for k in lost]), strict=True))
         again = torch.tensor([k for k in lost if len(found[k])], dtype=torch.int64)
         if len(again):

@@ -1,6 +1,6 @@
 """Tracking batch by batch, while the frames of the next batch are decoded; all cameras together, or each alone."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import accumulate, islice, pairwise
@@ -14,6 +14,7 @@ from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import OWN, ChunkTracker
 from sphereorient.locate import Frame, screened_frames
@@ -79,8 +80,14 @@ class Follower:
     """What single frames are measured with; made by a method, read by `run`."""
 
     recording: Recording
-    appearance: Appearance
-    tracker: ChunkTracker | PerCameraTracker
+    appearances: Mapping[str, Appearance]  # of each ball, by name
+    tracker: ChunkTracker | PerCameraTracker | SceneTracker
+
+    @property
+    def appearance(self) -> Appearance:
+        """That of an only ball."""
+        (only,) = self.appearances.values()
+        return only
 
     @property
     def batches(self) -> list[Batch]:
@@ -92,19 +99,20 @@ class Follower:
             for end, batch in zip(ends, lengths, strict=True)
         ]
 
-    def follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, list[Poses]]]:
-        """Yield the poses of each frame, batch by batch; consecutive batches are decoded ahead."""
+    def follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, dict[str, list[Poses]]]]:
+        """Yield the poses of each ball in each frame, batch by batch; consecutive batches are decoded ahead."""
         breaks = [k for k in range(1, len(batches)) if batches[k - 1].last != batches[k].first]
         for first, last in pairwise([0, *breaks, len(batches)] if batches else []):
             yield from self._follow(batches[first:last])
 
-    def _follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, list[Poses]]]:
+    def _follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, dict[str, list[Poses]]]]:
         streams, time_s = self.recording.streams, self.recording.timeline.time_s
         first, last = batches[0].first, batches[-1].last
+        views = next(iter(self.appearances.values())).fitter.views
         with ThreadPoolExecutor(DECODING) as parts, ThreadPoolExecutor(len(streams)) as pool:
             movies = [
                 screened_frames(stream, view.background, first, last, parts)
-                for stream, view in zip(streams, self.appearance.fitter.views, strict=True)
+                for stream, view in zip(streams, views, strict=True)
             ]
 
             def read_on(movie: Iterator[Frame], batch: Batch) -> list[Frame]:
@@ -121,7 +129,12 @@ class Follower:
                 read = [movie.result() for movie in coming]
                 coming = ahead(batches[k + 1]) if k + 1 < len(batches) else []
                 times = time_s[batch.first : batch.last].tolist()
-                yield batch, list(self.tracker.track(read, batch.lengths, times))
+                if isinstance(self.tracker, SceneTracker):
+                    scenes = list(self.tracker.track(read, batch.lengths, times))
+                    yield batch, {name: [scene[name] for scene in scenes] for name in self.appearances}
+                else:
+                    (only,) = self.appearances
+                    yield batch, {only: list(self.tracker.track(read, batch.lengths, times))}
 
 
 def sample_frames(

@@ -2,9 +2,9 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, combinations, pairwise
 
 import numpy as np
@@ -22,7 +22,9 @@ from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown, Steps
-from sphereorient.pose.settle import settled
+from sphereorient.pose.neighbours import Neighbours, joined, visible_shares
+from sphereorient.pose.pixels import thinned_stencil
+from sphereorient.pose.settle import FIRST_EVERY, settled
 from sphereorient.pose.start import NearStart
 from sphereorient.trajectory import Reason
 
@@ -32,6 +34,9 @@ ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 LONG_STEP = 3.0  # times the step before: a longer one changes the motion
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
+LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
+HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk that others hide
+SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
@@ -50,6 +55,7 @@ class _Expected:
     rough: bool  # from one predecessor alone: the motion is unknown
     moved: Floats  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
     open_share: float  # of the time from the frame before to this one, in which the shutter is open
+    among: Neighbours | None = None  # of this one pose; None: no other sphere is in view
 
 
 @dataclass(eq=False)
@@ -158,12 +164,12 @@ class ChunkTracker:
             now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
             frames = {chunk.first: [movie[chunk.first + k] for movie in shots] for chunk in now}
             here = list(self._step(now, k, frames))
-            for chunk, poses, turn in zip(now, here, self._turns(now, here), strict=True):
+            for chunk, poses, turn in zip(now, here, self.turns(now, here), strict=True):
                 chunk.saw(chunk.first + k, poses, turn)
                 found[chunk.first + k] = poses
         yield from (found[k] for k in range(sum(batch)))
 
-    def _turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Floats:
+    def turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Floats:
         """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
         turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
         for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
@@ -189,17 +195,17 @@ class ChunkTracker:
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {chunk.first: self._ahead(chunk, chunk.first + k) for chunk in chunks}
+        expected = {chunk.first: self.ahead(chunk, chunk.first + k) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
-        followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
+        followed = dict(zip(ahead, self.follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         if lost := [chunk.first for chunk in chunks if followed.get(chunk.first) is None]:
             followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
         for chunk in chunks:
             poses = followed[chunk.first]
             assert poses is not None  # a search returns one that may be empty
-            yield self._stated(poses)
+            yield self.stated(poses)
 
-    def _ahead(self, chunk: _Chunk, frame: int) -> _Expected | None:
+    def ahead(self, chunk: _Chunk, frame: int) -> _Expected | None:
         """Return what the frames before say of a frame of a chunk."""
         pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
         if pose is None or self.centre is None:
@@ -207,11 +213,11 @@ class ChunkTracker:
         place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
         return replace(pose, position_lab_mm=place, place_spread=spread)
 
-    def _stated(self, poses: Poses) -> Poses:
+    def stated(self, poses: Poses) -> Poses:
         """Return poses with the errors of a fixed centre."""
         return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
-    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
+    def follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
@@ -225,25 +231,30 @@ class ChunkTracker:
             for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
         )
         R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
-        use = known & usable
+        use, among = known & usable, joined([one.among for one in expected])
         if any(one.rough for one in expected):
             was = X, R
-            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
+            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]), among)
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         disks_px = self._disks_px(X)
-        fit = self._fitted(frames, X, R, use, precision, moved, disks_px)
-        good = self._supported(fit, use)
+        visible = None if among is None else self._visible(X, disks_px, among)
+        sees = torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE
+        usable, use = usable & sees, use & sees
+        start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
+        fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
+        fit = fitted(X, R, use, disks_px)
+        good = supported(fit, use)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.
-            usable = torch.stack(
+            usable = sees & torch.stack(
                 [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
             )
             changed = (use != (known & usable)).any(1)
             if bool(changed.any()):
                 use = known & usable
-                fit = self._fitted(frames, X, R, use, precision, moved, disks_px).where(changed, fit)
-                good = torch.where(changed, self._supported(fit, use), good)
+                fit = fitted(X, R, use, disks_px).where(changed, fit)
+                good = torch.where(changed, supported(fit, use), good)
         first = good
         within = disks_px[1] <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
@@ -253,14 +264,14 @@ class ChunkTracker:
                 break
             # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
             # one size, which disagree, the one nearer to the prediction counts.
-            fits = [self._fitted(frames, X, R, _only(usable, one), precision, moved, disks_px) for one in some]
-            supported = [
-                self._supported(fit_, _only(usable, one)) & usable[:, one].all(1)
+            fits = [fitted(X, R, _only(usable, one), disks_px) for one in some]
+            holds = [
+                supported(fit_, _only(usable, one)) & usable[:, one].all(1)
                 for one, fit_ in zip(some, fits, strict=True)
             ]
             astray = [
                 torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
-                for one, right in zip(fits, supported, strict=True)
+                for one, right in zip(fits, holds, strict=True)
             ]
             nearest, which = torch.stack(astray).min(0)
             for k, one in enumerate(fits):
@@ -271,40 +282,47 @@ class ChunkTracker:
         others = torch.zeros_like(use)
         if bool((usable & ~use).any()):
             # A camera without the sphere before may see it again: test it at the joint pose.
-            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision, moved)
+            both = fitted(fit.position_lab_mm, fit.R_lab_body, usable)
             unused = good & (usable & ~use).any(1)
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
             contradicts = self._contradictory(both, usable, limit)
-            back = unused & self._supported(both, usable) & ~contradicts
+            back = unused & supported(both, usable) & ~contradicts
             fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
             several = good & ~back & ((usable & ~use).sum(1) > 1)
             for k in range(use.shape[1] if bool(several.any()) else 0):
                 # Of several such cameras some may see it.
                 rows = several & (usable & ~use)[:, k]
                 wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
-                both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, wider, precision, moved)
-                rows &= self._supported(both, wider) & ~self._contradictory(both, wider, limit)
+                both = fitted(fit.position_lab_mm, fit.R_lab_body, wider)
+                rows &= supported(both, wider) & ~self._contradictory(both, wider, limit)
                 fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
             # Another camera is judged only where this frame needs it: results must not depend on the batch.
             doubtful = ~first | before.any(1) | (unused & contradicts)
             others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
-            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, [k]), precision, moved)
-            others[:, k] &= self._supported(one, _only(usable, [k]))
+            one = alone[k] if alone else fitted(X, R, _only(usable, [k]))
+            others[:, k] &= supported(one, _only(usable, [k]))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
-            [_reason(*of_camera) for of_camera in zip(used, contradicts, row, one.reason, strict=True)]
-            for used, contradicts, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
+            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
+            for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
     def _approached(
-        self, frames: Sequence[Sequence[Shown]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
+        self,
+        frames: Sequence[Sequence[Shown]],
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        precision: Tensor,
+        rough: Tensor,
+        among: Neighbours | None,
     ) -> tuple[Tensor, Tensor]:
         """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
-            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px)
+            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
             fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
             X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
             R = torch.where(rough[:, None, None], fit.R_lab_body, R)
@@ -313,33 +331,39 @@ class ChunkTracker:
     def _fitted(
         self,
         frames: Sequence[Sequence[Shown]],
+        start: Callable[..., NearStart],
         X: Tensor,
         R: Tensor,
         use: Tensor,
-        precision: Tensor,
-        moved: Tensor,
         disks_px: Disks | None = None,
     ) -> FittedPoses:
-        """Fit poses that are nearly right."""
-        begin = NearStart(
-            position_lab_mm=self._from(X),
-            R_lab_body=R,
-            use=use,
-            place_precision=precision,
-            moved=moved,
-            held=self.centre is not None,
-        )
+        """Fit poses that are nearly right; `start` knows the rest of where they begin."""
+        begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
         return settled(self.fitter, frames, begin, disks_px)
+
+    def _visible(self, X: Tensor, disks_px: Disks, among: Neighbours) -> Tensor:
+        """Return the share of the disks of B poses that the others leave to each camera, (B, C)."""
+        fine = self.fitter.optics.fine
+        stencil = thinned_stencil(self.fitter.stencil(fine, self.fitter.widest_px), FIRST_EVERY)
+        return visible_shares(self.fitter.places(X, fine, stencil, disks_px[0]), among)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
-    def _supported(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which poses have converged and explain all pictures in use well, (B,) bool."""
+    def _supported(self, fit: FittedPoses, use: Tensor, visible: Tensor | None = None) -> Tensor:
+        """Return which poses have converged and explain all pictures in use well, (B,) bool. Of disks of which others
+        leave a share `visible` (B, C), less is asked, and nothing where it is too little for a score.
+        """
         seen = use.numpy()
         explained = (fit.score.numpy() >= self.score_min) | ~seen
+        if visible is not None:
+            left, score = visible.numpy(), fit.score.numpy()
+            explained |= (score >= self.score_min - HIDDEN_LESS * (1.0 - left)) & (left < 1.0)
+            explained |= (score == 0) & (left < SILENT)
         arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
+        if visible is not None:  # of little paint the pose may not be known at all
+            arrived &= ((score > 0) & seen).any(1) & np.isfinite(fit.covariance.numpy()).all((1, 2))
         good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
         return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
 
@@ -380,12 +404,39 @@ class ChunkTracker:
         fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
-    def _looked_at(self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps) -> FittedPoses:
+    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours) -> Poses:
+        """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
+        those whose pictures support none are left out.
+        """
+        fitter, count = self.search.fitter, len(poses)
+        frames, X = [shot.picture for shot in shots], poses.position_lab_mm[:1]
+        visible = self._visible(X, fitter.disks_px(X), among)[0]
+        use, every = poses.use & (visible > LEAST_VISIBLE), among.of([0] * count)
+        if not bool(use.any()):
+            return replace(poses, use=use)
+        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), every)
+        order = explaining_first(fit, use).argsort(stable=True)
+        best = fit.of(order[:1])
+        seen = use & (best.score[0] > 0) & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
+        seen &= torch.isfinite(best.covariance).all()
+        reason = [
+            Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
+            for now, why in zip(seen.tolist(), poses.reason, strict=True)
+        ]
+        if bool(seen.any()) and not bool((seen == use).all()):
+            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), every)
+            order = explaining_first(fit, seen).argsort(stable=True)
+        return poses_of(fit, order, seen, reason)
+
+    def _looked_at(
+        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps, among: Neighbours | None = None
+    ) -> FittedPoses:
         """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
         X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
         held = self.centre is not None
-        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
+        use = use.expand(count, -1)
+        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use, known, held, among)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
@@ -447,11 +498,11 @@ class OnlineTracker:
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
             self._forget()
         self._time_s[self._number] = time_s
-        tracker, ahead = self._tracker, self._tracker._ahead(self._chunk, self._number)
-        (followed,) = [None] if ahead is None else tracker._follow([ahead], [shots])
+        tracker, ahead = self._tracker, self._tracker.ahead(self._chunk, self._number)
+        (followed,) = [None] if ahead is None else tracker.follow([ahead], [shots])
         if followed is None:
             return None
-        poses = tracker._stated(followed)
+        poses = tracker.stated(followed)
         self._saw(poses)
         return poses
 
@@ -460,7 +511,7 @@ class OnlineTracker:
         followed = self.followed(time_s, shots)
         if followed is not None:
             return followed, False
-        poses = self._tracker._stated(self._tracker._search(shots))
+        poses = self._tracker.stated(self._tracker._search(shots))
         self._forget()  # what was before says nothing of the motion from here
         self._saw(poses)
         return poses, True
@@ -470,7 +521,7 @@ class OnlineTracker:
         self._chunk.turns.clear()
 
     def _saw(self, poses: Poses) -> None:
-        self._chunk.saw(self._number, poses, self._tracker._turns([self._chunk], [poses])[0])
+        self._chunk.saw(self._number, poses, self._tracker.turns([self._chunk], [poses])[0])
         self._number += 1
         self._time_s.pop(self._number - 4, None)
 
@@ -500,9 +551,11 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
     return replace(fit, **told)
 
 
-def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
+def _reason(used: bool, contradicts: bool, sees: bool, shot: Frame, before: Reason) -> Reason:
     if used:
         return Reason.OK
+    if not sees:
+        return Reason.HIDDEN
     if contradicts:
         return Reason.CONTRADICTS
     if not shot.usable:

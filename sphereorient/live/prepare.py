@@ -14,7 +14,7 @@ from sphereorient.files.whole_file import writing
 from sphereorient.follow.tracker import ChunkTracker, OnlineTracker
 from sphereorient.live.live import LiveTracker
 from sphereorient.methods import precise
-from sphereorient.methods.method import Job, Learnt, one_thread
+from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
 from sphereorient.sphere.texture import seen_path
 
@@ -49,7 +49,7 @@ def open_live(
     refine = settings.refine.model_copy(update={"chunks": 1})  # frames come one by one
     chosen = settings.model_copy(update={"refine": refine})
     with open_recording(experiment, cameras) as recording, one_thread():
-        given = None if learnt is None else Learnt.load(learnt)
+        given = None if learnt is None else load_learnt(learnt)
         job = Job(recording=recording, settings=chosen, device=torch.device("cpu"), given=given)
         follower = precise.learn(job, silent) if given is None else precise.resume(job, given)
         if not isinstance(follower.tracker, ChunkTracker):

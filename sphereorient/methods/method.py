@@ -29,8 +29,9 @@ from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.model import Lighting
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory.trajectory import SPHERES
 
-SCHEMA = "sphereorient-learnt/1"
+SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/1", "sphereorient-learnt/2"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
 WHETHER = ("together", "second_ball", "sharper")
 LASTING = ("covariance", "own_rad2")
@@ -115,27 +116,50 @@ class Learnt:
 
     def save(self, path: Path) -> None:
         """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
-        with whole_hdf5(path) as file:
-            _write(self, file)
-            file.attrs["sha256"] = digest(file)
+        save_learnt({"": self}, path)
 
     @classmethod
     def load(cls, path: Path) -> "Learnt":
-        """Read what `save` wrote; raise TrackError if the file is missing, damaged or of another schema."""
-        do = "write one with `sphereorient track --save-learnt FILE`"
-        if not path.is_file():
-            raise TrackError(refusal(str(path), expected="a file of what was learnt", got="no such file", do=do))
-        try:
-            with h5py.File(path, "r") as file:
-                schema = file.attrs.get("schema")
-                if schema != SCHEMA:
-                    raise TrackError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema), do=do))
-                if file.attrs.get("sha256") not in (None, digest(file)):  # None: of an older version
-                    raise ValueError("a checksum that does not fit")
-                return _read(file)
-        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-            expected, got = "a whole file of what was learnt", error_words(error)
-            raise TrackError(refusal(str(path), expected=expected, got=got, do=do)) from error
+        """Read what `save` wrote; raise TrackError if it is missing, damaged, of several balls or another schema."""
+        found = load_learnt(path)
+        if list(found) != [""]:
+            do, got = "pass what was learnt of one ball", f"that of {', '.join(found)}"
+            raise TrackError(refusal(str(path), expected="what was learnt of one ball", got=got, do=do))
+        return found[""]
+
+
+def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:
+    """Write what was learnt of each ball, by name, as HDF5, atomically; OutputError if the file cannot be written."""
+    with whole_hdf5(path) as file:
+        if list(learnt) == [""]:
+            _write(learnt[""], file)
+        else:
+            file.attrs["schema"] = SCHEMA_OF_SEVERAL
+            _write_scenes(next(iter(learnt.values())), file)
+            for name, one in learnt.items():
+                _write(one, file.create_group(f"{SPHERES}/{name}"), scenes=False)
+        file.attrs["sha256"] = digest(file)
+
+
+def load_learnt(path: Path) -> dict[str, Learnt]:
+    """Read what `save_learnt` wrote; raise TrackError if the file is missing, damaged or of another schema."""
+    do = "write one with `sphereorient track --save-learnt FILE`"
+    if not path.is_file():
+        raise TrackError(refusal(str(path), expected="a file of what was learnt", got="no such file", do=do))
+    try:
+        with h5py.File(path, "r") as file:
+            schema = file.attrs.get("schema")
+            if schema not in (SCHEMA, SCHEMA_OF_SEVERAL):
+                raise TrackError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema), do=do))
+            if file.attrs.get("sha256") not in (None, digest(file)):  # None: of an older version
+                raise ValueError("a checksum that does not fit")
+            scenes = _read_scenes(file)
+            if schema == SCHEMA:
+                return {"": _read(file, scenes)}
+            return {str(name): _read(group, _scenes_of(group, scenes)) for name, group in file[SPHERES].items()}
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        expected, got = "a whole file of what was learnt", error_words(error)
+        raise TrackError(refusal(str(path), expected=expected, got=got, do=do)) from error
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,7 +169,16 @@ class Job:
     recording: Recording
     settings: Settings
     device: torch.device
-    given: Learnt | None = None  # what another run learnt
+    given: Mapping[str, Learnt] | None = None  # what another run learnt of each ball
+
+    def of(self, name: str) -> "Job":
+        """Return the job of one ball alone; ExperimentError for an unknown name."""
+        given = None if self.given is None else {"": self.given[name]}
+        return replace(self, recording=self.recording.of(name), given=given)
+
+
+Measured = Mapping[str, list[Poses]]  # of each ball, by name: its poses in the frames of a batch
+Joined = tuple[Trajectory, Learnt | None]  # of one ball
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,8 +186,10 @@ class Method:
     """The stages of a method, in the order of `run`; without a follower, `join` does all (paper)."""
 
     learn: Callable[[Job, Progress], Follower | None]
-    resume: Callable[[Job, Learnt], Follower] | None  # instead of learn, with what is known; None: it learns nothing
-    join: Callable[[Job, Follower | None, Iterable[list[Poses]], Progress], tuple[Trajectory, Learnt | None]]
+    # Instead of learn, with what is known of each ball; None: it learns nothing.
+    resume: Callable[[Job, Mapping[str, Learnt]], Follower] | None
+    join: Callable[[Job, Follower | None, Iterable[Measured], Progress], dict[str, Joined]]
+    several: bool = True  # whether it tracks several balls
 
 
 @contextmanager
@@ -168,7 +203,17 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _write(learnt: Learnt, file: h5py.File) -> None:
+def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
+    file.attrs["cameras"] = list(learnt.scenes)
+    for name, scene in learnt.scenes.items():
+        group, background = file.create_group(f"cameras/{name}"), scene.background
+        group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
+        for part in ("mean", "noise", "shown"):
+            if getattr(background, part) is not None:
+                group.create_dataset(part, data=getattr(background, part), track_times=False)
+
+
+def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
     file.attrs["schema"] = SCHEMA
     for name in NUMBERS:
         file.attrs[name] = getattr(learnt, name)
@@ -179,13 +224,10 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
         file.attrs["still_blur_px"], file.attrs["instants"] = learnt.still_blur_px, learnt.instants
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
-    file.attrs["cameras"] = list(learnt.scenes)
-    for name, scene in learnt.scenes.items():
-        group, background = file.create_group(f"cameras/{name}"), scene.background
-        group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
-        for part in ("mean", "noise", "shown"):
-            if getattr(background, part) is not None:
-                group.create_dataset(part, data=getattr(background, part), track_times=False)
+    if scenes:
+        _write_scenes(learnt, file)
+    else:
+        file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
     for part, values in light_parts(learnt.light).items():
@@ -205,7 +247,7 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
                 group.attrs[part] = np.array([motion.prior.pole, motion.prior.deviation, motion.scale])
 
 
-def _read(file: h5py.File) -> Learnt:
+def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
     scenes = {}
     for name in map(str, file.attrs["cameras"]):
         group: Any = file[f"cameras/{name}"]
@@ -216,6 +258,16 @@ def _read(file: h5py.File) -> Learnt:
             shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
         )
         scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
+    return scenes
+
+
+def _scenes_of(group: h5py.Group, scenes: Mapping[str, CameraScene]) -> dict[str, CameraScene]:
+    """Return the scenes with the diameters of one ball of several."""
+    sizes = zip(scenes.items(), group.attrs["diameter_px"], strict=True)
+    return {name: CameraScene(background=scene.background, diameter_px=float(px)) for (name, scene), px in sizes}
+
+
+def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting.none(len(scenes))

@@ -14,14 +14,13 @@ from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.follow.follower import Follower
-from sphereorient.follow.poses import Poses
 from sphereorient.locate import Sightings
 from sphereorient.methods import results
-from sphereorient.methods.method import Job, Method
+from sphereorient.methods.method import Job, Joined, Measured, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
 from sphereorient.search import Candidates, Proposer, crop_disk
-from sphereorient.trajectory import Reason, Trajectory
+from sphereorient.trajectory import Reason
 
 CHUNK = 64  # frames held at once; a result does not depend on it
 
@@ -30,9 +29,7 @@ def learn(job: Job, progress: Progress) -> None:
     """Learn nothing: the stages look at the whole movie."""
 
 
-def track(
-    job: Job, follower: Follower | None, measured: Iterable[list[Poses]], progress: Progress
-) -> tuple[Trajectory, None]:
+def track(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
     """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are not used."""
     settings = job.settings
     grid, place = job.recording.gridded()
@@ -59,7 +56,7 @@ def track(
     )
     tracks = {name: results.paper_camera(sightings[name], candidates[name], paths[name]) for name in cameras}
     whole = results.paper_track(grid.experiment, clock, positions, fused, moved, tracks)
-    return (whole if len(whole) == len(place) else whole.at(place)), None
+    return {"": (whole if len(whole) == len(place) else whole.at(place), None)}
 
 
 def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> Sightings:
@@ -121,4 +118,4 @@ def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Cand
     return replace(proposals, R_lab_view=camera.R_cam_lab.mT @ R_cam_view(direction_cam))
 
 
-PAPER = Method(learn=learn, resume=None, join=track)
+PAPER = Method(learn=learn, resume=None, join=track, several=False)

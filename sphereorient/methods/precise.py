@@ -1,6 +1,6 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import torch
 
@@ -14,7 +14,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, pose_table
 from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
-from sphereorient.methods.method import Job, Learnt, Method
+from sphereorient.methods.method import Job, Joined, Learnt, Measured
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views
 from sphereorient.pose.blur import estimate_blur_px
 from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter, widest_px
@@ -38,20 +38,20 @@ def learn(job: Job, progress: Progress) -> Follower:
         candidates=settings.refine.candidates,
     )
     following = None
-    if _exposure_s(job) > 0 and len(recording.clock) > 1:
+    if exposure_s(job) > 0 and len(recording.clock) > 1:
         beside = [place + 1 if place + 1 < len(recording.clock) else place - 1 for place in places]
         following = Following(
             shots=lambda rows: frames_at(recording, views, [beside[k] for k in rows]),
-            open_share=_exposure_s(job) / (recording.clock[beside] - recording.clock[places]),
+            open_share=exposure_s(job) / (recording.clock[beside] - recording.clock[places]),
         )
     appearance = estimate_appearance(first, frames, base, settings.refine, following)
     progress("appearance", 1, 1)
     return follower(job, appearance, search)
 
 
-def resume(job: Job, learnt: Learnt) -> Follower:
+def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:
     """Return the follower of `learn`, from what another run or process learnt."""
-    appearance = learnt.appearance(job.recording)
+    appearance = learnt[""].appearance(job.recording)
     search = BlurMatchedSearch(job.recording.texture, job.settings, widest_px(appearance.fitter.views))
     return follower(job, appearance, search)
 
@@ -74,23 +74,27 @@ def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Fol
         if job.recording.experiment.fixed:
             frames, _ = sample_frames(job.recording, views, settings.refine.appearance_frames)
             centre = find_fixed_centre(begin, frames, appearance.score_min)
-        tracker = ChunkTracker(there, begin, settings.refine, _exposure_s(job), centre)
+        tracker = ChunkTracker(there, begin, settings.refine, exposure_s(job), centre)
     else:
         tracker = PerCameraTracker(there, begin, settings.refine)
-    return Follower(recording=job.recording, appearance=appearance, tracker=tracker)
+    return Follower(recording=job.recording, appearances={"": appearance}, tracker=tracker)
 
 
-def _exposure_s(job: Job) -> float:
+def exposure_s(job: Job) -> float:
     """Return how long the shutter is open, s; 0 where that is not known, or where the given blur holds its motion."""
     return 0.0 if job.settings.refine.blur_px is not None else job.recording.experiment.exposure_s or 0.0
 
 
-def join(
-    job: Job, follower: Follower | None, measured: Iterable[list[Poses]], progress: Progress
-) -> tuple[Trajectory, Learnt]:
+def join(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
     """Choose the path through all frames' candidates and smooth it; return the track and what was learnt."""
     assert follower is not None  # `learn` and `resume` return one
-    clock, given, settings = job.recording.clock, job.given, job.settings
+    return {"": joined(job, follower.appearance, (poses[""] for poses in measured))}
+
+
+def joined(job: Job, appearance: Appearance, measured: Iterable[list[Poses]]) -> tuple[Trajectory, Learnt]:
+    """Join the poses of one ball, as `join`."""
+    clock, settings = job.recording.clock, job.settings
+    given = None if job.given is None else job.given[""]
     table = pose_table(measured, len(job.recording.streams))
     path = settings.path
     if given is not None and given.acceleration_rad_s2 is not None:
@@ -115,8 +119,5 @@ def join(
     share = motion.lasting_share(apart, spread, chosen.segment, settings.smooth.slow_share)
     smooth = settings.smooth.model_copy(update={"slow_share": share})
     smoothed = motion.smooth_motion(poses, smooth, None if given is None else given.process)
-    track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, follower.appearance)
-    return track, Learnt.of(follower.appearance, smoothed.process, float(chosen.acceleration_rad_s2))
-
-
-PRECISE = Method(learn=learn, resume=resume, join=join)
+    track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, appearance)
+    return track, Learnt.of(appearance, smoothed.process, float(chosen.acceleration_rad_s2))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.files.cache import cached
-from sphereorient.locate import find_scene, known_diameter_px
+from sphereorient.locate import CameraScene, find_scene, find_scenes, known_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.fitter import defocus_radii
@@ -82,6 +83,25 @@ def open_views(
         views = [view.result() for view in opening]
         sharp.result()
         return views, base.result(), search
+
+
+def open_scene(recording: Recording, settings: Settings, progress: Progress) -> dict[str, list[CameraView]]:
+    """Estimate the cameras' backgrounds of a movie of several balls; return the views of each ball, by its name."""
+    views: dict[str, list[CameraView]] = {name: [] for name in recording.experiment.names}
+
+    def scenes(stream: CameraStream) -> dict[str, CameraScene]:
+        stage = f"{stream.name}: background"
+        progress(stage, 0, 1)
+        found = find_scenes(recording, stream, settings.refine.background_frames, settings.locate)
+        progress(stage, 1, 1)
+        return found
+
+    with ThreadPoolExecutor(2) as pool:
+        for stream, found in zip(recording.streams, pool.map(scenes, recording.streams), strict=True):
+            first = CameraView.of(stream.name, stream.camera, next(iter(found.values())))
+            for name, scene in found.items():  # the lines of sight are computed once
+                views[name].append(replace(first, diameter_px=scene.diameter_px))
+    return views
 
 
 def open_view(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> CameraView:

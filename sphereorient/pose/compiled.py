@@ -109,6 +109,7 @@ class _Near(ctypes.Structure):
         ("most_hidden", ctypes.c_float),
         ("held", ctypes.c_int64),
         ("far", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("some_hidden", "all_hidden")),
     ]
 
 
@@ -122,7 +123,7 @@ def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
 
 def library() -> ctypes.CDLL | None:
     """Return the compiled code for this processor; None where there is none."""
-    return compiled(SOURCE, _Task)
+    return compiled(SOURCE, _Near)
 
 
 @cache
@@ -190,6 +191,7 @@ def settled(
     scenes: Sequence[tuple[LinesOfSight, Background]],
     middle_px: Tensor,
     stencils: tuple[Stencil, Stencil],
+    hidden: tuple[Tensor, Tensor] | None,
     begin: NearStart,
     model: SphereModel,
     *,
@@ -200,8 +202,9 @@ def settled(
     first: bool,
 ) -> tuple[dict[str, Tensor], Tensor] | None:
     """Fit B poses to the frames of C cameras as `settled` of settle.py does: with the first of two stencils, where that
-    is `first`, then with the second. Disks lie about `middle_px` (C, B, 2). Return the parts of `FittedPoses`, and
-    which poses the first stencil moved, (B,) bool: nothing else was done there. None where compiled code cannot do it.
+    is `first`, then with the second. Disks lie about `middle_px` (C, B, 2); `hidden`: places (B * C, P) bool of each
+    stencil that do not count, None: all count. Return the parts of `FittedPoses`, and which poses the first stencil
+    moved, (B,) bool: nothing else was done there. None where compiled code cannot do it.
     """
     code = library()
     kinds = {frame.dtype for row in frames for frame in row}
@@ -221,6 +224,7 @@ def settled(
             shot[b * cameras + c] = _Shot(frame.ctypes.data, *frame.strides, frame.itemsize, round(u), round(v))
     near.scene, near.shot = ctypes.addressof(scene), ctypes.addressof(shot)
     near.moved = at(begin.moved, torch.float64) if instants > 1 else None
+    near.some_hidden, near.all_hidden = (at(one) for one in hidden or (None, None))
     instant, share = _quadrature(instants)
     task = near.task
     task.cameras, task.instants, task.instant, task.shares = cameras, instants, at(instant), at(share)

@@ -20,6 +20,7 @@ from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
+from sphereorient.pose.neighbours import DiskPlaces, Neighbours, hidden_places
 from sphereorient.pose.occluders import MOST_HIDDEN, unoccluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.pose.residuals import KNOWN
@@ -191,10 +192,13 @@ class Fitter:
         """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
         return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
 
-    def lit_in_the_lab(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple["Fitter", FittedPoses, Rivals]:
+    def lit_in_the_lab(
+        self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, preferred: bool = False
+    ) -> tuple["Fitter", FittedPoses, Rivals]:
         """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
         Both are learnt from every other row of `use` (B, C); what counts is what they leave in the rows between.
-        Return the fits of these rows by both where neither explains clearly more.
+        Return the fits of these rows by both where neither explains clearly more. `preferred`: where it does not
+        explain clearly less.
         """
         fine = self.optics.fine
         if len(use) < FEWEST_LIT:
@@ -208,7 +212,7 @@ class Fitter:
         for light, more in zip(lab_lights(*learning, self.model(fine)), (0.0, MORE_EXPLAINED), strict=True):
             lit = replace(self, light=light)
             gain = maps_leave - lit.left(*held)
-            if gain < more:
+            if gain < (-MORE_EXPLAINED if preferred else more):
                 return self, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
         for _ in range(4):  # the poses, too, were found with the maps
             lit = lit.lit_again(pixels, fit, use)
@@ -271,11 +275,13 @@ class Fitter:
         radius_px: float | None = None,
         moved: Tensor | None = None,
         disks_px: Disks | None = None,
+        neighbours: Neighbours | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
         Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. `moved` (B, 6): the
         sphere's turn (rad) and move (mm) while the shutter is open; None: unknown, as if at rest. `disks_px`: what
-        the method of this name tells of these positions, where that is known.
+        the method of this name tells of these positions, where that is known. Places that `neighbours` spoil are not
+        inside, see `hidden_places`.
         """
         middle_px, largest_px = disks_px or self.disks_px(position_lab_mm)
         middles = middle_px.nan_to_num().tolist()
@@ -291,7 +297,31 @@ class Fitter:
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
                 disks.append(cut_pixels(frame, view.background, view.sight, middles[c][b], stencil, level.extra_px))
-        return self.exposed(stacked(disks), moved)
+        pixels = self.exposed(stacked(disks), moved)
+        if neighbours is None:
+            return pixels
+        places = self.places(position_lab_mm, level, stencil, middle_px, moved)
+        hidden = hidden_places(places, neighbours)
+        return pixels if hidden is None else replace(pixels, inside=pixels.inside & ~hidden)
+
+    def places(
+        self,
+        position_lab_mm: Tensor,
+        level: PyramidLevel,
+        stencil: Stencil,
+        middle_px: Tensor,
+        moved: Tensor | None = None,
+    ) -> DiskPlaces:
+        """Return where the disks of B poses lie, for `hidden_places`; arguments as of `pixels`."""
+        return DiskPlaces(
+            sights=[view.sight for view in self.views],
+            stencil=stencil,
+            middle_px=middle_px,
+            position_lab_mm=position_lab_mm,
+            radius_mm=self.radius_mm,
+            blur_px=level.blur_px,
+            move_mm=None if moved is None or self.instants == 1 else moved[:, 3:],
+        )
 
     def exposed(self, pixels: Pixels, moved: Tensor | None) -> Pixels:
         """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""
@@ -343,11 +373,12 @@ class Fitter:
         use: Tensor,
         place_precision: Tensor | None = None,
         held: bool = False,
+        neighbours: Neighbours | None = None,
     ) -> FittedPoses:
         """Refine B poses step by step; `held`: each from the first position."""
         X, R = position_lab_mm, R_lab_body
         for level, every, iterations in steps:
-            pixels = self.pixels(pictures, X, level).thinned(every)
+            pixels = self.pixels(pictures, X, level, neighbours=neighbours).thinned(every)
             fit = self.fit(pixels, X, R, use, level, iterations, place_precision)
             X, R = X if held else fit.position_lab_mm, fit.R_lab_body
         return fit

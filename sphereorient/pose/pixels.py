@@ -24,20 +24,26 @@ INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pixels:
+class Sights:
+    """Lines of sight of L disks with P places each. float32: right to 3e-5 mm half a metre away."""
+
+    direction: Tensor  # (L, 3, P), unit lines of sight, lab
+    origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
+    pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
+    pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pixels(Sights):
     """Pixels of L disks (one camera's view of one frame each) with P places each.
-    Grey levels and geometry are float32: a line of sight is right to 3e-5 mm half a metre away.
+    Grey levels are float32.
     """
 
     grey: Tensor  # (L, P), grey levels
     behind: Tensor  # (L, P), grey levels of the scene without the sphere
     inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
     clipped: Tensor  # (L, P) bool, saturated: the true grey level is this one or a higher one
-    direction: Tensor  # (L, 3, P), unit lines of sight, lab
-    origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
-    pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
-    pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
     moved: Tensor  # (L, 6) float64, turn (rad) and move (mm, lab) of the sphere while the shutter is open
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
     place: Tensor  # (2, P) int64, px to the right of and below the middle pixel
@@ -56,10 +62,10 @@ class Pixels:
         """Return every `step`-th place of all disks."""
         if step == 1:
             return self
-        count = whole_vectors(len(range(0, self.grey.shape[1], step)))
+        kept = thinned_places(self.grey.shape[1], step)
         own = ("origin",) if self.origin.shape[-1] > 1 else ()
-        some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., : step * count : step])
-        return replace(some, inner=min(len(range(0, self.inner, step)), count))
+        some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., kept])
+        return replace(some, inner=min(len(range(0, self.inner, step)), some.grey.shape[1]))
 
     def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> "Pixels":
         parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
@@ -71,6 +77,11 @@ def whole_vectors(count: int) -> int:
     The remainder takes other code whose last bits differ, so that a disk would depend on its batch.
     """
     return max(count // VECTOR, 1) * VECTOR
+
+
+def thinned_places(count: int, step: int) -> slice:
+    """Return which of `count` places `Pixels.thinned` keeps."""
+    return slice(None, step * whole_vectors(len(range(0, count, step))), step)
 
 
 class LinesOfSight:
@@ -96,6 +107,26 @@ class LinesOfSight:
         """Return the change of the line of sight to the next pixel: angle, rad, and start, mm; each (1,)."""
         there = self.pitch_mm.shape[0] > 1
         return self.pitch_rad[v, u : u + 1], self.pitch_mm[v * there, u * there : u * there + 1]
+
+    def about(self, middle_px: tuple[float, float]) -> tuple[Tensor, Tensor, float, float]:
+        """Return the line of sight of the pixel nearest to a place: direction and origin, (3,) float64, and `pitch`."""
+        u, v = (min(max(round(at), 0), count - 2) for at, count in zip(middle_px, self.size, strict=True))
+        start = self.origin[:, 0, 0] if self.one_origin else self.origin[:, v, u]
+        pitch_rad, pitch_mm = self.pitch(u, v)
+        return self.direction[:, v, u].double(), start.double(), float(pitch_rad), float(pitch_mm)
+
+    def of(self, middle_px: tuple[float, float], stencil: "Stencil") -> Sights:
+        """Return the lines of sight of one disk's places, those of `cut_pixels`."""
+        (width, height), (u, v) = self.size, (round(at) for at in middle_px)
+        columns, rows = (u + stencil.right).clip(0, width - 1), (v + stencil.down).clip(0, height - 1)
+        at = torch.from_numpy(rows * width + columns)
+        pitch_rad, pitch_mm = self.pitch(min(max(u, 0), width - 2), min(max(v, 0), height - 2))
+        return Sights(
+            direction=self.direction.reshape(3, -1).index_select(1, at)[None],
+            origin=(self.origin.reshape(3, 1) if self.one_origin else self.origin.reshape(3, -1)[:, at])[None],
+            pitch_rad=pitch_rad,
+            pitch_mm=pitch_mm,
+        )
 
 
 def _to_next_pixel(field: Tensor, sight: Tensor | None = None) -> Tensor:
@@ -148,10 +179,9 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
 @lru_cache(maxsize=64)
 def thinned_stencil(stencil: Stencil, step: int) -> Stencil:
     """Return every `step`-th place, as `Pixels.thinned`."""
-    count = whole_vectors(len(range(0, len(stencil.right), step)))
-    some = np.s_[: step * count : step]
+    some = thinned_places(len(stencil.right), step)
     right, down, tile = stencil.right[some], stencil.down[some], stencil.tile[some].contiguous()
-    place, inner = torch.from_numpy(np.stack([right, down])), min(len(range(0, stencil.inner, step)), count)
+    place, inner = torch.from_numpy(np.stack([right, down])), min(len(range(0, stencil.inner, step)), len(right))
     return Stencil(right=right, down=down, tile=tile, place=place, reach=stencil.reach, inner=inner)
 
 

@@ -999,9 +999,6 @@ static int open_work(const Task *t, Work *work) {
     return 0;
 }
 
-/* The size of the record that this code reads: a caller with another one must not call it. */
-int64_t refine_record(void) { return (int64_t)sizeof(Task); }
-
 /* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
 int refine(const Task *t, int64_t begin, int64_t end) {
     Work work;
@@ -1049,6 +1046,7 @@ typedef struct {
     float most_hidden;           /* of the second stage */
     int64_t held;                /* whether each fit begins at the given position, with its precision */
     uint8_t *far; /* (poses), 1 where the first stage is left out; then where it moved the pose: nothing else is done */
+    const uint8_t *some_hidden, *all_hidden; /* (poses, cameras, places), 1 where other spheres show; or none */
 } Near;
 
 /* One pose: its disks, cut out with one stencil, and its fits. */
@@ -1060,6 +1058,7 @@ typedef struct {
     float *single;  /* (cameras, 11): origin, axes, pitches */
     uint8_t *marks; /* (cameras, 3, places) */
     double *moved;  /* (cameras, 6) */
+    const uint8_t *hidden; /* (poses, cameras, places), or none */
 } Cut;
 
 static void close_cut(Cut *cut) {
@@ -1068,8 +1067,9 @@ static void close_cut(Cut *cut) {
 }
 
 /* Return 0, or 1 without memory; to be closed in both cases. */
-static int open_cut(const Near *n, const Stencil *stencil, float most_hidden, Cut *cut) {
+static int open_cut(const Near *n, const Stencil *stencil, const uint8_t *hidden, float most_hidden, Cut *cut) {
     Task *t = &cut->task;
+    cut->hidden = hidden;
     *t = n->task;
     const int64_t cameras = t->cameras;
     t->places = stencil->places, t->inner = stencil->inner, t->tiles = stencil->tiles;
@@ -1106,6 +1106,7 @@ static inline float grey_level(const Shot *shot, int64_t right, int64_t down) {
 
 /* Cut the disks of a pose out of its frames, as `cut_pixels` without a blur. */
 static void cut_disks(const Near *n, const Cut *cut, int64_t pose) {
+    const uint8_t *hidden = cut->hidden ? cut->hidden + pose * cut->task.cameras * cut->task.places : 0;
     const Task *t = &cut->task;
     const int64_t P = t->places, all = t->cameras * P;
     uint8_t *inside = cut->marks, *clipped = cut->marks + all;
@@ -1121,7 +1122,7 @@ static void cut_disks(const Near *n, const Cut *cut, int64_t pose) {
             const int64_t right = within(x, width), down = within(y, height), at = down * width + right;
             grey[p] = grey_level(shot, right, down);
             behind[p] = scene->behind[at];
-            inside[c * P + p] = x == right && y == down && (!scene->shown || scene->shown[at]);
+            inside[c * P + p] = x == right && y == down && (!scene->shown || scene->shown[at]) && !(hidden && hidden[c * P + p]);
             clipped[c * P + p] = grey[p] >= limit;
             for (int i = 0; i < 3; i++) direction[i * P + p] = scene->direction[i * size + at];
             if (t->origins > 1)
@@ -1174,11 +1175,15 @@ static int settle_on(const Near *n, Cut *cut, int64_t pose, int64_t more) {
     return far;
 }
 
+/* The size of the largest record that this code reads: a caller with another one must not call it. */
+int64_t refine_record(void) { return (int64_t)sizeof(Near); }
+
 /* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
 int settle(const Near *n, int64_t begin, int64_t end) {
     Cut some, all;
     memset(&some, 0, sizeof some), memset(&all, 0, sizeof all);
-    const int without = open_cut(n, &n->some, 0.0f, &some) || open_cut(n, &n->all, n->most_hidden, &all);
+    const int without = open_cut(n, &n->some, n->some_hidden, 0.0f, &some) ||
+                        open_cut(n, &n->all, n->all_hidden, n->most_hidden, &all);
     for (int64_t pose = begin; pose < end && !without; pose++) {
         const double *X = n->task.start + pose * 3, *R = n->task.start_rotation + pose * 9;
         memcpy(all.X, X, sizeof all.X), memcpy(all.R, R, sizeof all.R);

@@ -9,7 +9,8 @@ from sphereorient.movies import OnDemand
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown
-from sphereorient.pose.pixels import Pixels, Stencil, thinned_stencil, window_of
+from sphereorient.pose.neighbours import hidden_places
+from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil, window_of
 from sphereorient.pose.start import NearStart
 
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
@@ -45,11 +46,16 @@ def _compiled(
         return None
     middle_px, _ = disks_px or fitter.disks_px(begin.position_lab_mm)
     stencil = fitter.stencil(fitter.optics.fine, fitter.widest_px)
+    hidden = None
+    if begin.among is not None:
+        places = fitter.places(begin.position_lab_mm, fitter.optics.fine, stencil, middle_px, begin.moved)
+        hidden = hidden_places(places, begin.among)
     done = compiled.settled(
         _decoded(fitter, frames, middle_px, stencil),
         [(view.sight, view.background) for view in fitter.views],
         middle_px,
         (thinned_stencil(stencil, FIRST_EVERY), stencil),
+        None if hidden is None else (hidden[:, thinned_places(hidden.shape[1], FIRST_EVERY)], hidden),
         begin,
         fitter.fine_model,
         instants=fitter.instants,
@@ -84,12 +90,13 @@ def _settled_in_torch(
     fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None
 ) -> FittedPoses:
     fine, moved = fitter.optics.fine, begin.moved
-    pixels = fitter.pixels(frames, begin.position_lab_mm, fine, fitter.widest_px, moved, disks_px)
+    others = begin.among
+    pixels = fitter.pixels(frames, begin.position_lab_mm, fine, fitter.widest_px, moved, disks_px, others)
     fit, far = _step(fitter, pixels.thinned(FIRST_EVERY), begin, MORE[0])
     there = begin.after(fit.position_lab_mm, fit.R_lab_body)
     if bool(far.any()):
         X = torch.where(far[:, None], there.position_lab_mm, begin.position_lab_mm)
-        pixels = fitter.pixels(frames, X, fine, fitter.widest_px, moved)
+        pixels = fitter.pixels(frames, X, fine, fitter.widest_px, moved, None, others)
     return _step(fitter, pixels, there, MORE[1], fitter.most_hidden)[0]
 
 

@@ -18,6 +18,7 @@ from sphereorient.preflight.finding import FAULT, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.run.stages import opened
+from sphereorient.trajectory import one_track
 
 TITLE, STOPS = "cameras agree", "a run stops"
 ENOUGH = 60  # frames of a movie that gives its own background: a ghost of the ball in 50 turned poses by 0.3 degrees
@@ -45,7 +46,7 @@ def cameras_agree(
             settings=settings,
             learnt=replace(learnt, together=False),
         )
-        track = run(request, MemoryStore())
+        track = one_track(run(request, MemoryStore()))
     except SphereOrientError as error:
         measured, _, do = str(error).rpartition("; ")
         finding = judged(TITLE, f"{STOPS}: {measured}", (True, FAULT, do.rstrip(".")))

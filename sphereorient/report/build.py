@@ -67,7 +67,7 @@ def write_report(
         OutputError: `out` cannot be written, or contains something else.
     """
     known = match_experiments(tracks, experiments)
-    around = surroundings_of(experiments)
+    around = surroundings_of([experiment for experiment in known.values() if experiment is not None])
     names = list(tracks)
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     summary = summarise(
@@ -97,13 +97,14 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track by its name, or None; a single one belongs to a single track.
+    """Return the experiment of each track by its name, or None, of its sphere alone; a single one belongs to a single
+    track.
 
     Raises:
-        ExperimentError: an experiment without a track, or two of one name.
+        ExperimentError: an experiment without a track or without its sphere, or two of one name.
     """
     if len(tracks) == 1 and len(experiments) == 1:
-        return dict.fromkeys(tracks, experiments[0])
+        return {name: experiments[0].of(track.sphere) for name, track in tracks.items()}
     known: dict[str, Experiment] = {}
     wanted = {track.experiment for track in tracks.values()}
     for experiment in experiments:
@@ -118,15 +119,23 @@ def match_experiments(
             do = "pass the experiment.yaml that the track was measured from"
             expected = f"the name of one of {', '.join(sorted(wanted)[:5])}"
             raise ExperimentError(refusal(str(experiment.path), expected=expected, got=name, do=do))
-    return {name: known.get(track.experiment) for name, track in tracks.items()}
+    return {
+        name: known[track.experiment].of(track.sphere) if track.experiment in known else None
+        for name, track in tracks.items()
+    }
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
-    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other."""
+    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other. Of spheres of
+    one recording that differ in size, no diameter is known.
+    """
     known: dict[str, float] = {}
+    sizes: dict[Path, set[float | None]] = {}
+    for experiment in experiments:
+        sizes.setdefault(experiment.path, set()).add(experiment.diameter_mm)
     for experiment in experiments:
         found = {FLOW_KEYS[key]: value for key, value in experiment.flow.items() if key in FLOW_KEYS}
-        if experiment.diameter_mm is not None:
+        if experiment.diameter_mm is not None and len(sizes[experiment.path]) == 1:
             found["diameter_mm"] = experiment.diameter_mm
         for key, value in found.items():
             if known.setdefault(key, value) != value:
@@ -141,11 +150,18 @@ Plan = tuple[str, str, str, Callable[[], Figure]]  # name, title, caption, funct
 
 def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
-    of = "" if len(tracks) == 1 else f" of {name}"
     caption = "As measured (dots) and smooth, with bands of two standard errors."
-    yield "track", f"Track{of}", caption, lambda: plots.track_figure(track)
+    together = {
+        key: one
+        for key, one in tracks.items()
+        if one is track or (track.sphere and key.removesuffix(one.sphere) == name.removesuffix(track.sphere))
+    }
+    for number, (key, one) in enumerate(together.items()):
+        of = "" if len(tracks) == 1 else f" of {key}"
+        yield f"track_{number + 1}" if number else "track", f"Track{of}", caption, partial(plots.track_figure, one)
     if not track.held:
-        yield "path", f"Path{of}", "With the sphere's axes.", lambda: plots.path_figure(track)
+        of = "" if len(tracks) == 1 else f" of {', '.join(together)}"
+        yield "path", f"Path{of}", "With the sphere's axes.", partial(plots.path_figure, *together.values())
     if any(len(one.distance_rad) for one in distances):
         caption = "PDF of the angle between the two cameras' own orientations."
         yield "camera_distance", "Distance of the cameras", caption, lambda: plots.camera_distance_figure(distances)

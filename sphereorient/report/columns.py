@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import combinations_with_replacement
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, refusal
-from sphereorient.trajectory import CameraTrack, Flag, Trajectory, quaternions_wxyz
+from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.datasets import stored_fields
 
 if TYPE_CHECKING:
@@ -107,8 +107,8 @@ class Dataset:
 def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
     """Yield the datasets of a track or camera that have a row for each frame, in the order of the file."""
     for name, column in stored_fields(record):
-        values = np.asarray(getattr(record, name))
-        if column.rows == "frames" and not (column.of_several and np.isnan(values).all()):
+        if column.rows == "frames":
+            values = np.asarray(getattr(record, name))
             yield Dataset(name=name, units=column.units, description=column.description, values=values)
 
 
@@ -146,27 +146,34 @@ def reasons(camera: CameraTrack) -> NDArray[Any]:
 
 def safe_names(track: Trajectory) -> dict[str, CameraTrack]:
     """Return the cameras by unique names of letters, digits and _, which all programs accept."""
-    safe: dict[str, CameraTrack] = {}
-    for name, camera in track.cameras.items():
+    plain = plain_names(track.cameras, "camera")
+    return {plain[name]: camera for name, camera in track.cameras.items()}
+
+
+def plain_names(names: Iterable[str], kind: str) -> dict[str, str]:
+    """Return unique names of letters, digits and _ by name; one that begins with no letter begins with the kind."""
+    known: dict[str, str] = {}
+    for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
-        plain = plain if plain[:1].isalpha() else f"camera_{plain}"
+        plain = plain if plain[:1].isalpha() else f"{kind}_{plain}"
         base, count = plain, 1
-        while plain in safe:
+        while plain in known.values():
             count += 1
             plain = f"{base}_{count}"
-        safe[plain] = camera
-    return safe
+        known[name] = plain
+    return known
 
 
 def metadata(track: Trajectory) -> dict[str, Any]:
     """Return the root attributes of a track's file, with the names of the flags."""
     return {
         "experiment": track.experiment,
+        **({"sphere": track.sphere} if track.sphere else {}),
         "method": track.method,
         "frame_rate_hz": track.frame_rate,
         "length_unit": track.length_unit,
         "cameras": list(track.cameras),
-        "flags": {flag.name: flag.value for flag in Flag},
+        "flags": track.bits,
         "provenance": dict(track.provenance),
         "settings": track.settings,
     }

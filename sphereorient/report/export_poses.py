@@ -125,10 +125,10 @@ def write_nwb(track: Trajectory, path: Path, camera: Camera | None) -> None:
     from datetime import UTC, datetime
 
     walk = track.walk()
-    about = f"{track.experiment}: {track.method} method of sphereorient"
+    about = f"{track.title}: {track.method} method of sphereorient"
     # The recording's date is not in a track: the epoch says so.
     begin = datetime(1970, 1, 1, tzinfo=UTC)
-    file = pynwb.NWBFile(session_description=about, identifier=track.experiment, session_start_time=begin)
+    file = pynwb.NWBFile(session_description=about, identifier=track.title, session_start_time=begin)
     module = file.create_processing_module(name="behavior", description="pose of the ball; frames without one are NaN")
     length, unit = (1.0, "radii") if track.length_unit == "radii" else (1e-3, "m")
     series = {

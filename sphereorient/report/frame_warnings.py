@@ -23,6 +23,7 @@ FLAG_WORDS = {
     Flag.SPIKE: "the orientation jumps",
     Flag.EXTRAPOLATED: "not measured; the smoother's value",
     Flag.CONTRADICTION: "the cameras contradict each other",
+    Flag.IDENTITY: "it may be another ball",
 }
 REASON_WORDS: dict[str, str] = {
     Reason.OK: "measured",

@@ -176,7 +176,7 @@ def worst_frames(
         columns = max(1, PICTURES // (2 * len(page.views)))
         canvas = Canvas(columns * across + BETWEEN, HEAD + max(1, math.ceil(len(bad) / columns)) * down)
         names = ", ".join(view.name for view in page.views)
-        title = f"{track.experiment}, {track.method}: the {len(bad)} worst of {len(track)} frames"
+        title = f"{track.title}, {track.method}: the {len(bad)} worst of {len(track)} frames"
         canvas.text((BETWEEN, 24), f"{title}, worst first; {int(track.valid.sum())} are valid", 17)
         about = f"of each camera ({names}): the crop with the outline, and the sphere re-rendered at the measured pose "
         about += "with body axes (x orange, y green, z blue; dotted: away)"

@@ -20,8 +20,9 @@ from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import OverlayView, Page, crop_side
+from sphereorient.report.overlay_scene import ScenePage
 from sphereorient.sphere import load_texture, reduced_texture
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Tracks, Trajectory
 
 SAMPLE = 16  # frames from which light and brightness are taken
 NEAR_FRAMES = 0.5  # frames: largest distance in time of a picture from the track's frame
@@ -57,7 +58,7 @@ class FrameSelection:
 
 
 def overlay_movie(
-    track: Trajectory,
+    tracks: Trajectory | Mapping[str, Trajectory],
     experiment: Experiment,
     path: Path,
     selection: FrameSelection | None = None,
@@ -65,6 +66,7 @@ def overlay_movie(
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
+    Several spheres, by name, are drawn into the same frames.
 
     Raises:
         ExperimentError: a camera that track or experiment do not have.
@@ -73,8 +75,11 @@ def overlay_movie(
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
+    known = list(Tracks.of(tracks).values())
     with ExitStack() as opened:
-        page, streams = prepared(track, experiment, selection.cameras, opened)
+        first, streams = prepared(known[0], experiment, selection.cameras, opened)
+        more = [page_of(track, experiment, first.numbers, streams) for track in known[1:]]
+        page = ScenePage(pages=[first, *more]) if more else first
         chosen = selection.rows(page.numbers)
 
         def drawn() -> Iterator[NDArray[np.uint8]]:
@@ -96,12 +101,18 @@ def prepared(
     if not names:
         got, do = "none", "write --cameras cam1, or leave it out"
         raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
-    texture = None if experiment.texture_path is None else load_texture(experiment.texture_path)
     numbers, streams = streams_of(track, experiment, names, opened)
-    where = path_of(track, experiment.radius_mm)
-    models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in names]
-    views = [_view(track, model, streams[name]) for name, model in zip(names, models, strict=True)]
-    return Page(track=track, numbers=numbers, views=views), streams
+    return page_of(track, experiment, numbers, streams), streams
+
+
+def page_of(track: Trajectory, experiment: Experiment, numbers: Rows, streams: Mapping[str, CameraStream]) -> Page:
+    """Return the page of a track, whose frames have these numbers (N,) and pictures."""
+    ball = experiment.of(track.sphere)
+    texture = None if ball.texture_path is None else load_texture(ball.texture_path)
+    where = path_of(track, ball.radius_mm)
+    models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
+    views = [_view(track, model, stream) for model, stream in zip(models, streams.values(), strict=True)]
+    return Page(track=track, numbers=numbers, views=views)
 
 
 def streams_of(

@@ -156,6 +156,11 @@ class OverlayView:
         """Return the crop around `centre_px` of frame k, as fine as the panels of the page."""
         return CropWindow(centre_px=self.centre_px(seen, k), half_px=self.half_px, side=crop_side(self.half_px))
 
+    def depth_mm(self, k: int) -> float:
+        """Return the depth of the sphere in frame k, mm along the camera's axis."""
+        camera = self.model.camera
+        return float(camera.R_cam_lab[2].numpy() @ self.model.path.position_mm[k] + float(camera.T_cam_lab_mm[2]))
+
     def placed(self, k: int) -> bool:
         """Whether the track has a position in frame k."""
         return bool(np.isfinite(self.model.path.position_mm[k]).all())
@@ -188,7 +193,7 @@ class Page:
         place = f"segment {segment}" if segment >= 0 else "outside any segment"
         words = f"frame {int(self.numbers[k])}    t = {self.track.time[k]:.4f} s    {place}"
         canvas.text((GAP, 24), words, 18)
-        canvas.text((width - GAP, 24), f"{self.track.experiment}, {self.track.method}", 15, FAINT, "rs")
+        canvas.text((width - GAP, 24), f"{self.track.title}, {self.track.method}", 15, FAINT, "rs")
         state, colour = self.state(k)
         canvas.text((GAP, 50), textwrap.shorten(state, (width - 2 * GAP) // LETTER, placeholder=" ..."), 15, colour)
 
@@ -265,25 +270,38 @@ class Page:
 
     def _foot(self, canvas: Canvas, k: int) -> None:
         height, width = canvas.pixels.shape[:2]
-        left, top = GAP, height - FOOT
-        entries = [("outline", OUTLINE), ("body axes x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
-        entries += [(f"last {TRAIL_FRAMES} frames", TRAIL)]
-        for words, colour in entries:
-            canvas.text((left, top + 16), words, 13, colour)
-            left += 8 * len(words) + 14
-        canvas.text((left, top + 16), "axes solid: towards the camera, dotted: away", 13, FAINT)
-        strip = canvas.pixels[height - 26 : height - 14, GAP : width - GAP]
-        # the states of all frames side by side; a pixel shows the worst of its frames
-        state = np.where(self.track.valid, np.where(shown_flags(self.track) != 0, 1, 0), 2)
-        edges = np.linspace(0, len(state), strip.shape[1] + 1)
-        first = edges[:-1].astype(int)
-        last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
-        worst = [int(state[a:b].max()) for a, b in zip(first, last, strict=True)]
-        strip[:] = np.array([GOOD, DOUBT, LOST], np.uint8)[worst]
-        at = round((k + 0.5) / len(self.track) * strip.shape[1])
-        canvas.pixels[height - 31 : height - 9, GAP + max(0, at - 1) : GAP + at + 1] = 255
+        top = height - FOOT
+        legend(canvas, (GAP, top + 16), "axes solid: towards the camera, dotted: away")
+        state_strip(canvas, self.track, k, (GAP, height - 26), (width - 2 * GAP, 12), 5)
         words = f"whole track: green valid, orange in doubt, grey not valid ({int(self.track.valid.sum())} of "
         canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, FAINT, "rs")
+
+
+def legend(canvas: Canvas, at: tuple[int, int], more: str) -> None:
+    """Write what the colours of the lines mean, and `more`."""
+    left, row = at
+    entries = [("outline", OUTLINE), ("body axes x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
+    for words, colour in [*entries, (f"last {TRAIL_FRAMES} frames", TRAIL)]:
+        canvas.text((left, row), words, 13, colour)
+        left += 8 * len(words) + 14
+    canvas.text((left, row), more, 13, FAINT)
+
+
+def state_strip(
+    canvas: Canvas, track: Trajectory, k: int, corner: tuple[int, int], size: tuple[int, int], beyond: int = 2
+) -> None:
+    """Draw the states of all frames side by side, and a mark at frame k that stands `beyond` px above and below; a
+    pixel shows the worst of its frames.
+    """
+    (left, top), (width, height) = corner, size
+    state = np.where(track.valid, np.where(shown_flags(track) != 0, 1, 0), 2)
+    edges = np.linspace(0, len(state), width + 1)
+    first = edges[:-1].astype(int)
+    last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
+    worst = [int(state[a:b].max()) for a, b in zip(first, last, strict=True)]
+    canvas.pixels[top : top + height, left : left + width] = np.array([GOOD, DOUBT, LOST], np.uint8)[worst]
+    at = round((k + 0.5) / len(track) * width)
+    canvas.pixels[top - beyond : top + height + beyond, left + max(0, at - 1) : left + at + 1] = 255
 
 
 def crop_side(half_px: float) -> int:
@@ -296,19 +314,42 @@ def crop_panel(canvas: Canvas, corner: tuple[int, int], side: int, window: CropW
     return Panel(canvas, corner, (side, side), window.centre_px - window.half_px, side / (2 * window.half_px))
 
 
-def draw_pictures(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> bool:
-    """Show crop, re-rendered sphere and, in a third panel, residual; return whether the sphere could be rendered."""
+def draw_pictures(
+    panels: Sequence[Panel],
+    view: OverlayView,
+    k: int,
+    picture: Grey | None,
+    window: CropWindow,
+    others: Sequence[OverlayView] = (),
+) -> bool:
+    """Show crop, re-rendered sphere and, in a third panel, residual; return whether the sphere could be rendered.
+    `others`: of the same camera, spheres that may hide it or stand behind it.
+    """
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
         panels[0].show(view.shown(grey))
     if view.light is None or not view.model.path.whole[k]:
         return False
-    model = view.light.picture(view.model.look(k, window), grey)
+    model = rendered((view, *others), k, grey, window)
     panels[1].show(view.shown(model))
     if grey is not None:
         for panel in panels[2:]:
             panel.show(residual_colours((grey - model) / view.light.contrast))
     return True
+
+
+def rendered(
+    views: Sequence[OverlayView], k: int, filmed: NDArray[np.float32] | None, window: CropWindow
+) -> NDArray[np.float32]:
+    """Return the spheres of one camera as they are seen, nearer before farther, (side, side); NaN beside them."""
+    whole = np.full((window.side, window.side), np.nan, np.float32)
+    known = [view for view in views if view.model.path.whole[k] and view.light is not None]
+    for view in sorted(known, key=lambda view: view.depth_mm(k)):
+        there = np.isnan(whole)
+        shown = None if filmed is None else np.where(there, filmed, np.float32(np.nan))
+        if view.light is not None:
+            whole = np.where(there, view.light.picture(view.model.look(k, window), shown), whole)
+    return whole
 
 
 def residual_colours(residual: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -52,7 +52,10 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
     css, js = strip_assets()
     names = sorted({track.experiment for track in tracks.values() if track.experiment})
     what = "Rotation of a sphere" if all(track.held for track in tracks.values()) else "Motion of a sphere"
-    what += f", {len(tracks)} tracks compared" if len(tracks) > 1 else ""
+    if len({track.sphere for track in tracks.values()}) == len(tracks) > 1:
+        what = f"Motion of {len(tracks)} spheres"
+    elif len(tracks) > 1:
+        what += f", {len(tracks)} tracks compared"
     page = {
         "title": f"{what}: {_some(names)}" if names else what,
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",

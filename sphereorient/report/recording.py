@@ -24,7 +24,7 @@ from sphereorient.report.overlay import pictures_by_row, streams_of
 from sphereorient.report.overlay_model import Path3D, finite_rows, path_of
 from sphereorient.report.overlay_page import AXES, OUTLINE, TRAIL
 from sphereorient.sphere import load_texture, reduced_texture
-from sphereorient.trajectory import Trajectory, quaternions_wxyz
+from sphereorient.trajectory import Tracks, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.datasets import in_length
 
 with suppress(ImportError):  # an extra: `view_track` says how to install it
@@ -54,7 +54,7 @@ SERIES = {
 
 
 def view_track(
-    track: Trajectory,
+    tracks: Trajectory | Mapping[str, Trajectory],
     *,
     experiment: Experiment | None = None,
     save: Path | None = None,
@@ -62,7 +62,7 @@ def view_track(
     pictures: bool = True,
     progress: Advance = lambda done, total: None,
 ) -> None:
-    """Show a track in Rerun's viewer, or write it to `save` (.rrd) without a window.
+    """Show a track, or those of several spheres by name, in Rerun's viewer, or write `save` (.rrd) without a window.
 
     The experiment adds cameras, texture map and pictures, the latter in one of `every` frames.
 
@@ -74,14 +74,15 @@ def view_track(
     if save is not None:
         check_ending(save, "--save", [".rrd"])
     recording: Any = rr.RecordingStream("sphereorient", recording_id=None)
-    layout = _layout(track, experiment)
+    known = Tracks.of(tracks)
+    layout = _layout(known, experiment)
     with nullcontext() if save is None else put_aside(save) as aside:
         if aside is None:
             _open_viewer(recording, layout)
         else:
             recording.save(aside, default_blueprint=layout)
         try:
-            _log(recording, track, experiment, every if pictures else 0, progress)
+            _log(recording, known, experiment, every if pictures else 0, progress)
         finally:
             recording.flush()
             recording.disconnect()
@@ -101,12 +102,19 @@ def _open_viewer(recording: Any, layout: Any) -> None:
         raise OutputError(refusal("view", expected="a viewer that opens", got=error_words(error), do=do)) from error
 
 
-def _layout(track: Trajectory, experiment: Experiment | None) -> Any:
+def _place(name: str, *steps: str) -> list[str]:
+    """Return the place of what is of one sphere: steps for the only one, else spheres, its name, steps."""
+    return ["spheres", name, *steps] if name else list(steps)
+
+
+def _layout(tracks: Tracks, experiment: Experiment | None) -> Any:
     space = rrb.Spatial3DView(origin="lab", name="lab")
-    names = [] if experiment is None else [name for name in experiment.cameras if name in track.cameras]
+    seen = next(iter(tracks.values())).cameras
+    names = [] if experiment is None else [name for name in experiment.cameras if name in seen]
     shown = [rrb.Spatial2DView(origin=f"lab/{name}/picture", name=name) for name in names]
     plots = [
-        rrb.TimeSeriesView(origin=rr.new_entity_path(["plots", name]), name=name)
+        rrb.TimeSeriesView(origin=rr.new_entity_path(["plots", *_place(ball, name)]), name=f"{ball} {name}".strip())
+        for ball, track in tracks.items()
         for name in (*series_of(track), "state")
     ]
     log = rrb.TextLogView(origin="warnings", name="warnings")
@@ -114,22 +122,28 @@ def _layout(track: Trajectory, experiment: Experiment | None) -> Any:
     return rrb.Blueprint(rrb.Vertical(above, rrb.Tabs(*plots, log), row_shares=[2, 1]), collapse_panels=True)
 
 
-def _log(recording: Any, track: Trajectory, experiment: Experiment | None, every: int, progress: Advance) -> None:
-    def when(rows: NDArray[np.int64]) -> list[Any]:
-        return [rr.TimeColumn(TIME, duration=track.time[rows]), rr.TimeColumn(FRAME, sequence=rows)]
+def _log(recording: Any, tracks: Tracks, experiment: Experiment | None, every: int, progress: Advance) -> None:
+    first = next(iter(tracks.values()))
 
-    radius = PLAIN_RADIUS_MM if experiment is None else experiment.radius_mm
-    path = path_of(track, radius if track.length_unit == "mm" else 1.0)
+    def when(rows: NDArray[np.int64]) -> list[Any]:
+        return [rr.TimeColumn(TIME, duration=first.time[rows]), rr.TimeColumn(FRAME, sequence=rows)]
+
     recording.log("lab", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    balls = {name: None if experiment is None else experiment.of(name) for name in tracks}
+    paths = {}
+    for name, track in tracks.items():
+        radius = PLAIN_RADIUS_MM if (ball := balls[name]) is None else ball.radius_mm
+        paths[name] = path_of(track, radius if track.length_unit == "mm" else 1.0)
     if experiment is not None:
-        there = path.position_mm[finite_rows(path.position_mm)]
-        near = there.mean(0) if len(there) else np.zeros(3)
-        cameras = {name: camera for name, camera in experiment.cameras.items() if name in track.cameras}
+        known = np.concatenate([path.position_mm[finite_rows(path.position_mm)] for path in paths.values()])
+        near = known.mean(0) if len(known) else np.zeros(3)
+        cameras = {name: camera for name, camera in experiment.cameras.items() if name in first.cameras}
         _log_cameras(recording, cameras, near)
-    _log_sphere(recording, track, path, experiment, when)
-    _log_series(recording, track, when)
+    for name, track in tracks.items():
+        _log_sphere(recording, track, paths[name], balls[name], when)
+        _log_series(recording, track, when)
     if experiment is not None and every:
-        _log_pictures(recording, track, experiment, np.arange(0, len(track), every), progress)
+        _log_pictures(recording, first, experiment, np.arange(0, len(first), every), progress)
 
 
 def pinhole_near(camera: Camera, near_lab_mm: Floats) -> tuple[Floats, float] | None:
@@ -173,25 +187,27 @@ def _log_cameras(recording: Any, cameras: Mapping[str, Camera], near_lab_mm: Flo
 def _log_sphere(
     recording: Any, track: Trajectory, path: Path3D, experiment: Experiment | None, when: Callable[[Any], Any]
 ) -> None:
-    radius = path.radius_mm
+    radius, name = path.radius_mm, track.sphere
+    sphere = ["lab", *(_place(name) or ["sphere"])]
     if experiment is None or experiment.texture_path is None:
-        recording.log("lab/sphere/ball", rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[OUTLINE]), static=True)
+        recording.log([*sphere, "ball"], rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[OUTLINE]), static=True)
     else:
         map_ = reduced_texture(load_texture(experiment.texture_path), MAP_PX).numpy()
-        recording.log("lab/sphere/ball", _textured(radius, map_), static=True)
+        recording.log([*sphere, "ball"], _textured(radius, map_), static=True)
     arrows = rr.Arrows3D(vectors=AXIS_REACH * radius * np.eye(3), colors=AXES, labels=["x", "y", "z"])
-    recording.log("lab/sphere/axes", arrows, static=True)
+    recording.log([*sphere, "axes"], arrows, static=True)
     rows = np.flatnonzero(path.whole)
     if len(rows):
         xyzw = np.roll(quaternions_wxyz(path.R_lab_body[rows]), -1, axis=1)  # Rerun's order, w last
         poses = rr.Transform3D.columns(translation=path.position_mm[rows], quaternion=xyzw)
-        recording.send_columns("lab/sphere", when(rows), poses)
+        recording.send_columns(rr.new_entity_path(sphere), when(rows), poses)
     there = finite_rows(path.position_mm)
     known = np.where(there, track.segment, -2)  # the line is interrupted where the segment changes
     cuts = np.concatenate([[0], np.flatnonzero(np.diff(known) != 0) + 1, [len(track)]]).astype(int)
     strips = [path.position_mm[a:b] for a, b in pairwise(cuts) if b - a > 1 and there[a]]
     if strips:
-        recording.log("lab/path", rr.LineStrips3D(strips, colors=[TRAIL], radii=[0.02 * radius]), static=True)
+        lines = rr.LineStrips3D(strips, colors=[TRAIL], radii=[0.02 * radius])
+        recording.log(["lab", "path", *_place(name)[1:]], lines, static=True)
 
 
 def _textured(radius: float, map_: NDArray[np.float32]) -> Any:
@@ -226,10 +242,11 @@ def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -
     rows = np.arange(len(track))
 
     def send(name: str, lines: Floats, style: Any) -> None:
-        recording.log(["plots", name], style, static=True)
+        place = rr.new_entity_path(["plots", *_place(track.sphere, name)])
+        recording.log(place, style, static=True)
         if len(lines):
             columns = rr.Scalars.columns(scalars=lines.ravel()).partition([lines.shape[1]] * len(lines))
-            recording.send_columns(rr.new_entity_path(["plots", name]), when(rows), columns)
+            recording.send_columns(place, when(rows), columns)
 
     names = [f"{axis}{more}" for axis in "xyz" for more in ("", " + sigma", " - sigma")]
     colours = [(*colour, opacity) for colour in AXES for opacity in (255, FADED, FADED)]
@@ -243,7 +260,8 @@ def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -
     if warned:
         levels = ["WARN" if track.valid[k] else "ERROR" for k in warned]
         columns = rr.TextLog.columns(text=[", ".join(found[k]) for k in warned], level=levels)
-        recording.send_columns("warnings", when(np.array(warned)), columns)
+        place = rr.new_entity_path(["warnings", *_place(track.sphere)[1:]])
+        recording.send_columns(place, when(np.array(warned)), columns)
 
 
 def _log_pictures(

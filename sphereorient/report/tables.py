@@ -118,7 +118,7 @@ def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
             "method": track.method,
             "frames": len(track),
             "valid": int(track.valid.sum()),
-            "doubtful": int((track.valid & (track.flags & Flag.DOUBTFUL_FIT > 0)).sum()),
+            "doubtful": int((track.valid & (track.flags & (Flag.DOUBTFUL_FIT | Flag.IDENTITY) > 0)).sum()),
             "stated_error_deg": _median(np.rad2deg(stated_error(track.orientation_cov))),
             "stated_error_mm": _median(stated_error(track.position_cov)),
             "rms_v_m_s": _rms(track.velocity),

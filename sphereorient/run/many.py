@@ -24,7 +24,7 @@ from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import one_thread
 from sphereorient.run.stages import Task, Work, check_method, check_out, opened, stages
 from sphereorient.run.store import FolderStore, Request
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Tracks
 
 POLL_S = 0.5  # between looks at what the workers have written
 DEATHS = 3  # of workers on one experiment without anything new being done
@@ -202,7 +202,9 @@ def do_task(request: Request, run_id: str, task: Task) -> Any:
     limit_cores(1)
     with one_thread():
         result = _work(request, run_id)[0].do(task)
-    return (len(result), int(np.sum(result.valid))) if isinstance(result, Trajectory) else result
+    if not isinstance(result, Tracks):
+        return result
+    return sum(map(len, result.values())), sum(int(np.sum(track.valid)) for track in result.values())
 
 
 def run_many(

@@ -1,6 +1,6 @@
 """One way through a run, for every command, the Python API and the workers: learn, follow, join."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,14 +16,14 @@ from sphereorient.files.provenance import provenance, sha256
 from sphereorient.files.whole_file import check_folder, check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
-from sphereorient.methods.method import Job, Learnt, Method, one_thread
+from sphereorient.methods.method import Job, Learnt, Method, load_learnt, one_thread, save_learnt
 from sphereorient.methods.paper import PAPER
-from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
+from sphereorient.methods.several import PRECISE
 from sphereorient.pose.lasting import Lasting
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Tracks, Trajectory
 
 METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}
 TASK_BATCHES = 16  # at most in one task of a worker; a worker that dies loses less than one batch
@@ -38,7 +38,7 @@ class Task:
     batches: tuple[Batch, ...] = ()  # to follow
 
 
-def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory:
+def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory | Tracks:
     """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
 
     `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
@@ -54,8 +54,8 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
             try:
                 tasks = todo.send([work.do(task) for task in tasks])
             except StopIteration as end:
-                track: Trajectory = end.value
-                return track
+                tracks: Tracks = end.value
+                return tracks[""] if list(tracks) == [""] else tracks
 
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
@@ -69,8 +69,8 @@ def stages(store: Store, workers: int | None = None) -> Generator[list[Task], li
     if workers is not None:
         size = min(TASK_BATCHES, max(1, -(-len(left) // (TASKS_A_WORKER * workers))))
     yield [Task("follow", tuple(left[k : k + size])) for k in range(0, len(left), size)]
-    (track,) = yield [Task("join")]
-    return track
+    (tracks,) = yield [Task("join")]
+    return tracks
 
 
 @dataclass(eq=False)
@@ -84,7 +84,7 @@ class Work:
     progress: Progress = silent
 
     def do(self, task: Task) -> Any:
-        """Do one task: learn returns the batches, follow the number of batches, join the track."""
+        """Do one task: learn returns the batches, follow the number of batches, join the tracks."""
         if task.stage == "learn":
             return self.batches
         return self.follow(task.batches) if task.stage == "follow" else self.join()
@@ -97,7 +97,7 @@ class Work:
             return self.method.resume(self.job, known)
         follower = self.method.learn(self.job, self.progress)
         if follower is not None:
-            self.store.keep(Learnt.of(follower.appearance))
+            self.store.keep({name: Learnt.of(appearance) for name, appearance in follower.appearances.items()})
         return follower
 
     @property
@@ -118,27 +118,37 @@ class Work:
             self.progress("track", done, total)
         return len(batches)
 
-    def join(self) -> Trajectory:
-        """Join the measured batches to a track, write it, and empty the store."""
+    def join(self) -> Tracks:
+        """Join the measured batches to the track of each ball, write them, and empty the store."""
         measured = (self.store.read(batch) for batch in self.batches)
         self.progress("join", 0, 1)
-        track, learnt = self.method.join(self.job, self.follower, measured, self.progress)
-        track = finished(track, self.job, self.request, None if learnt is None else learnt.lasting)
+        joined = self.method.join(self.job, self.follower, measured, self.progress)
+        learnt = {name: known for name, (_, known) in joined.items() if known is not None}
+        tracks = Tracks(
+            {
+                name: finished(track, self.job.of(name), self.request, None if known is None else known.lasting)
+                for name, (track, known) in joined.items()
+            }
+        )
         with writing_of(self.request):
-            if learnt is not None and self.request.save_learnt is not None:
-                learnt.save(self.request.save_learnt)
+            if learnt and self.request.save_learnt is not None:
+                save_learnt(learnt, self.request.save_learnt)
             if self.request.out is not None:
-                track.save(self.request.out)
+                tracks.save(self.request.out)
         self.store.remove()
         self.progress("join", 1, 1)
-        return track
+        return tracks
 
 
 @contextmanager
 def opened(request: Request, store: Store, progress: Progress = silent) -> Iterator[Work]:
     """Open the inputs of a request; raise SphereOrientError if they are missing, unreadable or inconsistent."""
     method = check_method(request)
-    given = Learnt.load(request.learnt) if isinstance(request.learnt, Path) else request.learnt
+    given = request.learnt
+    if isinstance(given, Path):
+        given = load_learnt(given)
+    elif isinstance(given, Learnt):
+        given = {"": given}
     device = torch_device(request.device)
     with open_recording(request.experiment, request.cameras) as recording, one_thread():
         job = Job(recording=recording, settings=request.settings, device=device, given=given)
@@ -152,11 +162,11 @@ def track_movies(
     settings: Settings | None = None,
     cameras: Sequence[str] | None = None,
     device: str = "cpu",
-    learnt: Learnt | None = None,
+    learnt: Learnt | Mapping[str, Learnt] | None = None,
     proposer: str | Path | None = None,
     progress: Progress = silent,
     command: str = "sphereorient.track_movies",
-) -> Trajectory:
+) -> Trajectory | Tracks:
     """Measure position (mm) and orientation of the sphere in every frame; see docs/data-format.md for the result.
 
     Args:

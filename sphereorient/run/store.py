@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,11 +21,12 @@ from sphereorient.files.hdf5 import DAMAGE, digest, whole_hdf5
 from sphereorient.files.whole_file import is_forced, write_text, writing
 from sphereorient.follow.follower import Batch
 from sphereorient.follow.poses import Poses
-from sphereorient.methods.method import Learnt
+from sphereorient.methods.method import Learnt, load_learnt, save_learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.trajectory import Reason
+from sphereorient.trajectory.trajectory import SPHERES
 
 SCHEMA = "sphereorient-poses/1"
 LOCK, PROCESS = "lock", "process"  # files in the folder of a run
@@ -43,7 +44,7 @@ class Request:
     settings: Settings = field(default_factory=Settings)
     cameras: tuple[str, ...] | None = None
     device: str = "cpu"
-    learnt: Path | Learnt | None = None  # what another run learnt, to measure with
+    learnt: Path | Learnt | Mapping[str, Learnt] | None = None  # what another run learnt, to measure with
     save_learnt: Path | None = None
     command: str = "sphereorient.run"
     force: bool = field(default_factory=is_forced)  # whether files without this program's mark may be replaced
@@ -115,24 +116,24 @@ def _digest(text: str) -> str:
 class MemoryStore:
     """Keeps a run in this process."""
 
-    known: Learnt | None = None  # what was learnt before the first frame
-    _poses: dict[int, list[Poses]] = field(default_factory=dict)
+    known: Mapping[str, Learnt] | None = None  # what was learnt of each ball before the first frame
+    _poses: dict[int, Mapping[str, list[Poses]]] = field(default_factory=dict)
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
         """Do nothing: no other process uses this store."""
         yield
 
-    def keep(self, learnt: Learnt) -> None:
-        """Keep what was learnt."""
+    def keep(self, learnt: Mapping[str, Learnt]) -> None:
+        """Keep what was learnt of each ball."""
         self.known = learnt
 
-    def write(self, batch: Batch, poses: list[Poses]) -> None:
-        """Keep the poses of one batch."""
+    def write(self, batch: Batch, poses: Mapping[str, list[Poses]]) -> None:
+        """Keep the poses of each ball in one batch."""
         self._poses[batch.first] = poses
 
-    def read(self, batch: Batch) -> list[Poses]:
-        """Return the poses of one batch."""
+    def read(self, batch: Batch) -> Mapping[str, list[Poses]]:
+        """Return the poses of each ball in one batch."""
         return self._poses.pop(batch.first)
 
     def missing(self, batches: Sequence[Batch]) -> list[Batch]:
@@ -227,35 +228,32 @@ class FolderStore:
         return {str(name): str(value) for name, value in known.items()}
 
     @property
-    def known(self) -> Learnt | None:
-        """What was learnt before the first frame; None if the file is missing or damaged."""
+    def known(self) -> Mapping[str, Learnt] | None:
+        """What was learnt of each ball before the first frame; None if the file is missing or damaged."""
         try:
-            return Learnt.load(self.folder / "learnt.h5")
+            return load_learnt(self.folder / "learnt.h5")
         except TrackError:
             return None
 
-    def keep(self, learnt: Learnt) -> None:
-        """Write what was learnt."""
+    def keep(self, learnt: Mapping[str, Learnt]) -> None:
+        """Write what was learnt of each ball."""
         with writing(force=True):  # over a damaged one, too: the folder is of this run
-            learnt.save(self.folder / "learnt.h5")
+            save_learnt(learnt, self.folder / "learnt.h5")
 
-    def write(self, batch: Batch, poses: list[Poses]) -> None:
-        """Write the poses of one batch."""
+    def write(self, batch: Batch, poses: Mapping[str, list[Poses]]) -> None:
+        """Write the poses of each ball in one batch."""
         do = "check the space left, then run again with --resume"
         with writing(force=True), whole_hdf5(self.poses(batch), do) as file:
             file.attrs["schema"] = SCHEMA
-            file["count"] = np.array([len(one) for one in poses])
-            file["use"] = np.stack([one.use.numpy() for one in poses])
-            file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
-            for name in POSE_PARTS:
-                file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
+            for ball, of_ball in poses.items():
+                _write_poses(of_ball, file.create_group(f"{SPHERES}/{ball}") if ball else file)
             file.attrs["sha256"] = digest(file)
 
-    def read(self, batch: Batch) -> list[Poses]:
-        """Return the poses of one batch; raise TrackError and remove the file if it is damaged."""
+    def read(self, batch: Batch) -> dict[str, list[Poses]]:
+        """Return the poses of each ball in one batch; raise TrackError and remove the file if it is damaged."""
         path = self.poses(batch)
         poses = read_poses(path) if path.is_file() else None
-        if poses is None or len(poses) != len(batch):
+        if poses is None or any(len(of_ball) != len(batch) for of_ball in poses.values()):
             path.unlink(missing_ok=True)
             do = "run again with --resume; only this part is measured again"
             raise TrackError(refusal(str(path), expected="the poses of a batch", got="a damaged file", do=do))
@@ -277,21 +275,37 @@ class FolderStore:
 Store = MemoryStore | FolderStore
 
 
-def read_poses(path: Path) -> list[Poses] | None:
+def _write_poses(poses: list[Poses], group: h5py.Group) -> None:
+    group["count"] = np.array([len(one) for one in poses])
+    group["use"] = np.stack([one.use.numpy() for one in poses])
+    group["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
+    for name in POSE_PARTS:
+        group[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
+
+
+def read_poses(path: Path) -> dict[str, list[Poses]] | None:
     """Return what `FolderStore.write` wrote; None if the file is not whole."""
     try:
         with h5py.File(path, "r") as file:
-            R = torch.from_numpy(file["R_lab_body"][()])
-            turned = bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all())
-            if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file) or not turned:
+            if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file):
                 return None
-            count, use = file["count"][()].tolist(), torch.from_numpy(file["use"][()])
-            reason = [[Reason(why.decode()) for why in row] for row in file["reason"][()].tolist()]
-            parts = {name: torch.split(torch.from_numpy(file[name][()]), count) for name in POSE_PARTS}
+            groups = {str(name): group for name, group in file[SPHERES].items()} if SPHERES in file else {"": file}
+            found = {name: _read_poses(group) for name, group in groups.items()}
     except MemoryError:
         raise
     except DAMAGE:
         return None
+    whole = {name: poses for name, poses in found.items() if poses is not None}
+    return whole if len(whole) == len(found) else None
+
+
+def _read_poses(group: h5py.Group) -> list[Poses] | None:
+    R = torch.from_numpy(group["R_lab_body"][()])
+    if not bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all()):
+        return None
+    count, use = group["count"][()].tolist(), torch.from_numpy(group["use"][()])
+    reason = [[Reason(why.decode()) for why in row] for row in group["reason"][()].tolist()]
+    parts = {name: torch.split(torch.from_numpy(group[name][()]), count) for name in POSE_PARTS}
     return [
         # Copy: a row would keep the whole array in memory.
         Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))

@@ -1,4 +1,5 @@
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -7,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.cameras import Camera
+from sphereorient.cameras import Camera, centre_lab_mm
 from sphereorient.sphere import reduced_texture, see_sphere
 from sphereorient.sphere.renderer import fine_pixels, lambert, reach_px
 from sphereorient.synth.settings import SynthSettings
@@ -55,18 +56,48 @@ def expose(
     cover = np.zeros((height, width), np.float32)
     share = 1.0 / max(1, len(position_lab_mm))
     for position, R in zip(position_lab_mm, R_lab_body, strict=True):
-        u, v = camera.project(position).tolist()
-        reach = math.ceil(reach_px(camera, position[None], settings.diameter_mm / 2)) + 2
-        left, right = max(0, round(u) - reach), min(width, round(u) + reach + 1)
-        top, bottom = max(0, round(v) - reach), min(height, round(v) + reach + 1)
+        left, right, top, bottom = box = _box(camera, position, settings.diameter_mm / 2)
         if left < right and top < bottom:
-            grey, hit = _window(scene, camera, (left, right, top, bottom), position, R)
+            grey, hit = _window(scene, camera, box, position, R)
             picture[top:bottom, left:right] += share * (grey - hit * settings.background)
             cover[top:bottom, left:right] += share * hit
     if settings.blur_px > 0:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), settings.blur_px))
         cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), settings.blur_px))
     return picture, cover
+
+
+def expose_several(
+    scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
+) -> NDArray[np.float32]:
+    """Return one exposure of K balls without noise, (H, W), blurred by the optics; nearer ones cover those behind them.
+
+    `position_lab_mm` (K, E, 3) and `R_lab_body` (K, E, 3, 3) are the poses at E instants; raises as `expose`.
+    """
+    settings = scenes[0].settings
+    width, height = camera.image_size
+    mean = np.zeros((height, width), np.float32)
+    for places, rotations in zip(position_lab_mm.unbind(1), R_lab_body.unbind(1), strict=True):
+        picture = np.full((height, width), settings.background, np.float32)
+        for k in (places - centre_lab_mm(camera)).norm(dim=-1).argsort(descending=True).tolist():
+            left, right, top, bottom = box = _box(camera, places[k], scenes[k].settings.diameter_mm / 2)
+            if left < right and top < bottom:
+                grey, hit = _window(scenes[k], camera, box, places[k], rotations[k])
+                window = picture[top:bottom, left:right]
+                window[...] = (1 - hit) * window + grey
+        mean += picture / position_lab_mm.shape[1]
+    if settings.blur_px > 0:
+        mean = np.asarray(cv2.GaussianBlur(mean, (0, 0), settings.blur_px))
+    return mean
+
+
+def _box(camera: Camera, position: Tensor, radius_mm: float) -> tuple[int, int, int, int]:
+    """Return left, right, top and bottom (the second of each excluded) of a ball in a picture, px, with a margin."""
+    (width, height), (u, v) = camera.image_size, camera.project(position).tolist()
+    reach = math.ceil(reach_px(camera, position[None], radius_mm)) + 2
+    left, right = max(0, round(u) - reach), min(width, round(u) + reach + 1)
+    top, bottom = max(0, round(v) - reach), min(height, round(v) + reach + 1)
+    return left, right, top, bottom
 
 
 def digitise(picture: NDArray[np.float32], settings: SynthSettings, rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -28,7 +28,7 @@ class DatasetSpec:
     fill: float = np.nan  # value if not measured
     since: str = ""  # first version with this dataset; older files are read without it
     rows: str = "frames"  # frames, offsets (frames + 1) or candidates
-    of_several: bool = False  # whether a file of one sphere is without it
+    of_several: bool = False  # whether the track of an only sphere is without it
 
 
 def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
@@ -44,9 +44,10 @@ def in_length(text: str, length_unit: str) -> str:
 def stored_fields(record: Any) -> Iterator[tuple[str, DatasetSpec]]:
     """Yield name and specification of every dataset of a record (or its class: in mm), in order."""
     unit = getattr(record, "length_unit", "mm")
+    alone = not isinstance(record, type) and not getattr(record, "sphere", True)
     for entry in fields(record):
-        if KEY in entry.metadata:
-            spec = entry.metadata[KEY]
+        spec = entry.metadata.get(KEY)
+        if spec is not None and not (alone and spec.of_several):
             yield entry.name, spec if unit == "mm" else replace(spec, units=in_length(spec.units, unit))
 
 
@@ -69,8 +70,6 @@ def check_shapes(record: object, rows: Mapping[str, int]) -> None:
 def write_datasets(record: Any, group: h5py.Group) -> None:
     """Write all datasets of a record."""
     for name, c in stored_fields(record):
-        if c.of_several and group.name == "/":
-            continue
         write_dataset(group, _place(name), np.asarray(getattr(record, name), c.dtype), c)
 
 

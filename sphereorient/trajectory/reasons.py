@@ -32,5 +32,6 @@ class Reason(StrEnum):
     AMBIGUOUS = "ambiguous"
     CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
     SECOND_BALL = "second_ball"  # likewise, in a movie with two balls: it may show the other one
+    HIDDEN = "hidden"  # another sphere covers it
     UNDECODABLE = "undecodable"
     MISSING = "missing"

@@ -145,6 +145,7 @@ class Trajectory:
     experiment: str
     provenance: Mapping[str, Any]  # versions, command, sha256 of inputs; JSON types
     length_unit: str = "mm"  # or radii, of a sphere of unknown diameter
+    sphere: str = ""  # name of the sphere; empty: the only one
 
     def __post_init__(self) -> None:
         frames = np.size(self.time)
@@ -156,6 +157,16 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def title(self) -> str:
+        """Name of the experiment, and of the sphere among several."""
+        return f"{self.experiment}, ball {self.sphere}" if self.sphere else self.experiment
+
+    @property
+    def bits(self) -> dict[str, int]:
+        """The flags, by name."""
+        return {str(flag.name): flag.value for flag in Flag if self.sphere or flag is not Flag.IDENTITY}
 
     @property
     def rate_scale(self) -> float:
@@ -184,7 +195,7 @@ class Trajectory:
         span = f"{self.time[0]:.6g} .. {self.time[-1]:.6g} s" if len(self) else "none"
         cameras = [f"{name} ({sum(lost.values())} frames lost)" for name, lost in counts["lost"].items()]
         return [
-            ("of", self.experiment or "an experiment without name"),
+            ("of", self.title or "an experiment without name"),
             ("frames", f"{counts['frames']}, {counts['valid']} valid"),
             ("time", span + rate),
             ("cameras", ", ".join(cameras) or "none"),
@@ -216,10 +227,10 @@ class Trajectory:
         group.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
         for name in (*TEXTS, "frame_rate", "length_unit"):
             group.attrs[name] = getattr(self, name)
+        if self.sphere:
+            group.attrs["sphere"] = self.sphere
         datasets.write_datasets(self, group)
-        alone = group.name == "/"
-        bits = {flag.name: flag.value for flag in Flag if not (alone and flag is Flag.IDENTITY)}
-        group["flags"].attrs["bits"] = json.dumps(bits)
+        group["flags"].attrs["bits"] = json.dumps(self.bits)
         cameras = group.create_group("cameras")
         for name in sorted(self.cameras):
             write_camera(self.cameras[name], cameras.create_group(name))
@@ -313,7 +324,7 @@ class Trajectory:
             axes.legend(loc="upper right", ncols=4, fontsize="small")
             axes.grid(alpha=0.3)
         axes.set_xlabel("time (s)")
-        figure.suptitle(f"{self.experiment or 'trajectory'}: {len(self)} frames, {self.method}")
+        figure.suptitle(f"{self.title or 'trajectory'}: {len(self)} frames, {self.method}")
         return figure
 
     def summary(self) -> dict[str, Any]:
@@ -373,7 +384,7 @@ def _read(group: h5py.Group) -> dict[str, Any]:
     schema, name = group.attrs.get("schema"), f"{group.file.filename}{group.name.rstrip('/')}"
     spheres = datasets.inside(group, SPHERES) if schema == SCHEMA_OF_SEVERAL else None
     if spheres is not None:
-        got, do = ", ".join(spheres)[:200], "pick one: --sphere NAME, or Tracks.load(path)[NAME] in Python"
+        got, do = ", ".join(spheres)[:200], "read all with Tracks.load(path)"
         raise TrackError(refusal(name, expected="the track of one ball", got=got, do=do))
     if schema != SCHEMA:
         got, do = repr(str(schema))[1:60].strip("'"), "pass a track, or update sphereorient where the track is newer"
@@ -387,6 +398,7 @@ def _read(group: h5py.Group) -> dict[str, Any]:
         "frame_rate": float(group.attrs["frame_rate"]),
         "provenance": json.loads(group.attrs["provenance"]),
         "length_unit": str(group.attrs.get("length_unit", "mm")),
+        "sphere": str(group.attrs.get("sphere", "")),
         **{name: str(group.attrs[name]) for name in TEXTS},
     }
 

@@ -242,15 +242,17 @@ def test_spheres_are_read_in_their_order_and_written_back_the_same(folder):
 def test_the_experiment_of_one_ball_is_that_of_a_file_with_only_this_ball(folder):
     of_b = load_experiment(written(folder, BALLS)).of("b")
     alone = load_experiment(written(folder, FULL))
-    assert of_b.names == alone.names == ("",)
+    assert of_b.spheres == of_b.of("b").spheres == of_b.of("").spheres == (dataclasses.replace(alone.sphere, name="b"),)
     assert (of_b.diameter_mm, of_b.texture_path, of_b.radius_mm) == (18.0, folder / "texture.png", 9.0)
-    assert of_b.spheres == alone.spheres == alone.of("").spheres
+    assert alone.spheres == alone.of("").spheres
+    with pytest.raises(ExperimentError, match="spheres: expected a ball b, got one without name"):
+        alone.of("b")
 
 
 def test_what_holds_for_one_ball_is_refused_for_several(folder):
     experiment = load_experiment(written(folder, BALLS))
     for name in ("sphere", "diameter_mm", "texture_path", "fixed", "radius_mm"):
-        with pytest.raises(ExperimentError, match=r"spheres: expected one ball, got b, a; pick one: --sphere NAME"):
+        with pytest.raises(ExperimentError, match=r"spheres: expected one ball, got b, a; name a file with one"):
             getattr(experiment, name)
     with pytest.raises(ExperimentError, match="spheres: expected one of b, a, got 'c'"):
         experiment.of("c")

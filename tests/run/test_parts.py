@@ -36,7 +36,7 @@ def store(tmp_path) -> FolderStore:
     parts = blank_parts(2, 2)
     one = Poses(**parts, use=torch.ones(2, dtype=torch.bool), reason=(Reason.OK, Reason.OK))
     with store.held(request, resume=False):
-        store.write(BATCH, [one] * 3)
+        store.write(BATCH, {"": [one] * 3})
     return store
 
 
@@ -70,9 +70,19 @@ def test_what_is_not_of_the_run_stays_when_its_folder_is_emptied(store, tmp_path
 
 
 def test_parts_come_back_as_they_were(store):
-    (one, _, _) = store.read(BATCH)
+    (one, _, _) = store.read(BATCH)[""]
     assert torch.equal(one.R_lab_body, torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
     assert one.use.tolist() == [True, True]
+
+
+def test_parts_of_several_balls_come_back_by_name(store, tmp_path):
+    (one, *_) = store.read(BATCH)[""]
+    with store.held(request_to(tmp_path / "track.h5"), resume=False):
+        single = Poses(**blank_parts(2, 1), use=one.use, reason=one.reason)
+        store.write(BATCH, {"a": [one] * 3, "b": [single] * 3})
+        found = store.read(BATCH)
+    assert list(found) == ["a", "b"]
+    assert [len(poses) for poses in found["a"] + found["b"]] == [2, 2, 2, 1, 1, 1]
 
 
 def damage(path: Path, name: str, values: object, *, sealed: bool) -> None:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from test_trajectory import arrays, full_trajectory
 
-from sphereorient.errors import TrackError
+from sphereorient.errors import ShapeError, TrackError
 from sphereorient.trajectory import Flag, Tracks, Trajectory
 
 
 def several() -> Tracks:
     track = full_trajectory()
     doubt = replace(track, identity=np.linspace(0.5, 1, len(track)), flags=track.flags | Flag.IDENTITY)
-    return Tracks({"b": track, "a": doubt, "c": track[2:5]})
+    return Tracks({"b": track, "a": doubt, "c": replace(track, cameras={})})
 
 
 def same(one: Trajectory, other: Trajectory) -> None:
@@ -45,6 +45,9 @@ def test_the_group_of_a_ball_is_a_file_of_one_ball(tmp_path: Path) -> None:
             file.copy(f"spheres/b/{name}", alone)
         alone.attrs.update(file["spheres/b"].attrs)
     same(Trajectory.load(tmp_path / "b.h5"), several()["b"])
+    assert list(Tracks.load(tmp_path / "b.h5")) == ["b"]
+    several()["b"].save(tmp_path / "saved.h5")
+    same(Trajectory.load(tmp_path / "saved.h5"), several()["b"])
 
 
 def test_of_one_ball_without_name_the_file_is_that_of_a_trajectory(tmp_path: Path) -> None:
@@ -57,6 +60,28 @@ def test_of_one_ball_without_name_the_file_is_that_of_a_trajectory(tmp_path: Pat
         assert "identity" not in file
 
 
+def test_tracks_of_other_times_are_refused() -> None:
+    with pytest.raises(ShapeError, match="Tracks: expected the same times of every ball, got 7, 3 frames"):
+        Tracks({"a": full_trajectory(), "b": full_trajectory()[2:5]})
+
+
+def test_one_of_several_is_picked_by_name() -> None:
+    assert list(several().picked("a")) == ["a"]
+    assert several().picked(None).keys() == several().keys()
+    with pytest.raises(TrackError, match="--sphere: expected b, a, c, got 'd'"):
+        several().picked("d")
+    with pytest.raises(TrackError, match="expected one ball without name, got 'a'; leave --sphere out"):
+        Tracks.of(full_trajectory()).picked("a")
+    assert several()["a"][1:3].sphere == "a"
+    assert "ball a" in repr(several())
+
+
+def test_one_ball_with_a_name_keeps_it_in_the_file_of_a_trajectory(tmp_path: Path) -> None:
+    several().picked("a").save(tmp_path / "track.h5")
+    same(Trajectory.load(tmp_path / "track.h5"), several()["a"])
+    assert Tracks.load(tmp_path / "track.h5")["a"].bits["IDENTITY"] == 1024
+
+
 def test_equal_tracks_give_equal_bytes(tmp_path: Path) -> None:
     several().save(tmp_path / "one.h5")
     several().save(tmp_path / "two.h5")
@@ -65,7 +90,7 @@ def test_equal_tracks_give_equal_bytes(tmp_path: Path) -> None:
 
 def test_a_file_of_several_balls_is_no_trajectory_and_the_refusal_names_the_balls(tmp_path: Path) -> None:
     several().save(tmp_path / "track.h5")
-    with pytest.raises(TrackError, match=r"expected the track of one ball, got b, a, c; pick one: .*Tracks\.load"):
+    with pytest.raises(TrackError, match=r"expected the track of one ball, got b, a, c; read all with Tracks\.load"):
         Trajectory.load(tmp_path / "track.h5")
 
 

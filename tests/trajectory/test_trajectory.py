@@ -58,7 +58,7 @@ def full_trajectory() -> Trajectory:
     drawn |= {"valid": rng.random(FRAMES) > 0.5, "segment": np.repeat([0, -1, 1], [3, 1, 3])}
     drawn["flags"] = np.full(FRAMES, Flag.SPIKE | Flag.ONE_CAMERA, np.uint32)
     drawn["time"] = track.time
-    drawn["position"][3] = drawn["identity"][:] = np.nan  # the latter is of several balls only
+    drawn["position"][3] = drawn["identity"][:] = np.nan  # identity is of several balls only
     camera = replace(
         CameraTrack.empty(FRAMES),
         centre_px=rng.standard_normal((FRAMES, 2)),

@@ -26,9 +26,9 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
 from sphereorient.run.stages import track_movies
-from sphereorient.trajectory import CameraTrack, Trajectory
+from sphereorient.trajectory import CameraTrack, Tracks, Trajectory, one_track
 
-Tracker = Callable[[Path], Trajectory]  # experiment.yaml to a track; can be pickled
+Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]
 PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
 DIGITS = 5
@@ -136,7 +136,7 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
     """Track a scene and measure the track; a refusal of the method is a result too."""
     begin = time.perf_counter()
     try:
-        track = tracker(experiment)
+        track = one_track(tracker(experiment))
     except SphereOrientError as error:
         measured = no_track(scene.frames, " ".join(str(error).split()))
         seconds = time.perf_counter() - begin

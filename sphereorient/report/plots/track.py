@@ -1,6 +1,6 @@
 """A track in six dimensions against time, and its path through space with the sphere's axes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -101,30 +101,38 @@ def track_figure(track: Trajectory) -> Figure:
 
 
 @look.in_style
-def path_figure(track: Trajectory) -> Figure:
-    """Draw the path in the lab, to scale, with body axes; of a long track `shown_part`. Source: the paper, figure."""
-    part = shown_part(track)
+def path_figure(*tracks: Trajectory) -> Figure:
+    """Draw the path in the lab, to scale, with body axes; of a long track `shown_part`. Several are of one
+    recording, a colour each sphere. Source: the paper, figure.
+    """
+    parts = [shown_part(track) for track in tracks]
     figure = look.new_figure(look.WIDTH_IN, 5.6)
     axes: Any = figure.add_subplot(projection="3d")
-    axes.set(**{f"{axis}label": f"{axis}, lab ({track.length_unit})" for axis in "xyz"})
-    position = part.track.position_smooth
-    there = np.flatnonzero(np.isfinite(position).all(1))
-    if len(there):
-        size = TRIPOD_SIZE * max(float(np.ptp(position[there], axis=0).max()), 1.0)
-        axes.plot(*_cut(position, part.broken).T, color=look.ALL.colour, linewidth=1.0, label="path")
-        axes.plot(*position[there[:1]].T, marker="o", markersize=5, color=look.ALL.colour, label="start")
-        _tripods(axes, part.track, there, size)
-        _equal_scale(axes, position[there], size)
+    axes.set(**{f"{axis}label": f"{axis}, lab ({tracks[0].length_unit})" for axis in "xyz"})
+    whole = np.concatenate([part.track.position_smooth for part in parts])
+    whole = whole[np.isfinite(whole).all(1)]
+    styles = [look.ALL, *(replace(look.ALL, colour=colour) for colour in look.BALLS)]
+    named = [(part, styles[k % len(styles)], part.track.sphere or "path") for k, part in enumerate(parts)]
+    if len(whole):
+        size = TRIPOD_SIZE * max(float(np.ptp(whole, axis=0).max()), 1.0)
+        for part, style, name in named:
+            position = part.track.position_smooth
+            there = np.flatnonzero(np.isfinite(position).all(1))
+            axes.plot(*_cut(position, part.broken).T, color=style.colour, linewidth=1.0, label=name)
+            axes.plot(*position[there[:1]].T, marker="o", markersize=5, color=style.colour, label="start")
+            _tripods(axes, part.track, there, size)
+        _equal_scale(axes, whole, size)
     else:
         look.say_empty(axes)
     start = look.ALL.handle("start", marker="o", linestyle="none", markersize=5)
+    paths = [style.handle(name, linewidth=1.0) for _, style, name in named]
     arms = [
         style.handle(f"body axis {style.name}", linestyle="-", marker=style.marker, linewidth=1.6)
         for style in look.COMPONENTS
     ]
-    look.legend_of_figure(figure, [look.ALL.handle("path", linewidth=1.0), start, *arms], ncols=5)
+    look.legend_of_figure(figure, [*paths, start, *arms], ncols=5)
     words = "the sphere's axes are not to scale"
-    look.note(figure, f"{part.words}; {words}" if part.words else words)
+    look.note(figure, f"{parts[0].words}; {words}" if parts[0].words else words)
     return figure
 
 

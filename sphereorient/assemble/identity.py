@@ -1,0 +1,218 @@
+"""Which of several balls that look alike is which, over the whole movie: by their motion alone, as one assignment."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
+
+from sphereorient import so3
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FITTED = 6  # frames from which a motion is extrapolated
+ORDER = 2  # of its polynomial
+JUMP = 12.0  # times the usual error of an extrapolation to the next frame: a piece may end here
+SAMPLES = 200  # windows of which the errors of one gap are measured
+SHARE, OF_CHI = 90.0, 2.5  # percentile of an error's length, and what this is of a normal one of three components
+NO_LINK = 60.0  # chi2 of a piece that follows none
+FARTHEST = 256  # frames over which pieces are linked
+CERTAIN = 0.9999  # probability from which a name was never in doubt
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Frames in which one row follows one ball without a break."""
+
+    row: int
+    first: int
+    last: int  # + 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Motions:
+    """Poses of K rows in N frames, and how far extrapolations of them err."""
+
+    position_lab_mm: Floats  # (K, N, 3)
+    R_lab_body: Floats  # (K, N, 3, 3)
+    time_s: Floats  # (N,)
+
+    def away(self, frames: Indices, row: int, to_row: int, to: int) -> Floats:
+        """Return how far the pose of a row in a frame is from where other frames, the nearest one first, predict it:
+        move (mm) and turn (rad), (2,).
+        """
+        t = self.time_s[frames] - self.time_s[frames[0]]
+        scale = np.abs(t).max() or 1.0
+        R0 = self.R_lab_body[row, frames[0]]
+        turn = so3.log(torch.from_numpy(self.R_lab_body[row, frames] @ R0.T)).numpy()
+        path = np.concatenate([self.position_lab_mm[row, frames], turn], axis=1)
+        degree = min(ORDER, len(frames) - 1)
+        powers = (t[:, None] / scale) ** np.arange(degree + 1)
+        at = ((self.time_s[to] - self.time_s[frames[0]]) / scale) ** np.arange(degree + 1)
+        there = at @ np.linalg.lstsq(powers, path, rcond=None)[0]
+        R = so3.exp(torch.from_numpy(there[3:])) @ torch.from_numpy(R0)
+        off = so3.geodesic_distance(R, torch.from_numpy(self.R_lab_body[to_row, to]))
+        return np.array([np.linalg.norm(there[:3] - self.position_lab_mm[to_row, to]), float(off)])
+
+
+def same_balls(
+    position_lab_mm: Floats, R_lab_body: Floats, seen: NDArray[np.bool_], time_s: Floats, breaks: Sequence[int]
+) -> tuple[Indices, Floats]:
+    """Return which row is which ball, (K, N): that of each ball in each frame, and the probability that the ball has
+    kept its name, (K, N), NaN where that was never in doubt.
+
+    Pieces of rows, which end where the row may have changed to another ball, are linked by the errors of extrapolating
+    each of two pieces to the other, in place and rotation, over the errors that this makes within pieces.
+
+    Args:
+        position_lab_mm: (K, N, 3), of K rows in N frames.
+        R_lab_body: (K, N, 3, 3).
+        seen: (K, N) bool, where the rows have a pose.
+        time_s: (N,), s.
+        breaks: frames before which all rows may have changed.
+    """
+    rows, frames = seen.shape
+    motions = _Motions(position_lab_mm, R_lab_body, time_s)
+    pieces = _unbroken(seen, breaks)
+    scale = _scale(motions, pieces)
+    pieces = [part for piece in pieces for part in _without_jumps(motions, piece, scale)]
+    pieces.sort(key=lambda piece: (piece.first, piece.row))
+    links = _links(motions, pieces, scale)
+    after = _linked(len(pieces), links)
+    sure = {end: _sure(end, after, links) for end in after}
+    order = np.tile(np.arange(rows)[:, None], (1, frames))
+    probability = np.ones((rows, frames))
+    taken = np.zeros((rows, frames), bool)
+    begun = set(range(len(pieces))) - set(after.values())
+    for start in sorted(begun):
+        chain, likely = [start], [1.0]
+        while chain[-1] in after:
+            likely.append(likely[-1] * sure[chain[-1]])
+            chain.append(after[chain[-1]])
+        spans = [slice(pieces[k].first, pieces[k].last) for k in chain]
+        free = [ball for ball in range(rows) if not any(taken[ball, span].any() for span in spans)]
+        if not free:  # more pieces at one time than balls: the last one goes where it was
+            free = [pieces[start].row]
+        own = pieces[start].row
+        ball = own if own in free else free[0]
+        # A piece that follows none may be any ball that is not followed.
+        first = 1.0 if pieces[start].first == 0 or len(free) == 1 else 1.0 / len(free)
+        for k, span, share in zip(chain, spans, likely, strict=True):
+            order[ball, span], taken[ball, span] = pieces[k].row, True
+            probability[ball, span] = first * share
+    return _whole(order, taken), np.where(probability < CERTAIN, probability, np.nan)
+
+
+def _whole(order: Indices, taken: NDArray[np.bool_]) -> Indices:
+    """Return an order in which rows without a ball belong to the balls without a row."""
+    for frame in np.flatnonzero(~taken.all(0)):
+        balls = np.flatnonzero(~taken[:, frame])
+        left = sorted(set(range(len(order))) - set(order[taken[:, frame], frame].tolist()))
+        order[balls, frame] = left[: len(balls)]
+    return order
+
+
+def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
+    """Return the pieces between breaks in which a row has poses."""
+    found = []
+    ends = sorted({0, *breaks, seen.shape[1]})
+    for row, there in enumerate(seen):
+        for first, last in pairwise(ends):
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], there[first:last].astype(int), [0]]))) + first
+            found += [_Piece(row, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return found
+
+
+def _before(piece: _Piece, frame: int) -> Indices:
+    return np.arange(frame - 1, max(piece.first, frame - FITTED) - 1, -1)
+
+
+def _scale(motions: _Motions, pieces: Sequence[_Piece]) -> Floats:
+    """Return gaps and the errors of extrapolations over them, per component, (n, 3): frames, mm, rad."""
+    found = []
+    gap = 1
+    while gap <= FARTHEST:
+        windows = [(piece, frame) for piece in pieces for frame in range(piece.first + FITTED, piece.last - gap + 1)]
+        if not windows:
+            break
+        some = [windows[k] for k in np.unique(np.linspace(0, len(windows) - 1, SAMPLES).astype(int))]
+        away = [motions.away(_before(piece, frame), piece.row, piece.row, frame - 1 + gap) for piece, frame in some]
+        found.append([gap, *(np.percentile(away, SHARE, axis=0) / OF_CHI)])
+        gap *= 2
+    return np.array(found) if found else np.array([[1.0, np.inf, np.inf]])
+
+
+def _error(scale: Floats, gap: int) -> Floats:
+    """Return the error of an extrapolation over a gap, (2,): mm and rad; beyond all that is known with its square."""
+    at = min(gap, scale[-1, 0])
+    known = np.array([np.exp(np.interp(np.log(at), np.log(scale[:, 0]), np.log(part))) for part in scale[:, 1:].T])
+    return np.asarray(known * (gap / at) ** 2)
+
+
+def _without_jumps(motions: _Motions, piece: _Piece, scale: Floats) -> Iterator[_Piece]:
+    """Yield the parts of a piece between jumps."""
+    first = piece.first
+    for frame in range(piece.first + FITTED, piece.last):
+        if frame - first < FITTED:
+            continue
+        away = motions.away(_before(_Piece(piece.row, first, frame), frame), piece.row, piece.row, frame)
+        if (away > JUMP * _error(scale, 1)).any():
+            yield _Piece(piece.row, first, frame)
+            first = frame
+    yield _Piece(piece.row, first, piece.last)
+
+
+def _links(motions: _Motions, pieces: Sequence[_Piece], scale: Floats) -> dict[tuple[int, int], float]:
+    """Return chi2 of each pair of pieces of which one may follow the other."""
+    links = {}
+    for j, later in enumerate(pieces):
+        ahead = np.arange(later.first, min(later.last, later.first + FITTED))
+        for i, early in enumerate(pieces):
+            gap = later.first - early.last + 1
+            if not 0 < gap <= FARTHEST:
+                continue
+            off = [
+                motions.away(_before(early, early.last), early.row, later.row, later.first),
+                motions.away(ahead, later.row, early.row, early.last - 1),
+            ]
+            links[i, j] = float(np.mean([((one / _error(scale, gap)) ** 2).sum() for one in off]))
+    return links
+
+
+def _linked(count: int, links: dict[tuple[int, int], float]) -> dict[int, int]:
+    """Return the piece that follows each piece that one does: the assignment of the least sum of chi2."""
+    if not links:
+        return {}
+    pairs = np.array(list(links))
+    ends, begins = pairs.T
+    every = np.arange(count)
+    # A piece that none follows, and one that follows none, are linked to places that stand for that.
+    row = np.concatenate([ends, every, count + every, count + begins])
+    column = np.concatenate([begins, count + every, every, count + ends])
+    tiny = 1e-9  # 0 means no link
+    weight = np.concatenate(
+        [
+            np.minimum(np.array(list(links.values())), 1e9) + tiny,
+            np.full(2 * count, NO_LINK / 2),
+            np.full(len(pairs), tiny),
+        ]
+    )
+    matrix = coo_array((weight, (row, column)), shape=(2 * count, 2 * count)).tocsr()
+    chosen = zip(*min_weight_full_bipartite_matching(matrix), strict=True)
+    return {int(i): int(j) for i, j in chosen if i < count and j < count}
+
+
+def _sure(end: int, after: dict[int, int], links: dict[tuple[int, int], float]) -> float:
+    """Return the probability of a link among those in which it is exchanged with another one."""
+    begin, odds = after[end], 0.0
+    for other_end, other_begin in after.items():
+        exchanged = [links.get(pair) for pair in ((end, other_begin), (other_end, begin))]
+        if other_end != end and exchanged[0] is not None and exchanged[1] is not None:
+            more = exchanged[0] + exchanged[1] - links[end, begin] - links[other_end, other_begin]
+            odds += np.exp(-0.5 * min(max(more, -100.0), 200.0))
+    return 1.0 / (1.0 + odds)
