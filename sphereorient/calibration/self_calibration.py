@@ -19,7 +19,7 @@ from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import TrackError
 from sphereorient.files.yaml_file import refuse_unknown
-from sphereorient.trajectory import Reason, Trajectory
+from sphereorient.trajectory import Reason, Tracks, Trajectory
 
 OBSERVED = (Reason.OK, Reason.CONTRADICTS)
 MOVED = (*ROTATION, *TRANSLATION)
@@ -95,12 +95,21 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
 
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
-    """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them.
-    CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other cameras.
+    """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them, by all
+    spheres in it. CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other
+    cameras.
     """
-    cameras, track = load_cameras(cameras_path), Trajectory.load(track_path)
-    used = {name: camera for name, camera in cameras.items() if name in track.cameras} or cameras
-    return self_calibrate(used, observations_of(track, used))
+    cameras, tracks = load_cameras(cameras_path), list(Tracks.load(track_path).values())
+    used = {name: camera for name, camera in cameras.items() if name in tracks[0].cameras} or cameras
+    each = [observations_of(track, used) for track in tracks]
+    observed = {
+        name: CameraObservations(
+            centre_px=torch.cat([one[name].centre_px for one in each]),
+            R_lab_body=torch.cat([one[name].R_lab_body for one in each]),
+        )
+        for name in used
+    }
+    return self_calibrate(used, observed)
 
 
 def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> Repaired:

@@ -162,6 +162,13 @@ def alike(job: Job) -> list[list[str]]:
     return list(kinds.values())
 
 
+def unlit(job: Job, views: Mapping[str, Sequence[CameraView]]) -> dict[str, Initialiser]:
+    """Return how each ball is looked for before its light is known; balls that look alike share it."""
+    paints = [_Paint.of(job, names, views[names[0]]) for names in alike(job)]
+    first = {name: paint.first for paint in paints for name in paint.names}
+    return {name: first[name] for name in job.recording.experiment.names}
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Paint:
     """Balls that look alike, and how they are looked for before their light is known."""

@@ -8,13 +8,14 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import agreement, cameras, movies, texture_map
 from sphereorient.preflight.finding import FAULT, OK, Finding, Severity, judged, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
+from sphereorient.preflight.scene import SceneView, look_at_scene
 from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture, load_unseen
 
@@ -36,6 +37,7 @@ class Preflight:
     similar: texture_map.ViewPair | None
     agreement: tuple[Finding, ...]  # of a short stretch tracked; none with one camera or without a map
     matches: tuple[texture_map.TextureMatch, ...]
+    scene: tuple[SceneView, ...] = ()  # of several balls: a picture of each camera
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -58,6 +60,8 @@ def preflight(
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
+        if len(experiment.spheres) > 1:
+            return _of_scene(recording, settings, progress)
         image, unseen = None, None
         if experiment.texture_path is not None and experiment.texture_path.exists():
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
@@ -97,6 +101,27 @@ def preflight(
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
+
+
+def _of_scene(recording: Recording, settings: Settings, progress: Progress) -> Preflight:
+    """Check an experiment of several balls."""
+    scene, found = look_at_scene(recording, settings, progress)
+    experiment = recording.experiment
+    return Preflight(
+        experiment=experiment,
+        timeline=recording.timeline,
+        samples=(),
+        closer=(),
+        scan=None,
+        texture=None,
+        unseen=None,
+        matches=(),
+        measures=None,
+        similar=None,
+        agreement=(),
+        scene=scene,
+        findings=(movies.frames(experiment, recording.timeline), *movies.outside(experiment), *found),
+    )
 
 
 def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:

@@ -177,7 +177,10 @@ def preflight_figure(result: Preflight, path: Path) -> None:
     heights = [PICTURE, PICTURE if agreement else 0.01, LINE * (len(lines) + 2)]
     figure = new_figure(WIDTH, sum(heights))
     top, middle, bottom = np.ravel(figure.subfigures(3, 1, height_ratios=heights, squeeze=False))
-    _cameras_part(top, result)
+    if result.samples:
+        _cameras_part(top, result)
+    else:
+        _scene_part(top, result)
     if agreement:
         gap, balance, pair = middle.subplots(1, 3, width_ratios=[1.1, 1.5, 1.4])
         _draw_gap(gap, result)
@@ -200,6 +203,19 @@ def _cameras_part(part: Any, result: Preflight) -> None:
             _draw_ball(ax, sample, k, expected, near)
     if axes[0].lines:
         axes[0].legend(loc="lower left", fontsize=7, framealpha=0.8)
+
+
+def _scene_part(part: Any, result: Preflight) -> None:
+    """Draw a picture of each camera with all disks, and the names of the balls found."""
+    for ax, view in zip(part.subplots(1, max(1, len(result.scene)), squeeze=False)[0], result.scene, strict=False):
+        height, width = view.picture.shape
+        ax.imshow(view.picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(view.picture, 99.8))))
+        for outline in view.disks:
+            ax.plot(*_circle(outline), lw=1.2, color=FOUND)
+        for name, (u, v) in view.balls.items():
+            ax.text(u, v, name, color=EXPECTED, fontsize=10, ha="center", va="center", clip_on=True)
+        ax.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        ax.set_title(f"{view.name}, frame {view.frame}: disks, and the balls found by their paint", fontsize=9)
 
 
 def _expected_px(result: Preflight, sample: MovieSample, k: int) -> NDArray[np.float64] | None:
