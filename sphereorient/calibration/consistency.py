@@ -147,12 +147,11 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
     """
     compare = _Comparison(seen, limits)
     found = compare(compare.sights())
-    gap, turn, size = found[:, 0].abs(), found[:, 1:4].norm(dim=-1), found[:, 4:6]
-    count = int(torch.isfinite(gap).sum())
+    count = int(torch.isfinite(found[..., 0]).sum(1).amax()) if len(found) else 0
     if count < FEWEST:
         return Consistency(frames=count)
-    middle = size.nanmedian(0).values.nan_to_num()
-    usual = torch.stack([gap.nanmedian(), turn.nanmedian(), middle[middle.abs().argmax()]])
+    usual = _usual(found)
+    usual = usual.gather(0, usual.nan_to_num().abs().argmax(0, keepdim=True))[0]  # of the pair that is farthest apart
     known = Consistency(
         frames=count,
         gap_px=limits.gap_px * float(usual[0]),
@@ -169,6 +168,36 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
         fewest = min(cause.parameters for cause in causes)
         causes = [cause for cause in causes if cause.parameters == fewest]
     return replace(known, causes=tuple(causes))
+
+
+def _usual(found: Tensor) -> Tensor:
+    """Return the typical gap, turn, and size that is farthest from the expected one, of each pair, (P, 3)."""
+    gap, turn, size = found[..., 0].abs(), found[..., 1:4].norm(dim=-1), found[..., 4:6]
+    middle = size.nanmedian(1).values.nan_to_num()
+    farthest = middle.gather(1, middle.abs().argmax(1, keepdim=True))
+    return torch.cat([gap.nanmedian(1, keepdim=True).values, turn.nanmedian(1, keepdim=True).values, farthest], 1)
+
+
+def majority(seen: Seen, limits: Limits) -> tuple[int, ...]:
+    """Return the largest set of cameras of which each two agree; none where these are not more than half of all.
+    Of sets of one size that whose lines of sight and sizes agree best: where two cameras alone measure a direction, the
+    size of the picture in another, which looks along it, decides.
+    """
+    compare = _Comparison(seen, limits)
+    found, count = compare(compare.sights()), len(compare.cameras)
+    if not found.shape[1]:
+        return ()
+    gap, turn, size = _usual(found).unbind(1)
+    agree = (gap <= 1) & (turn.nan_to_num(0.0) <= 1)  # without paint in view no turn is known
+    worse = torch.where(agree, gap.square() + size.square(), torch.inf)
+    apart = dict(zip(compare.pairs, worse.tolist(), strict=True))
+    for several in range(count, count // 2, -1):
+        sets = combinations(range(count), several)
+        worst = {some: max(apart[pair] for pair in combinations(some, 2)) for some in sets}
+        best = min(worst, key=lambda some: worst[some])
+        if math.isfinite(worst[best]):
+            return best
+    return ()
 
 
 class _Comparison:
@@ -225,7 +254,7 @@ class _Comparison:
         sized: bool = True,
         wider: Tensor | None = None,
     ) -> Tensor:
-        """Return gap, turn (3), log sizes (2) and stretches (2) of all frames and pairs, (M, 8), in units of limits.
+        """Return gap, turn (3), log sizes (2) and stretches (2) of pairs and frames, (P, N, 8), in units of limits.
         `larger`: logarithm of the factor by which pictures of the sphere are larger than the cameras say, () or (C,);
         `wider`: by how much wider than high, relative, (C,).
         """
@@ -241,12 +270,12 @@ class _Comparison:
             parts.append(torch.cat([(gap_mm * px_mm)[:, None], turn, size, stretch[:, [k, m]]], -1))
         limits = self.limits
         scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2]
-        return torch.cat(parts) / torch.tensor(scale, dtype=torch.float64)
+        return torch.stack(parts) / torch.tensor(scale, dtype=torch.float64)
 
     def causes(self, found: Tensor) -> Iterator[Cause]:
         """Yield what may be wrong, with the share of the misfit that it leaves."""
         names, count = self.names, len(self.names)
-        whole, unsized = _misfit(found), _misfit(found[:, :4])
+        whole, unsized = _misfit(found), _misfit(found[..., :4])
         for k, m in self.pairs:
             if self.cameras[k].image_size == self.cameras[m].image_size:
                 places = [*range(count)]
@@ -334,7 +363,8 @@ class _Comparison:
     def _late(self, frame: Tensor, whole: float) -> Iterator[Cause]:
         """Each movie some frames late; between frames all is interpolated."""
         shifts = np.arange(-LATEST, LATEST + 0.5, 0.5)
-        for k, name in enumerate(self.names[1:], 1):
+        # Of two the first one sets the time; of more the others do.
+        for k, name in list(enumerate(self.names))[len(self.names) == 2 :]:
             left = [_misfit(self(self._shifted(k, frame, float(shift)))) / whole for shift in shifts]
             if np.isnan(left).all():
                 continue
@@ -364,5 +394,5 @@ def _degrees(turn: Floats) -> float:
 
 
 def _misfit(found: Tensor) -> float:
-    """Return the median over frames of the mean square of what was measured; NaN without."""
-    return float(found.square().nanmean(-1).nanmedian())
+    """Return the median over frames of the mean square of what was measured (P, N, K), mean of pairs; NaN without."""
+    return float(found.square().nanmean(-1).nanmedian(1).values.nanmean())

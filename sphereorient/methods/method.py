@@ -54,6 +54,7 @@ class Learnt:
     right_score: float
     usual_apart_rad: float
     together: bool
+    majority: tuple[int, ...] = ()  # see `Appearance`
     second_ball: bool = False
     sharper: bool = False
     worn: torch.Tensor | None = None  # see `Appearance`
@@ -80,7 +81,7 @@ class Learnt:
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
-            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER)},
+            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER, "majority")},
             worn=study.worn,
             process=process,
             acceleration_rad_s2=acceleration_rad_s2 if told else None,
@@ -110,7 +111,7 @@ class Learnt:
         )
         if self.instants > 1:
             fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
-        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "worn")}
+        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "majority", "worn")}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
     def save(self, path: Path) -> None:
@@ -180,6 +181,8 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
     file.attrs["cameras"] = list(learnt.scenes)
+    if learnt.majority:
+        file.attrs["majority"] = learnt.majority
     for name, scene in learnt.scenes.items():
         group, background = file.create_group(f"cameras/{name}"), scene.background
         group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
@@ -233,6 +236,7 @@ def _read(file: h5py.File) -> Learnt:
         limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
         lasting=lasting,
         worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,
+        majority=tuple(int(k) for k in file.attrs.get("majority", ())),
         process=_process(file["process"]) if "process" in file else None,
         acceleration_rad_s2=None if acceleration is None else float(acceleration),
         **told,

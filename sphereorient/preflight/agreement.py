@@ -43,7 +43,7 @@ def cameras_agree(
         request = Request(
             experiment=replace(experiment, frames=(first, first + len(stretch[0].frame))),
             settings=settings,
-            learnt=replace(learnt, together=False),
+            learnt=replace(learnt, together=False, majority=()),
         )
         track = run(request, MemoryStore())
     except SphereOrientError as error:
