@@ -68,6 +68,7 @@ class Cause:
     left: float  # share of the misfit that it leaves
     parameters: int
     deadly: bool = False  # nothing can be measured before it is corrected
+    cameras: tuple[int, ...] = ()  # that it blames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +163,8 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
     if not known.contradicts:
         return known
     causes = sorted((c for c in compare.causes(found) if c.left < EXPLAINS), key=lambda cause: cause.left)
+    agree = {*compare.majority(found)} if len(compare.cameras) > 2 else set()
+    causes = [cause for cause in causes if not agree & {*cause.cameras}] or causes
     if causes:
         enough = EQUALLY * causes[0].left + SIMPLER / max(_misfit(found), 1e-9)
         causes = [cause for cause in causes if cause.left < enough]
@@ -184,20 +187,7 @@ def majority(seen: Seen, limits: Limits) -> tuple[int, ...]:
     size of the picture in another, which looks along it, decides.
     """
     compare = _Comparison(seen, limits)
-    found, count = compare(compare.sights()), len(compare.cameras)
-    if not found.shape[1]:
-        return ()
-    gap, turn, size = _usual(found).unbind(1)
-    agree = (gap <= 1) & (turn.nan_to_num(0.0) <= 1)  # without paint in view no turn is known
-    worse = torch.where(agree, gap.square() + size.square(), torch.inf)
-    apart = dict(zip(compare.pairs, worse.tolist(), strict=True))
-    for several in range(count, count // 2, -1):
-        sets = combinations(range(count), several)
-        worst = {some: max(apart[pair] for pair in combinations(some, 2)) for some in sets}
-        best = min(worst, key=lambda some: worst[some])
-        if math.isfinite(worst[best]):
-            return best
-    return ()
+    return compare.majority(compare(compare.sights()))
 
 
 class _Comparison:
@@ -272,6 +262,23 @@ class _Comparison:
         scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2]
         return torch.stack(parts) / torch.tensor(scale, dtype=torch.float64)
 
+    def majority(self, found: Tensor) -> tuple[int, ...]:
+        """Return the cameras that agree, see `majority`, of what was measured."""
+        count = len(self.cameras)
+        if not found.shape[1]:
+            return ()
+        gap, turn, size = _usual(found).unbind(1)
+        agree = (gap <= 1) & (turn.nan_to_num(0.0) <= 1)  # without paint in view no turn is known
+        worse = torch.where(agree, gap.square() + size.square(), torch.inf)
+        apart = dict(zip(self.pairs, worse.tolist(), strict=True))
+        for several in range(count, count // 2, -1):
+            sets = combinations(range(count), several)
+            worst = {some: max(apart[pair] for pair in combinations(some, 2)) for some in sets}
+            best = min(worst, key=lambda some: worst[some])
+            if math.isfinite(worst[best]):
+                return best
+        return ()
+
     def causes(self, found: Tensor) -> Iterator[Cause]:
         """Yield what may be wrong, with the share of the misfit that it leaves."""
         names, count = self.names, len(self.names)
@@ -281,10 +288,11 @@ class _Comparison:
                 places = [*range(count)]
                 places[k], places[m] = m, k
                 left = _misfit(self(self.sights(places=places), sized=False)) / unsized
-                yield Cause(words=f"swap {names[k]} and {names[m]} under movies:", left=left, parameters=0, deadly=True)
+                words = f"swap {names[k]} and {names[m]} under movies:"
+                yield Cause(words=words, left=left, parameters=0, deadly=True, cameras=(k, m))
         for k, name in enumerate(names):
             left = _misfit(self(self._upside_down(k), sized=False)) / unsized
-            yield Cause(words=f"write flip: {{{name}: both}}", left=left, parameters=0, deadly=True)
+            yield Cause(words=f"write flip: {{{name}: both}}", left=left, parameters=0, deadly=True, cameras=(k,))
         mm = self.seen.diameter_mm
         words = (
             f"sphere.diameter {mm:.4g} explains the pictures if it is {{:.4g}}, or the calibration's lengths are off"
@@ -295,18 +303,21 @@ class _Comparison:
         for some in [list(range(count)), *([k] for k in range(count))]:
             words = f"pixels of {' and '.join(names[k] for k in some)} {{:+.1f}} % wider than calibrated: check sx, "
             words += "pixel_pitch, and whether the movie was resized"
-            yield self._best(partial(self._wide, some), 1, words, lambda p: [100 * p[0]], whole)
+            wide = self._best(partial(self._wide, some), 1, words, lambda p: [100 * p[0]], whole)
+            yield replace(wide, cameras=tuple(some))
         for k, name in enumerate(names):
             words = f"{name} turned by {{:.2g}} degrees since its calibration: calibrate again"
-            yield self._best(partial(self._moved, k), 3, words, lambda p: [_degrees(p)], whole)
+            moved = self._best(partial(self._moved, k), 3, words, lambda p: [_degrees(p)], whole)
+            yield replace(moved, cameras=(k,))
             words = f"{name} turned by {{:.2g}} degrees and moved by {{:.2g}} mm since its calibration: calibrate again"
-            yield self._best(
+            moved = self._best(
                 partial(self._moved, k),
                 6,
                 words,
                 lambda p: [_degrees(p[:3]), 100 * float(np.linalg.norm(p[3:]))],
                 whole,
             )
+            yield replace(moved, cameras=(k,))
         if self.seen.frame is not None:
             yield from self._late(self.seen.frame, whole)
 
@@ -370,7 +381,7 @@ class _Comparison:
                 continue
             best = int(np.nanargmin(left))
             words = f"the movie of {name} {abs(shifts[best]):g} frames {'late' if shifts[best] > 0 else 'early'}"
-            yield Cause(words=f"{words}: check start:", left=left[best], parameters=1)
+            yield Cause(words=f"{words}: check start:", left=left[best], parameters=1, cameras=(k,))
 
     def _shifted(self, camera: int, frame: Tensor, late: float) -> list[_Sight]:
         """Return what the cameras say if one shows each frame `late` frames later."""
