@@ -113,8 +113,8 @@ class Lighting(Protocol):
     def tables(self) -> "LightTables":
         """What `at` looks up."""
 
-    def of(self, camera: int) -> "Lighting":
-        """Return the light of one camera."""
+    def of(self, *cameras: int) -> "Lighting":
+        """Return the light of some cameras."""
 
     def to(self, device: torch.device) -> "Lighting":
         """Return the light on another device."""
@@ -195,10 +195,9 @@ class Light:
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
 
-    def of(self, camera: int) -> "Light":
-        """Return the light of one camera."""
-        one = slice(camera, camera + 1)
-        return replace(self, **{name: getattr(self, name)[one] for name in LIGHT_PARTS})
+    def of(self, *cameras: int) -> "Light":
+        """Return the light of some cameras."""
+        return replace(self, **{name: getattr(self, name)[list(cameras)] for name in LIGHT_PARTS})
 
     def to(self, device: torch.device) -> "Light":
         """Return the light on another device."""
