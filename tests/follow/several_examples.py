@@ -29,7 +29,7 @@ class Several:
     R_lab_body: dict[str, np.ndarray]  # (N, 3, 3)
 
 
-def write_several(folder: Path, balls: str = "abc", cameras: int = 2) -> Several:
+def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several:
     """Balls that cross in the pictures: a passes before b in the first camera, c follows behind."""
     settings = SynthSettings(
         frames=FRAMES,
@@ -38,6 +38,7 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 2) -> Several
         diameter_px=52.0,
         diameter_mm=DIAMETER_MM,
         distance_mm=520.0,
+        black=70.0,
         exposure=0.0,
         exposure_samples=1,
     )
