@@ -362,6 +362,8 @@ class ChunkTracker:
             explained |= (score >= self.score_min - HIDDEN_LESS * (1.0 - left)) & (left < 1.0)
             explained |= (score == 0) & (left < SILENT)
         arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
+        if visible is not None:  # of little paint the pose may not be known at all
+            arrived &= ((score > 0) & seen).any(1) & np.isfinite(fit.covariance.numpy()).all((1, 2))
         good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
         return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
 
@@ -415,7 +417,8 @@ class ChunkTracker:
         fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), every)
         order = explaining_first(fit, use).argsort(stable=True)
         best = fit.of(order[:1])
-        seen = use & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
+        seen = use & (best.score[0] > 0) & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
+        seen &= torch.isfinite(best.covariance).all()
         reason = [
             Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
             for now, why in zip(seen.tolist(), poses.reason, strict=True)

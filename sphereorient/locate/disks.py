@@ -27,6 +27,7 @@ DEPTH = 0.2  # most relative deviation of a radius from the expected one that is
 LEAST_VOTES = 0.08  # share of a rim that must vote for its middle
 PEAK, MOST = 5, 80  # reduced px within which the best middle of a radius counts; circles that are looked at
 VOTED_PX = 2.5  # error of a voted circle
+USUAL = 0.15  # relative: circles of paint are usually further from the expected radius than rims
 LEAST_RIM = 0.2  # share of all directions with an edge on the rim, less half of those with one just outside
 LEAST_BESIDE = 0.15  # share of the pixels about an edge that differ from the background
 HALO, LEAST_NEW = 1.05, 0.06  # of the radius; share of a disk that lies in no disk of more rim
@@ -76,7 +77,7 @@ def find_disks(
     found: list[Outline] = []
     rest = full.copy()  # without the disks found
     while len(circles) and len(found) < len(diameters_px) + FURTHER:
-        merit = support(circles, edges, VOTED_PX) / DIRECTIONS
+        merit = _usual(circles[:, 2], diameters_px) * support(circles, edges, VOTED_PX) / DIRECTIONS
         best = int(merit.argmax())
         if merit[best] < LEAST_RIM:
             break
@@ -114,6 +115,12 @@ def _voted(edges: Edges, shape: tuple[int, ...], diameters_px: Sequence[float], 
     circles = np.concatenate(found)
     circles[:, :2] = (circles[:, :2] - margin) * SHRINK
     return circles[np.argsort(-circles[:, 3], kind="stable")[:MOST], :3]
+
+
+def _usual(radius: Points, diameters_px: Sequence[float]) -> Points:
+    """Return a weight (n,) of radii, px: 1 of the expected ones, less of those that only part of the paint may have."""
+    off = np.abs(2 * radius[:, None] / np.asarray(diameters_px) - 1).min(1)
+    return np.asarray(np.exp(-0.5 * (off / USUAL) ** 2))
 
 
 def _radii(diameters_px: Sequence[float], tolerance: float) -> list[float]:
