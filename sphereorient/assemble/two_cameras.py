@@ -1,8 +1,9 @@
-"""Two cameras, one sphere: repair of frames where they disagree, and the weighted mean on SO(3)."""
+"""Several cameras, one sphere: repair of frames where they disagree, and the weighted mean on SO(3)."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations
 
 import torch
 from torch import Tensor
@@ -37,14 +38,14 @@ class Fused:
 def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
-    """Fuse the paths of one or two cameras, in the lab frame, into one; `time_s` (N,).
-    Stretches that differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by the
-    inverse moving variance of xi; their differences give the sigma, so that one camera alone has none. Flags:
-    `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
+    """Fuse the paths of the cameras, in the lab frame, into one; `time_s` (N,).
+    Stretches that differ by more than `repair_deg` are repaired, of more than two cameras by majority where there is
+    one. Then each frame is the mean of all, weighted by the inverse moving variance of xi; their differences give the
+    sigma, so that one camera alone has none. Flags: `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
     Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
 
     Raises:
-        ExperimentError: no camera, or more than two.
+        ExperimentError: no camera.
         ShapeError: paths, candidates and times differ in cameras or frames.
     """
     _check(paths, candidates, time_s)
@@ -52,9 +53,9 @@ def fuse(
     tracks: list[Track] = list(paths.values())
     present = torch.stack([track.present for track in tracks])
     repaired, ambiguous = torch.zeros_like(present), torch.zeros_like(present[0])
-    if len(tracks) == 2:
-        first, second = (graph_of(candidates[name], settings.quality_min) for name in names)
-        mended = repair((paths[names[0]], paths[names[1]]), (first, second), settings)
+    if len(tracks) > 1:
+        graphs = [graph_of(candidates[name], settings.quality_min) for name in names]
+        mended = repair_all(list(paths.values()), graphs, settings)
         tracks, repaired, ambiguous = list(mended.tracks), mended.repaired, mended.ambiguous
     present = torch.stack([track.present for track in tracks])
     linked = [links(track.R_lab_body, time_s) for track in tracks]
@@ -63,10 +64,9 @@ def fuse(
     calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # no spike raises the variance
     share = _shares(variance, present)
     R = _mean(tracks, share)
-    apart = _apart(tracks)
     xi, turn = links(R, time_s)
     spike = find_spikes(xi, turn, settings)
-    alone = present.sum(0) == 1 if len(tracks) == 2 else torch.ones_like(present[0])
+    alone = present.sum(0) == 1 if len(tracks) > 1 else torch.ones_like(present[0])
     bits = {
         Flag.ONE_CAMERA: alone,
         Flag.REPAIRED_FROM_OTHER_CAMERA: repaired.any(0),
@@ -75,7 +75,7 @@ def fuse(
     }
     return Fused(
         R_lab_body=R,
-        sigma_rad=_sigma(variance, share, apart, calm),
+        sigma_rad=_sigma(variance, share, tracks, calm),
         segment=number_segments(present.any(0), spike, settings.gap_frames_max),
         flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
         weight=dict(zip(names, share, strict=True)),
@@ -121,23 +121,22 @@ def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
     return torch.where(several, mean, torch.where(present.any(0), alone, torch.nan))
 
 
-def _apart(tracks: Sequence[Track]) -> Tensor:
-    """Return the angle (N,), rad, between the two cameras' orientations; NaN without both."""
-    if len(tracks) == 1:
-        return torch.full_like(tracks[0].score, torch.nan)
-    first, second = tracks
+def _apart(first: Track, second: Track) -> Tensor:
+    """Return the angle (N,), rad, between two cameras' orientations; NaN without both."""
     apart = so3.geodesic_distance(first.R_lab_body, second.R_lab_body)
     return torch.where(first.present & second.present, apart, torch.nan)
 
 
-def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tensor:
+def _sigma(variance: Tensor, share: Tensor, tracks: Sequence[Track], calm: Tensor) -> Tensor:
     """Return the standard deviation per axis of the mean, (N,), rad.
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
-    degrees of freedom; its median gives s^2 robustly. Spikes raise the variance, not d: their frames are left out.
+    degrees of freedom; its median over all pairs gives s^2 robustly. Spikes raise the variance, not d: their frames are
+    left out.
     """
-    if not len(apart):
-        return apart
-    ratio = apart.square() / variance.sum(0)
+    pairs = list(combinations(range(len(tracks)), 2))
+    if not pairs or not len(calm):
+        return torch.full_like(tracks[0].score, torch.nan)
+    ratio = torch.stack([_apart(tracks[k], tracks[m]).square() / (variance[k] + variance[m]) for k, m in pairs])
     quiet = torch.where(calm, ratio, torch.nan)
     scale = (quiet if torch.isfinite(quiet).any() else ratio).nanmedian() / CHI2_3_MEDIAN
     relative = (share.square() * variance).sum(0)
@@ -145,9 +144,8 @@ def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tens
 
 
 def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor) -> None:
-    if not 1 <= len(paths) <= 2:
-        do = "name one or two cameras"
-        raise ExperimentError(refusal("paths", expected="one or two cameras", got=str(len(paths)), do=do))
+    if not paths:
+        raise ExperimentError(refusal("paths", expected="one camera or more", got="0", do="name a camera"))
     for name, path in paths.items():
         frames = len(candidates[name]) if name in candidates else 0
         if not len(path.choice) == frames == len(time_s):
@@ -158,11 +156,51 @@ def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Repair:
-    """Tracks of both cameras after the repair."""
+    """Tracks of C cameras after the repair."""
 
-    tracks: tuple[Track, Track]
-    repaired: Tensor  # (2, N) bool, replaced by the candidate nearest to the other camera
+    tracks: tuple[Track, ...]
+    repaired: Tensor  # (C, N) bool, replaced by the candidate nearest to another camera
     ambiguous: Tensor  # (N,) bool, the choice of the right camera was not decided by T
+
+
+def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: AssembleSettings) -> Repair:
+    """Repair the frames in which cameras disagree. Where more than half of three or more agree with one of them, the
+    others take their candidates nearest to that one, none (T = 0) beyond `repair_deg`. Other stretches are repaired
+    camera by camera, see `repair`.
+    """
+    if len(paths) == 2:
+        return repair((paths[0], paths[1]), (graphs[0], graphs[1]), settings)
+    limit, frames = math.radians(settings.repair_deg), torch.arange(len(paths[0].score))
+    tracks: list[Track] = list(paths)
+    there = torch.stack([path.present for path in paths])
+    near = torch.stack([torch.stack([_apart(one, other) <= limit for other in paths]) for one in paths])
+    score = torch.stack([path.score.nan_to_num(0.0) for path in paths])
+    leader = (near.sum(1) + 0.5 * score.clamp(0, 1)).argmax(0)  # with most on its side; of equals the better one
+    sided = near[leader, :, frames].T  # (C, N)
+    decided = (there.sum(0) > 2) & (2 * sided.sum(0) > there.sum(0))
+    repaired, ambiguous = torch.zeros_like(there), torch.zeros_like(decided)
+    for k, m in permutations(range(len(paths)), 2):
+        wrong = torch.nonzero(decided & (leader == k) & there[m] & ~sided[m])[:, 0]
+        follower = _follow(paths[k], graphs[m], wrong, limit)
+        tracks[m], repaired[m, wrong] = tracks[m].with_part(wrong, follower), follower.present
+    left = torch.nonzero(~decided)[:, 0]
+    for k, m in combinations(range(len(paths)), 2):
+        both = [_only(paths[c], tracks[c], ~decided) for c in (k, m)]
+        mended = repair((both[0], both[1]), (graphs[k], graphs[m]), settings)
+        for place, c in enumerate((k, m)):
+            tracks[c] = tracks[c].with_part(left, mended.tracks[place].part(left))
+            repaired[c] |= mended.repaired[place]
+        ambiguous |= mended.ambiguous
+    return Repair(tracks=tuple(tracks), repaired=repaired, ambiguous=ambiguous)
+
+
+def _only(path: Path, track: Track, where: Tensor) -> Path:
+    """Return a path with the orientations of a track in some frames, where (N,) bool, and none elsewhere."""
+    return replace(
+        path,
+        R_lab_body=torch.where(where[:, None, None], track.R_lab_body, torch.nan),
+        score=torch.where(where, track.score, torch.nan),
+    )
 
 
 def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
@@ -174,7 +212,7 @@ def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: Asse
     Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)
-    apart, segment = _apart(paths), torch.stack([path.segment for path in paths])
+    apart, segment = _apart(*paths), torch.stack([path.segment for path in paths])
     agreed = apart <= limit
     result: list[Track] = list(paths)
     decided: list[Track] = list(paths)  # the loser of a stretch has the leader's orientations

@@ -68,6 +68,7 @@ class Cause:
     left: float  # share of the misfit that it leaves
     parameters: int
     deadly: bool = False  # nothing can be measured before it is corrected
+    cameras: tuple[int, ...] = ()  # that it blames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,12 +148,11 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
     """
     compare = _Comparison(seen, limits)
     found = compare(compare.sights())
-    gap, turn, size = found[:, 0].abs(), found[:, 1:4].norm(dim=-1), found[:, 4:6]
-    count = int(torch.isfinite(gap).sum())
+    count = int(torch.isfinite(found[..., 0]).sum(1).amax()) if len(found) else 0
     if count < FEWEST:
         return Consistency(frames=count)
-    middle = size.nanmedian(0).values.nan_to_num()
-    usual = torch.stack([gap.nanmedian(), turn.nanmedian(), middle[middle.abs().argmax()]])
+    usual = _usual(found)
+    usual = usual.gather(0, usual.nan_to_num().abs().argmax(0, keepdim=True))[0]  # of the pair that is farthest apart
     known = Consistency(
         frames=count,
         gap_px=limits.gap_px * float(usual[0]),
@@ -163,12 +163,31 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
     if not known.contradicts:
         return known
     causes = sorted((c for c in compare.causes(found) if c.left < EXPLAINS), key=lambda cause: cause.left)
+    agree = {*compare.majority(found)} if len(compare.cameras) > 2 else set()
+    causes = [cause for cause in causes if not agree & {*cause.cameras}] or causes
     if causes:
         enough = EQUALLY * causes[0].left + SIMPLER / max(_misfit(found), 1e-9)
         causes = [cause for cause in causes if cause.left < enough]
         fewest = min(cause.parameters for cause in causes)
         causes = [cause for cause in causes if cause.parameters == fewest]
     return replace(known, causes=tuple(causes))
+
+
+def _usual(found: Tensor) -> Tensor:
+    """Return the typical gap, turn, and size that is farthest from the expected one, of each pair, (P, 3)."""
+    gap, turn, size = found[..., 0].abs(), found[..., 1:4].norm(dim=-1), found[..., 4:6]
+    middle = size.nanmedian(1).values.nan_to_num()
+    farthest = middle.gather(1, middle.abs().argmax(1, keepdim=True))
+    return torch.cat([gap.nanmedian(1, keepdim=True).values, turn.nanmedian(1, keepdim=True).values, farthest], 1)
+
+
+def majority(seen: Seen, limits: Limits) -> tuple[int, ...]:
+    """Return the largest set of cameras of which each two agree; none where these are not more than half of all.
+    Of sets of one size that whose lines of sight and sizes agree best: where two cameras alone measure a direction, the
+    size of the picture in another, which looks along it, decides.
+    """
+    compare = _Comparison(seen, limits)
+    return compare.majority(compare(compare.sights()))
 
 
 class _Comparison:
@@ -225,7 +244,7 @@ class _Comparison:
         sized: bool = True,
         wider: Tensor | None = None,
     ) -> Tensor:
-        """Return gap, turn (3), log sizes (2) and stretches (2) of all frames and pairs, (M, 8), in units of limits.
+        """Return gap, turn (3), log sizes (2) and stretches (2) of pairs and frames, (P, N, 8), in units of limits.
         `larger`: logarithm of the factor by which pictures of the sphere are larger than the cameras say, () or (C,);
         `wider`: by how much wider than high, relative, (C,).
         """
@@ -241,21 +260,39 @@ class _Comparison:
             parts.append(torch.cat([(gap_mm * px_mm)[:, None], turn, size, stretch[:, [k, m]]], -1))
         limits = self.limits
         scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2]
-        return torch.cat(parts) / torch.tensor(scale, dtype=torch.float64)
+        return torch.stack(parts) / torch.tensor(scale, dtype=torch.float64)
+
+    def majority(self, found: Tensor) -> tuple[int, ...]:
+        """Return the cameras that agree, see `majority`, of what was measured."""
+        count = len(self.cameras)
+        if not found.shape[1]:
+            return ()
+        gap, turn, size = _usual(found).unbind(1)
+        agree = (gap <= 1) & (turn.nan_to_num(0.0) <= 1)  # without paint in view no turn is known
+        worse = torch.where(agree, gap.square() + size.square(), torch.inf)
+        apart = dict(zip(self.pairs, worse.tolist(), strict=True))
+        for several in range(count, count // 2, -1):
+            sets = combinations(range(count), several)
+            worst = {some: max(apart[pair] for pair in combinations(some, 2)) for some in sets}
+            best = min(worst, key=lambda some: worst[some])
+            if math.isfinite(worst[best]):
+                return best
+        return ()
 
     def causes(self, found: Tensor) -> Iterator[Cause]:
         """Yield what may be wrong, with the share of the misfit that it leaves."""
         names, count = self.names, len(self.names)
-        whole, unsized = _misfit(found), _misfit(found[:, :4])
+        whole, unsized = _misfit(found), _misfit(found[..., :4])
         for k, m in self.pairs:
             if self.cameras[k].image_size == self.cameras[m].image_size:
                 places = [*range(count)]
                 places[k], places[m] = m, k
                 left = _misfit(self(self.sights(places=places), sized=False)) / unsized
-                yield Cause(words=f"swap {names[k]} and {names[m]} under movies:", left=left, parameters=0, deadly=True)
+                words = f"swap {names[k]} and {names[m]} under movies:"
+                yield Cause(words=words, left=left, parameters=0, deadly=True, cameras=(k, m))
         for k, name in enumerate(names):
             left = _misfit(self(self._upside_down(k), sized=False)) / unsized
-            yield Cause(words=f"write flip: {{{name}: both}}", left=left, parameters=0, deadly=True)
+            yield Cause(words=f"write flip: {{{name}: both}}", left=left, parameters=0, deadly=True, cameras=(k,))
         mm = self.seen.diameter_mm
         words = (
             f"sphere.diameter {mm:.4g} explains the pictures if it is {{:.4g}}, or the calibration's lengths are off"
@@ -266,18 +303,21 @@ class _Comparison:
         for some in [list(range(count)), *([k] for k in range(count))]:
             words = f"pixels of {' and '.join(names[k] for k in some)} {{:+.1f}} % wider than calibrated: check sx, "
             words += "pixel_pitch, and whether the movie was resized"
-            yield self._best(partial(self._wide, some), 1, words, lambda p: [100 * p[0]], whole)
+            wide = self._best(partial(self._wide, some), 1, words, lambda p: [100 * p[0]], whole)
+            yield replace(wide, cameras=tuple(some))
         for k, name in enumerate(names):
             words = f"{name} turned by {{:.2g}} degrees since its calibration: calibrate again"
-            yield self._best(partial(self._moved, k), 3, words, lambda p: [_degrees(p)], whole)
+            moved = self._best(partial(self._moved, k), 3, words, lambda p: [_degrees(p)], whole)
+            yield replace(moved, cameras=(k,))
             words = f"{name} turned by {{:.2g}} degrees and moved by {{:.2g}} mm since its calibration: calibrate again"
-            yield self._best(
+            moved = self._best(
                 partial(self._moved, k),
                 6,
                 words,
                 lambda p: [_degrees(p[:3]), 100 * float(np.linalg.norm(p[3:]))],
                 whole,
             )
+            yield replace(moved, cameras=(k,))
         if self.seen.frame is not None:
             yield from self._late(self.seen.frame, whole)
 
@@ -334,13 +374,14 @@ class _Comparison:
     def _late(self, frame: Tensor, whole: float) -> Iterator[Cause]:
         """Each movie some frames late; between frames all is interpolated."""
         shifts = np.arange(-LATEST, LATEST + 0.5, 0.5)
-        for k, name in enumerate(self.names[1:], 1):
+        # Of two the first one sets the time; of more the others do.
+        for k, name in list(enumerate(self.names))[len(self.names) == 2 :]:
             left = [_misfit(self(self._shifted(k, frame, float(shift)))) / whole for shift in shifts]
             if np.isnan(left).all():
                 continue
             best = int(np.nanargmin(left))
             words = f"the movie of {name} {abs(shifts[best]):g} frames {'late' if shifts[best] > 0 else 'early'}"
-            yield Cause(words=f"{words}: check start:", left=left[best], parameters=1)
+            yield Cause(words=f"{words}: check start:", left=left[best], parameters=1, cameras=(k,))
 
     def _shifted(self, camera: int, frame: Tensor, late: float) -> list[_Sight]:
         """Return what the cameras say if one shows each frame `late` frames later."""
@@ -364,5 +405,5 @@ def _degrees(turn: Floats) -> float:
 
 
 def _misfit(found: Tensor) -> float:
-    """Return the median over frames of the mean square of what was measured; NaN without."""
-    return float(found.square().nanmean(-1).nanmedian())
+    """Return the median over frames of the mean square of what was measured (P, N, K), mean of pairs; NaN without."""
+    return float(found.square().nanmean(-1).nanmedian(1).values.nanmean())

@@ -1,6 +1,6 @@
 """Check and repair cameras that moved after their calibration, with the tracked sphere."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.calibration.consistency import Limits, Seen, majority
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
-from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, load_cameras, triangulate
+from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras, triangulate
 from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import TrackError
 from sphereorient.files.yaml_file import refuse_unknown
-from sphereorient.trajectory import Reason, Trajectory
+from sphereorient.trajectory import Reason, Tracks, Trajectory
 
 OBSERVED = (Reason.OK, Reason.CONTRADICTS)
 MOVED = (*ROTATION, *TRANSLATION)
@@ -28,6 +29,7 @@ BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alon
 SHARED = 12  # consecutive frames that share one error of the centre: they have the same light
 HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
 FRAMES_MIN = 20
+GAP_PX, TURN_DEG = 1.0, 0.2  # by which cameras that agree may differ, in any light
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
 ROUNDS = 4
 
@@ -38,6 +40,11 @@ class CameraObservations:
 
     centre_px: Tensor  # (N, 2)
     R_lab_body: Tensor  # (N, 3, 3), with the camera before the repair
+
+    def seen_by(self, before: Camera, camera: Camera) -> "CameraObservations":
+        """Return the same pictures as read with another camera."""
+        R_view_body = R_lab_view(before, self.centre_px).mT @ self.R_lab_body
+        return replace(self, R_lab_body=R_lab_view(camera, self.centre_px) @ R_view_body)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,18 +102,29 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
 
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
-    """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them.
-    CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other cameras.
+    """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them, by all
+    spheres in it. CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other
+    cameras.
     """
-    cameras, track = load_cameras(cameras_path), Trajectory.load(track_path)
-    used = {name: camera for name, camera in cameras.items() if name in track.cameras} or cameras
-    return self_calibrate(used, observations_of(track, used))
+    cameras, tracks = load_cameras(cameras_path), list(Tracks.load(track_path).values())
+    used = {name: camera for name, camera in cameras.items() if name in tracks[0].cameras} or cameras
+    each = [observations_of(track, used) for track in tracks]
+    observed = {
+        name: CameraObservations(
+            centre_px=torch.cat([one[name].centre_px for one in each]),
+            R_lab_body=torch.cat([one[name].R_lab_body for one in each]),
+        )
+        for name in used
+    }
+    return self_calibrate(used, observed)
 
 
 def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> Repaired:
     """Rotate and shift two or more cameras until they see the sphere in one position and one orientation.
-    The first camera stays: a common motion is not observable. Orientations may differ by a small constant rotation. A
-    prior holds motions that change only the apparent size: distance and the common plane of the lines of sight.
+    One camera stays, since a common motion is not observable: the first, of those that agree where these are more than
+    half of three or more. The others follow one by one, each against all before it. Orientations may differ by a small
+    constant rotation. A prior holds motions that change only the apparent size: distance and the common plane of the
+    lines of sight.
 
     Raises:
         CameraError: one camera, or too few frames that both saw.
@@ -114,13 +132,17 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
     if len(cameras) < 2:
         do = "give the track of both cameras"
         raise camera_error("cameras", "two or more that saw the ball", f"{len(cameras)}", do)
-    (first, *others), repaired = cameras, dict(cameras)
+    agree, names = _agreeing(cameras, observed), list(cameras)
+    first, *others = [*(names[k] for k in agree), *(name for k, name in enumerate(names) if k not in agree)]
+    repaired, seen = dict(cameras), dict(observed)
     moved, sigma, held = {}, {}, [f"{first}: all (the lab frame)"]
     before, after = [], []
-    for name in others:
-        pair = _Pair(cameras[first], cameras[name], observed[first], observed[name])
+    for place, name in enumerate(others):
+        still = [(repaired[one], seen[one]) for one in (first, *others[:place])]
+        pair = _Pair(still, cameras[name], observed[name])
         moved[name], sigma[name] = change, spread = pair.solved()
         repaired[name] = with_parameters(cameras[name], MOVED, change)
+        seen[name] = observed[name].seen_by(cameras[name], repaired[name])
         held += [f"{name}.{part}" for part, loose in zip(MOVED, spread > HELD_SHARE * PRIOR, strict=True) if loose]
         before.append(pair.gaps(torch.zeros(6, dtype=torch.float64)))
         after.append(pair.gaps(change))
@@ -138,22 +160,47 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
     )
 
 
-class _Pair:
-    """Residuals of one camera against the first; unknowns (9,): its motion (6,) and a constant rotation bias."""
+def _agreeing(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> tuple[int, ...]:
+    """Return the cameras that agree where these are more than half of three or more; else none."""
+    if len(cameras) < 3:
+        return ()
+    R = torch.stack([observed[name].R_lab_body for name in cameras], 1)
+    seen = Seen(
+        cameras=cameras,
+        centre_px=torch.stack([observed[name].centre_px for name in cameras], 1),
+        radius_px=torch.full(R.shape[:2], torch.nan, dtype=torch.float64),
+        R_lab_body=R,
+        diameter_mm=1.0,  # nothing is known of sizes
+    )
+    return majority(seen, Limits(gap_px=GAP_PX, turn_deg=TURN_DEG, size=1.0))
 
-    def __init__(self, still: Camera, loose: Camera, seen: CameraObservations, seen_loose: CameraObservations) -> None:
-        both = torch.isfinite(seen.centre_px + seen_loose.centre_px).all(-1)
-        both &= torch.isfinite(seen.R_lab_body + seen_loose.R_lab_body).all(-1).all(-1)
-        if int(both.sum()) < FRAMES_MIN:
+
+class _Pair:
+    """Residuals of one camera against others; unknowns (9,): its motion (6,) and a constant rotation bias."""
+
+    def __init__(
+        self, still: Sequence[tuple[Camera, CameraObservations]], loose: Camera, seen_loose: CameraObservations
+    ) -> None:
+        known = torch.isfinite(seen_loose.centre_px).all(-1) & torch.isfinite(seen_loose.R_lab_body).all(-1).all(-1)
+        each = [
+            known & torch.isfinite(seen.centre_px).all(-1) & torch.isfinite(seen.R_lab_body).all(-1).all(-1)
+            for _, seen in still
+        ]
+        if (count := sum(int(both.sum()) for both in each)) < FRAMES_MIN:
             expected = f"{FRAMES_MIN} frames or more in which both cameras measure the ball's orientation"
             do = "pass a longer track, made with both cameras"
-            raise camera_error("track", expected, f"{int(both.sum())}", do)
+            raise camera_error("track", expected, f"{count}", do)
         self.loose = loose
-        self.ray = still.rays(seen.centre_px[both])
-        self.centre_px = seen_loose.centre_px[both]
-        self.R_still = seen.R_lab_body[both]
+        rays = [camera.rays(seen.centre_px[both]) for (camera, seen), both in zip(still, each, strict=True)]
+        self.ray = Rays(
+            origin_lab_mm=torch.cat([ray.origin_lab_mm for ray in rays]),
+            direction_lab=torch.cat([ray.direction_lab for ray in rays]),
+        )
+        self.centre_px = torch.cat([seen_loose.centre_px[both] for both in each])
+        self.R_still = torch.cat([seen.R_lab_body[both] for (_, seen), both in zip(still, each, strict=True)])
         # The body's orientation relative to the camera, independent of the camera's pose in the lab.
-        self.R_view_body = R_lab_view(loose, self.centre_px).mT @ seen_loose.R_lab_body[both]
+        R_loose = torch.cat([seen_loose.R_lab_body[both] for both in each])
+        self.R_view_body = R_lab_view(loose, self.centre_px).mT @ R_loose
 
     def gaps(self, change: Tensor) -> Tensor:
         """Signed distances (N,) between the two lines of sight, mm."""

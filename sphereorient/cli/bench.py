@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import Cameras, ExperimentPath, Quiet, TrackPath, cameras_of, names_in
+from sphereorient.cli.options import (
+    Cameras,
+    ExperimentPath,
+    Quiet,
+    SphereName,
+    TrackPath,
+    cameras_of,
+    names_in,
+    tracks_in,
+)
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.whole_file import write_text, writing
 
@@ -54,19 +63,30 @@ def synth(
 def score(
     track: TrackPath,
     truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
+    sphere: SphereName = None,
+    alike: Annotated[
+        str, typer.Option(help="Balls that look alike, e.g. a,c: their names may be exchanged, all over.")
+    ] = "",
 ) -> None:
     """Print the errors of a track against the exact truth of a synthetic experiment."""
     from sphereorient.evaluate import score_track
-    from sphereorient.trajectory import Trajectory
+    from sphereorient.evaluate.score import given_to_others, named_as_true
 
-    print_table(error_table(score_track(Trajectory.load(track), truth)))
+    tracks = named_as_true(tracks_in(track, None), truth, names_in(alike))
+    given = given_to_others(tracks, truth) if len(tracks) > 1 else {}
+    for name, one in tracks.picked(sphere).items():
+        print_table(error_table(score_track(one, truth), name))
+        if name in given:
+            wrong, changes = given[name]
+            typer.echo(f"ball {name}: {wrong} frames given to another ball, {changes} exchanges")
 
 
-def error_table(found: "Score") -> "Table":
+def error_table(found: "Score", ball: str = "") -> "Table":
     """Return errors of orientation and position, and relative errors of the rates, as a table."""
     from rich.table import Table
 
-    title = f"Errors against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
+    of = f" of ball {ball}" if ball else ""
+    title = f"Errors{of} against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
     table = Table("quantity", "median", "95 %", "largest", title=title)
     p50, p95, _, largest = found.percentiles_deg()
     table.add_row("orientation (degrees)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
@@ -228,27 +248,29 @@ def score_result(
 
     from sphereorient.evaluate.robustness.results import WRONG_DEG
     from sphereorient.evaluate.score import READERS, aligned_errors_deg, orientations_at, true_orientations
-    from sphereorient.trajectory import Trajectory
 
+    found = {}
     if of == "sphereorient":
-        track = Trajectory.load(result)
-        R, R_true = track.orientation, true_orientations(truth, track.time)
+        for name, track in tracks_in(result, None).items():
+            found[name] = track.orientation, true_orientations(truth, track.time, name)
     elif of in READERS:
         frame, R = READERS[of](result)
-        R_true = orientations_at(truth, frame)
+        found[""] = R, orientations_at(truth, frame)
     else:
         known = ", ".join(["sphereorient", *READERS])
         raise SettingsError(refusal("--format", expected=known, got=repr(of)[:40], do="choose one"))
-    errors = aligned_errors_deg(R, R_true, align)
-    finite = errors[np.isfinite(errors)]
-    typer.echo(f"{len(finite)} of {len(errors)} frames have an orientation")
-    if len(finite):
-        p50, p95, largest = np.percentile(finite, (50, 95, 100))
-        wrong = float((finite > WRONG_DEG).mean())
-        typer.echo(
-            f"error, degrees: median {p50:.4g}, 95 % {p95:.4g}, largest {largest:.4g}; "
-            f"above {WRONG_DEG:g}: {100 * wrong:.3g} %"
-        )
+    for name, (R, R_true) in found.items():
+        errors = aligned_errors_deg(R, R_true, align)
+        finite = errors[np.isfinite(errors)]
+        ball = f"ball {name}: " if name else ""
+        typer.echo(f"{ball}{len(finite)} of {len(errors)} frames have an orientation")
+        if len(finite):
+            p50, p95, largest = np.percentile(finite, (50, 95, 100))
+            wrong = float((finite > WRONG_DEG).mean())
+            typer.echo(
+                f"error, degrees: median {p50:.4g}, 95 % {p95:.4g}, largest {largest:.4g}; "
+                f"above {WRONG_DEG:g}: {100 * wrong:.3g} %"
+            )
 
 
 def _print(found: "Results") -> None:

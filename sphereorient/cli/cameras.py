@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import ExperimentPath, cameras_of
+from sphereorient.cli.options import ExperimentPath, SphereName, cameras_of, tracks_in
 from sphereorient.errors import CameraError, ExperimentError, refusal
 from sphereorient.files.whole_file import check_ending, put_aside
 
@@ -76,6 +76,7 @@ def check_cameras_command(
     track: Annotated[
         Path | None, typer.Option(help="track.h5 of this experiment; without it the movies are tracked first.")
     ] = None,
+    sphere: SphereName = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Report how far the cameras' lines of sight to the sphere miss each other, over a movie."""
@@ -83,19 +84,20 @@ def check_cameras_command(
     from sphereorient.calibration.table import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
     from sphereorient.run.stages import track_movies
-    from sphereorient.trajectory import Trajectory, one_track
+    from sphereorient.trajectory import Tracks
 
     known = load_experiment(experiment)
     if len(known.cameras) < 2:
         do = "name an experiment of two cameras"
         raise ExperimentError(refusal(str(experiment), expected="two cameras or more", got="one", do=do))
     if track is not None:
-        result = Trajectory.load(track)
+        results = tracks_in(track, sphere)
     else:
         with progress_bar(quiet) as advance:
-            result = one_track(track_movies(known, progress=advance))
-    lines = check_lines(check_cameras(known.cameras, result)) or ["no frame in which two cameras see the sphere"]
-    echo_lines([*lines, *contradiction_lines(result)])
+            results = Tracks.of(track_movies(known, progress=advance)).picked(sphere)
+    for ball, result in results.items():
+        lines = check_lines(check_cameras(known.cameras, result)) or ["no frame in which two cameras see the sphere"]
+        echo_lines([*([f"ball {ball}:"] if len(results) > 1 else []), *lines, *contradiction_lines(result)])
 
 
 @app.command("convert-cameras")

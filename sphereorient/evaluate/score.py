@@ -1,7 +1,8 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
 
 import h5py
@@ -12,7 +13,7 @@ from scipy.stats import chi2
 
 from sphereorient import so3
 from sphereorient.errors import BenchError, TrackError, refusal
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Tracks, Trajectory
 
 Floats = NDArray[np.float64]
 Frames = NDArray[np.int64]
@@ -69,10 +70,10 @@ def _percentiles(values: Floats) -> Floats:
 
 def score_track(track: Trajectory, truth_path: str | Path) -> Score:
     """Compare a track with the truth (docs/data-format.md) by time to half a frame; raise TrackError on a mismatch."""
-    truth = _read_truth(truth_path, "position", *RATES)
+    truth = _read_truth(truth_path, "position", sphere=track.sphere, also=RATES)
     row = _rows(truth["time"], track.time, truth_path)
     relative, coverage = {}, {}
-    for key in RATES:
+    for key in (rate for rate in RATES if rate in truth):
         measured, true = getattr(track, key), truth[key][row]
         have = np.isfinite(measured).all(axis=1)
         coverage[key] = float(have.mean())
@@ -93,6 +94,40 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
     )
 
 
+def named_as_true(tracks: Tracks, truth_path: str | Path, alike: Sequence[str]) -> Tracks:
+    """Return the tracks with the names of spheres that look alike exchanged, all over, as they fit the truth best.
+    Raise TrackError for a name without a track.
+    """
+    for name in alike:
+        tracks.picked(name)
+    orders = [dict(zip(alike, order, strict=True)) for order in permutations(alike)]
+    exchanged = [Tracks({order.get(name, name): track for name, track in tracks.items()}) for order in orders]
+    off_mm = [np.median(np.concatenate([o for o, _ in _places(one, truth_path).values()])) for one in exchanged]
+    return exchanged[int(np.argmin(off_mm))]
+
+
+def given_to_others(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[int, int]]:
+    """Return for each sphere in how many valid frames its position is nearer to the true one of another than to its
+    own, and how often the nearest one changes.
+    """
+    return {
+        name: (int((nearest != name).sum()), int((nearest[1:] != nearest[:-1]).sum()))
+        for name, (_, nearest) in _places(tracks, truth_path).items()
+    }
+
+
+def _places(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[Floats, NDArray[np.str_]]]:
+    """Return of each sphere's valid frames the error of position, mm, and the name of the sphere truly nearest."""
+    truths = {name: _read_truth(truth_path, "position", sphere=name) for name in tracks}
+    names, found = np.array(list(tracks)), {}
+    for name, track in tracks.items():
+        some = track.valid & np.isfinite(track.position).all(1)
+        at = _rows(truths[name]["time"], track.time[some], truth_path)
+        apart = [np.linalg.norm(truths[other]["position"][at] - track.position[some], axis=1) for other in names]
+        found[name] = apart[list(tracks).index(name)], names[np.argmin(apart, axis=0)]
+    return found
+
+
 def mahalanobis(error: Floats, covariance: Floats) -> Floats:
     """Return the lengths (N,) of errors (N, 3) over their covariances (N, 3, 3); NaN where either is unknown."""
     found = np.full(len(error), np.nan)
@@ -102,9 +137,9 @@ def mahalanobis(error: Floats, covariance: Floats) -> Floats:
     return found
 
 
-def true_orientations(path: Path, time_s: Floats) -> Floats:
+def true_orientations(path: Path, time_s: Floats, sphere: str = "") -> Floats:
     """Return R_lab_body (N, 3, 3) of truth.h5 at times (N,), s, to half a frame; raise TrackError without a match."""
-    truth = _read_truth(path)
+    truth = _read_truth(path, sphere=sphere)
     return truth["orientation"][_rows(truth["time"], time_s, path)]
 
 
@@ -117,13 +152,19 @@ def orientations_at(path: Path, frame: Frames) -> Floats:
     return R[frame]
 
 
-def _read_truth(path: str | Path, *names: str) -> dict[str, Floats]:
+def _read_truth(path: str | Path, *names: str, sphere: str = "", also: Sequence[str] = ()) -> dict[str, Floats]:
+    """Read what is true of a sphere; `also`: where the file has it."""
     try:
         with h5py.File(path) as file:
             schema = str(file.attrs.get("schema", ""))  # old truths have none
-            truth = {key: np.asarray(file[key][()], np.float64) for key in ("time", "orientation", *names)}
+            if "spheres" in file and not sphere and not schema:
+                got, do = f"that of {', '.join(file['spheres'])}"[:200], "score the track of all of them"
+                raise TrackError(refusal(f"truth {path}", expected="the truth of one ball", got=got, do=do))
+            there = file[f"spheres/{sphere}"] if sphere else file
+            wanted = ("time", "orientation", *names, *(key for key in also if key in there))
+            truth = {key: np.asarray(there[key][()], np.float64) for key in wanted}
     except (OSError, KeyError) as error:
-        got, expected = " ".join(str(error).split()), "time, position, orientation and rates"
+        got, expected = " ".join(str(error).split()), "time, position and orientation"
         raise TrackError(refusal(f"truth {path}", expected=expected, got=got, do=DO)) from None
     if schema.startswith("sphereorient-track"):
         raise TrackError(refusal(f"truth {path}", expected="the exact truth", got="a track", do=DO))

@@ -98,7 +98,7 @@ def open_recording(
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
     paths = {sphere.name: _texture_path(experiment, sphere) for sphere in experiment.spheres} if textured else {}
-    loaded = {path: _load_map(path) for path in dict.fromkeys(paths.values())}
+    loaded = {path: load_map(path) for path in dict.fromkeys(paths.values())}
     names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
     frames = timeline(experiment, movies)
@@ -136,7 +136,8 @@ def _texture_path(experiment: Experiment, sphere: Sphere) -> Path:
     raise ExperimentError(refusal(f"{experiment.path}{name}", expected="a texture", got="none", do=do))
 
 
-def _load_map(path: Path) -> TextureMap:
+def load_map(path: Path) -> TextureMap:
+    """Read a texture map, with what of it is no paint; TextureError for a file that is none."""
     grey, unseen = load_texture(path), load_unseen(path)
     return TextureMap(grey=grey if unseen is None else grey.masked_fill(unseen, UNKNOWN), unseen=unseen)
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
+from sphereorient.calibration.consistency import Limits, Seen, compare_cameras, majority
 from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.files.threads import side_by_side
@@ -84,14 +84,15 @@ class Appearance:
     right_score: float  # typical of right poses
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see the sphere at one position
+    majority: tuple[int, ...] = ()  # if not, the cameras that do, more than half of all; empty: none
     second_ball: bool = False  # whether another sphere with this texture is in view
     sharper: bool = False  # whether the pictures are clearly sharper than the exposure allows
     worn: Tensor | None = None  # where the paint differs from the map and is not used, see `worn_cells`; None: nowhere
 
-    def of(self, camera: int) -> "Appearance":
-        """Return the appearance in one camera."""
-        lasting = self.lasting.of(camera)
-        return replace(self, fitter=self.fitter.of(camera), still=self.still.of(camera), lasting=lasting)
+    def of(self, *cameras: int) -> "Appearance":
+        """Return the appearance in some cameras."""
+        fitter, still, lasting = self.fitter.of(*cameras), self.still.of(*cameras), self.lasting.of(*cameras)
+        return replace(self, fitter=fitter, still=still, lasting=lasting)
 
     def on(self, device: torch.device) -> "Appearance":
         """Return an appearance whose fits are computed on another device."""
@@ -158,7 +159,7 @@ def estimate_appearance(
     if not _clear(found):
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found) if among is None else (1.0, 0.0)
-    looked, others = found, None
+    looked, seen, others = found, [], None
     if gain > APART_GAIN or gap_px > APART_PX:
         # A pose between those of disagreeing cameras would give a wrong light.
         alone = [replace(first, fitter=fitter.of(k)) for k in range(len(fitter.views))]
@@ -240,6 +241,7 @@ def estimate_appearance(
         right_score=right,
         usual_apart_rad=_usual_apart(fit, use),
         together=together,
+        majority=() if together else _agreeing(fitter, seen, fit),
         sharper=sharper,
         second_ball=claimed >= max(2, RIVALS * len(frames)),
         worn=worn,
@@ -257,25 +259,48 @@ def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
 
 
 def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
-    """Raise ExperimentError if the cameras contradict each other in a way that nothing can be measured."""
+    """Raise ExperimentError if the cameras contradict each other in a way that nothing can be measured, and no majority
+    agrees; `alone`: poses by camera and frame.
+    """
     parts = []
-    for view, of_camera in zip(fitter.views, alone, strict=True):
+    for of_camera in alone:
         clear = torch.tensor([0 if k in _clear(of_camera) else -1 for k in range(len(of_camera))])
         best = pose_table([of_camera], 1).rows(clear)
-        X, R = best["position_lab_mm"], best["R_lab_body"]
-        parts.append((view.camera.project(X), view.radius_px(X, fitter.radius_mm), R, best["covariance"][:, :3, :3]))
-    centre_px, radius_px, R, covariance = (torch.stack(part, 1) for part in zip(*parts, strict=True))
-    seen = Seen(
-        cameras={view.name: view.camera for view in fitter.views},
-        centre_px=centre_px,
-        radius_px=radius_px,
-        R_lab_body=R,
-        diameter_mm=2 * fitter.radius_mm,
-    )
-    found = compare_cameras(seen, limits_of(seen, covariance))
-    if found.deadly:
+        parts.append((best["position_lab_mm"], best["R_lab_body"], best["covariance"][:, :3, :3]))
+    X, R, covariance = (torch.stack(part, 1) for part in zip(*parts, strict=True))
+    seen = _seen_alone(fitter, X, R)
+    limits = limits_of(seen, covariance)
+    found = compare_cameras(seen, limits)
+    if found.deadly and not (len(alone) > 2 and majority(seen, limits)):
         expected = "cameras that agree"
         raise ExperimentError(refusal("movies", expected=expected, got=str(found), do=found.advice))
+
+
+def _agreeing(fitter: Fitter, rows: Sequence[tuple[int, int]], fit: FittedPoses) -> tuple[int, ...]:
+    """Return the cameras that agree where these are more than half of more than two; fits of frames and cameras (B)."""
+    if len(fitter.views) < 3 or not rows:
+        return ()
+    frame, camera = torch.tensor(rows).unbind(1)
+    parts = []
+    for part in (fit.position_lab_mm, fit.R_lab_body, fit.covariance[:, :3, :3]):
+        whole = part.new_full((int(frame.max()) + 1, len(fitter.views), *part.shape[1:]), torch.nan)
+        whole[frame, camera] = part
+        parts.append(whole)
+    X, R, covariance = parts
+    seen = _seen_alone(fitter, X, R)
+    return majority(seen, limits_of(seen, covariance))
+
+
+def _seen_alone(fitter: Fitter, position_lab_mm: Tensor, R_lab_body: Tensor) -> Seen:
+    """Return poses (N, C, 3), (N, C, 3, 3) of each camera alone as what they say of the pictures."""
+    views = list(enumerate(fitter.views))
+    return Seen(
+        cameras={view.name: view.camera for view in fitter.views},
+        centre_px=torch.stack([view.camera.project(position_lab_mm[:, k]) for k, view in views], 1),
+        radius_px=torch.stack([view.radius_px(position_lab_mm[:, k], fitter.radius_mm) for k, view in views], 1),
+        R_lab_body=R_lab_body,
+        diameter_mm=2 * fitter.radius_mm,
+    )
 
 
 def _usual_apart(fit: FittedPoses, use: Tensor) -> float:

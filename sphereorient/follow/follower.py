@@ -1,4 +1,4 @@
-"""Tracking batch by batch, while the frames of the next batch are decoded; all cameras together, or each alone."""
+"""Tracking batch by batch, while the next one is decoded; all cameras together, or those that agree."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -25,11 +25,14 @@ DECODING = 2  # threads in which parts of pictures are decoded
 
 
 class PerCameraTracker:
-    """Tracks the sphere in each camera alone; the first that sees it gives the pose, the others contradict."""
+    """Tracks the sphere in the cameras that agree, and in each other one alone; the first of these that sees it gives
+    the pose, the others contradict.
+    """
 
     def __init__(self, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
-        alone = [appearance.of(k) for k in range(len(appearance.fitter.views))]
-        self.trackers = [ChunkTracker(one, search, settings) for one in alone]
+        others = [(k,) for k in range(len(appearance.fitter.views)) if k not in appearance.majority]
+        self.parts = [part for part in (appearance.majority, *others) if part]
+        self.trackers = [ChunkTracker(appearance.of(*part), search, settings) for part in self.parts]
 
     def batches(self, frames: range) -> list[list[int]]:
         """Return the lengths of the chunks of each batch; see `ChunkTracker`."""
@@ -37,29 +40,37 @@ class PerCameraTracker:
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Track the chunks of one batch; see `ChunkTracker`."""
-        each = [tracker.track([movie], batch, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
-        yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))
+        each = [
+            tracker.track([shots[k] for k in part], batch, time_s)
+            for tracker, part in zip(self.trackers, self.parts, strict=True)
+        ]
+        yield from (cameras_disagree(poses, self.parts) for poses in zip(*each, strict=True))
 
 
-def cameras_disagree(alone: Sequence[Poses]) -> Poses:
-    """Return one frame's poses of the first of C cameras that sees the sphere, with the results of the others alone."""
-    reason = [poses.reason[0] for poses in alone]
-    seeing = [k for k, poses in enumerate(alone) if len(poses) and bool(poses.use.any())]
+def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> Poses:
+    """Return one frame's poses of the first part of C cameras that sees the sphere, and what the others say alone."""
+    why = dict(pair for poses, part in zip(apart, parts, strict=True) for pair in zip(part, poses.reason, strict=True))
+    reason = [why[k] for k in range(len(why))]
+    seeing = [k for k, poses in enumerate(apart) if len(poses) and bool(poses.use.any())]
     if not seeing:
-        return no_pose(len(alone), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
-    main, parts = alone[seeing[0]], alone[seeing[0]].parts()
+        return no_pose(len(reason), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+    main, own = apart[seeing[0]], parts[seeing[0]]
+    told, use = main.parts(), torch.zeros(len(reason), dtype=torch.bool)
+    use[list(own)] = main.use
     for name in ("own_turn", "own_move", *OWN):
-        parts[name] = parts[name].new_zeros(len(main), len(alone), *parts[name].shape[2:])
-    for k in seeing:
-        parts["own_turn"][:, k] = so3.log(alone[k].R_lab_body[:1] @ main.R_lab_body.mT)
-        parts["own_move"][:, k] = alone[k].position_lab_mm[:1] - main.position_lab_mm
-        for name in OWN:
-            own = getattr(alone[k], name)[:, 0]
-            parts[name][:, k] = own if k == seeing[0] else own[:1]
-        if k != seeing[0]:
+        whole = told[name].new_zeros(len(main), len(reason), *told[name].shape[2:])
+        whole[:, list(own)] = told[name]
+        told[name] = whole
+    for other, (k, *several) in ((apart[part], parts[part]) for part in seeing):
+        if several:
+            continue  # only the first part, those that agree, has more than one
+        told["own_turn"][:, k] = so3.log(other.R_lab_body[:1] @ main.R_lab_body.mT)
+        told["own_move"][:, k] = other.position_lab_mm[:1] - main.position_lab_mm
+        if other is not main:
             reason[k] = Reason.CONTRADICTS
-    use = torch.arange(len(alone)) == seeing[0]
-    return Poses(**parts, use=use, reason=tuple(reason))
+            for name in OWN:
+                told[name][:, k] = getattr(other, name)[:1, 0]
+    return Poses(**told, use=use, reason=tuple(reason))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

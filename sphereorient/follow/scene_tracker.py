@@ -83,7 +83,9 @@ class SceneTracker:
             ]
             again = self._followed(ahead, at, frames, rough)
             found = [again[n] if unsure else row for n, (unsure, row) in enumerate(zip(rough, found, strict=True))]
-        return list(side_by_side(self._completed, zip(found, known, frames, strict=True)))
+        rows = list(zip(found, known, frames, strict=True))
+        whole = all(poses is not None for row in found for poses in row.values())
+        return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
 
     def _followed(
         self,

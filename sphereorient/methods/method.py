@@ -55,6 +55,7 @@ class Learnt:
     right_score: float
     usual_apart_rad: float
     together: bool
+    majority: tuple[int, ...] = ()  # see `Appearance`
     second_ball: bool = False
     sharper: bool = False
     worn: torch.Tensor | None = None  # see `Appearance`
@@ -81,7 +82,7 @@ class Learnt:
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
-            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER)},
+            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER, "majority")},
             worn=study.worn,
             process=process,
             acceleration_rad_s2=acceleration_rad_s2 if told else None,
@@ -111,7 +112,7 @@ class Learnt:
         )
         if self.instants > 1:
             fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
-        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "worn")}
+        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "majority", "worn")}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
     def save(self, path: Path) -> None:
@@ -224,6 +225,8 @@ def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
         file.attrs["still_blur_px"], file.attrs["instants"] = learnt.still_blur_px, learnt.instants
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
+    if learnt.majority:
+        file.attrs["majority"] = learnt.majority
     if scenes:
         _write_scenes(learnt, file)
     else:
@@ -285,6 +288,7 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
         limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
         lasting=lasting,
         worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,
+        majority=tuple(int(k) for k in file.attrs.get("majority", ())),
         process=_process(file["process"]) if "process" in file else None,
         acceleration_rad_s2=None if acceleration is None else float(acceleration),
         **told,

@@ -116,6 +116,8 @@ def joined(job: Job, appearance: Appearance, measured: Iterable[list[Poses]]) ->
     first, second = torch.combinations(torch.arange(len(job.recording.streams)), 2).unbind(1)
     turn, spread = picked["own_turn"], picked["own_covariance"]
     apart, spread = turn[:, first] - turn[:, second], spread[:, first] + spread[:, second]
+    counts = table.use[:, first] & table.use[:, second] | (table.use.sum(1) < 2)[:, None]
+    apart = torch.where(counts[..., None], apart, torch.nan)  # a camera that contradicts those in use does not count
     share = motion.lasting_share(apart, spread, chosen.segment, settings.smooth.slow_share)
     smooth = settings.smooth.model_copy(update={"slow_share": share})
     smoothed = motion.smooth_motion(poses, smooth, None if given is None else given.process)

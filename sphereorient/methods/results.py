@@ -140,7 +140,7 @@ def measured_track(
     margin, angle = _margin(table, choice)
     cameras = {view.name: precise_camera(k, table, picked, learnt) for k, view in enumerate(learnt.fitter.views)}
     missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
-    flags = _fit_flags(table, choice, picked, learnt, np.any(missed, axis=0))
+    flags = _fit_flags(table, choice, picked, learnt, np.sum(missed, axis=0))
     return replace(
         _empty(experiment, clock, cameras),
         valid=(choice >= 0).numpy(),
@@ -262,10 +262,10 @@ def _fit_flags(
     choice: Tensor,
     picked: Mapping[str, Tensor],
     learnt: Appearance,
-    missed: NDArray[np.bool_],
+    missed: NDArray[np.int64],
 ) -> Tensor:
     """Return flags (N,) int64 of frames that one camera alone measured, of poor fits, and of a movie of two balls.
-    Where another camera should see the sphere and does not (`missed`), half of the poses are wrong.
+    Where as many other cameras should see the sphere and do not (`missed`, a number), half of the poses are wrong.
     """
     found = choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
@@ -274,7 +274,8 @@ def _fit_flags(
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
     excess = torch.where(table.use, picked["excess"], torch.inf).amin(-1)
-    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.in_doubt | torch.from_numpy(missed))
+    outvoted = torch.from_numpy((missed > 0) & (missed >= table.use.sum(-1).numpy()))
+    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.in_doubt | outvoted)
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
     return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 
@@ -299,10 +300,12 @@ def with_systematic_errors(
 def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
     """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
     use = torch.from_numpy(_believed(track))
-    together = lasting.covariance[:3, :3].expand(len(use), 3, 3)
+    # Those of each camera are its own: the fewer count, the less of them is averaged away.
+    fewer = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None]
+    together = fewer * lasting.covariance[:3, :3]
     alone = (use.to(torch.float64) @ lasting.own_rad2.flatten(1)).reshape(-1, 3, 3)
     turn = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
-    place = lasting.covariance[3:, 3:].numpy()
+    place = (fewer * lasting.covariance[3:, 3:]).numpy()
     return replace(
         track,
         position_cov=track.position_cov + place,
@@ -316,13 +319,19 @@ def with_contradictions(
     track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool, lasting: Lasting
 ) -> tuple[Trajectory, Consistency]:
     """Mark frames in which two cameras contradict each other, and make the covariances hold what they disagree by.
-    Errors that last, see `with_lasting_errors`, let them disagree without a contradiction.
+    Errors that last, see `with_lasting_errors`, let them disagree without a contradiction. A camera that contradicts
+    more others than it has on its side takes no part.
     A contradiction is added to those of its frame; all are scaled where cameras disagree more than they state in most
     frames. Return also how well the cameras agree in the whole movie.
     """
     seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
-    pairs = [_compared(track, seen, lasting, *two) for two in combinations(range(len(cameras)), 2)]
-    wrong = torch.from_numpy(np.any([np.isin(one.reason, ELSEWHERE) for one in track.cameras.values()], axis=0))
+    elsewhere = np.stack([np.isin(one.reason, ELSEWHERE) for one in track.cameras.values()], 1)
+    believed = _believed(track).sum(1)
+    outvoted = torch.from_numpy(elsewhere & (believed > elsewhere.sum(1))[:, None])
+    wrong = torch.from_numpy(elsewhere.any(1)) & ~outvoted.any(1)
+    counted = replace(seen, centre_px=seen.centre_px.masked_fill(outvoted[..., None], torch.nan))
+    counted = replace(counted, R_lab_body=seen.R_lab_body.masked_fill(outvoted[..., None, None], torch.nan))
+    pairs = [_compared(track, counted, lasting, *two) for two in combinations(range(len(cameras)), 2)]
     for pair in pairs:
         wrong |= pair.turned | (pair.gaps.signed_px.abs() > limits.gap_px)
     turns = torch.cat([pair.away[pair.both & ~wrong] for pair in pairs])
@@ -337,10 +346,12 @@ def with_contradictions(
         scaled["position" + kind] = place_scale**2 * place
         scaled["orientation" + kind] = turn_scale**2 * turn + rolled.nan_to_num()[:, None, None] * unit
     place_cov, turn_cov = scaled["position_cov"], scaled["orientation_cov"]
+    share = 1 / torch.from_numpy(believed).clamp_min(2).to(torch.float64)
     for pair in pairs:
         # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
-        turn = torch.where(pair.both, 0.5, 1.0)[:, None] * pair.turned[:, None] * pair.turn.nan_to_num()
-        gap_mm = 0.5 * (pair.apart > CONTRADICTS_SIGMAS * place_scale) * pair.gaps.signed_mm.nan_to_num()
+        turn = torch.where(pair.both, share, 1.0)[:, None] * pair.turned[:, None] * pair.turn.nan_to_num()
+        gap_mm = torch.where(pair.both, share, 0.5) * pair.gaps.signed_mm.nan_to_num()
+        gap_mm = gap_mm * (pair.apart > CONTRADICTS_SIGMAS * place_scale)
         shift_mm = (pair.gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
         shift_mm = torch.where(pair.both[:, None], 0.0, shift_mm)
         # A pose between two pictures turns the sphere to match their paint; one camera's own pose does not.

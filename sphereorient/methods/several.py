@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 
 SURE = 0.99  # probability from which a ball has its name
 MOSTLY_SEEN = 0.5  # share of a disk that others must leave to each camera, of the frames that light is learnt from
+MORE_FRAMES = 2  # times those of one ball: others hide it in some
 WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
 
 
@@ -45,7 +46,8 @@ def learn(job: Job, progress: Progress) -> Follower:
     views = open_scene(recording, job.settings, progress)
     progress("appearance", 0, 1)
     any_views = next(iter(views.values()))
-    frames, places = sample_frames(recording, any_views, 2 * refine.appearance_frames)
+    count = MORE_FRAMES * refine.appearance_frames
+    frames, places = sample_frames(recording, any_views, count)
     paints = [_Paint.of(job, names, views[names[0]]) for names in alike(job)]
     first = {name: paint.first for paint in paints for name in paint.names}
     start = SceneStart(first)
@@ -57,6 +59,8 @@ def learn(job: Job, progress: Progress) -> Follower:
     appearances: dict[str, Appearance] = {}
     for paint in paints:
         rows = _mostly_seen(paint, first, found)
+        # Mixed: light is judged from halves of them, and any half should hold all balls at all times.
+        rows = [rows[k] for k in np.random.default_rng(0).permutation(len(rows))[:count]]
         if not rows:
             raise ExperimentError(_none(paint.names))
         followed = None
@@ -162,6 +166,13 @@ def alike(job: Job) -> list[list[str]]:
     return list(kinds.values())
 
 
+def unlit(job: Job, views: Mapping[str, Sequence[CameraView]]) -> dict[str, Initialiser]:
+    """Return how each ball is looked for before its light is known; balls that look alike share it."""
+    paints = [_Paint.of(job, names, views[names[0]]) for names in alike(job)]
+    first = {name: paint.first for paint in paints for name in paint.names}
+    return {name: first[name] for name in job.recording.experiment.names}
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Paint:
     """Balls that look alike, and how they are looked for before their light is known."""
@@ -191,8 +202,7 @@ def _mostly_seen(
     """Return frames and names of balls of a paint that the others mostly leave to all cameras that see them."""
     rows = []
     for k, there in enumerate(found):
-        # Every other row is one half of the frames: so both halves hold all balls.
-        for name in paint.names if k % 2 else reversed(paint.names):
+        for name in paint.names:
             if name not in there or not len(there[name]):
                 continue
             poses = there[name]

@@ -153,9 +153,10 @@ def refined(
     poses, cameras = use.shape
     kept = torch.empty(L, P, dtype=torch.bool)
     parts = pose_arrays(cameras, poses)
-    at = _Addresses()
     instant, share = _quadrature(pixels.instants)
-    task = _Task.from_buffer_copy(_of_model(model)[0])
+    of_model, known = _of_model(model)
+    at = _Addresses(known)
+    task = _Task.from_buffer_copy(of_model)
     task.disks, task.places, task.inner, task.cameras = L, P, pixels.inner, cameras
     task.tiles = int(pixels.tile.max()) + 1 if P else 1
     task.instants, task.origins = pixels.instants, pixels.origin.shape[-1]
@@ -211,9 +212,11 @@ def settled(
     if code is None or not kinds <= READABLE:
         return None
     poses, cameras = begin.use.shape
-    at, parts = _Addresses(), pose_arrays(cameras, poses)
+    parts = pose_arrays(cameras, poses)
     far = torch.full((poses,), not first)
-    near = _Near(task=_of_model(model)[0], some_more=more[0], all_more=more[1], near_rad=near_rad)
+    of_model, of = _of_model(model)
+    at = _Addresses(of)
+    near = _Near(task=of_model, some_more=more[0], all_more=more[1], near_rad=near_rad)
     near.most_hidden, near.held, near.far = most_hidden, begin.held, far.data_ptr()
     near.some, near.all = (_of_stencil(one) for one in stencils)
     known = [_of_scene(*one) for one in scenes]
@@ -271,7 +274,9 @@ def _of_stencil(stencil: Stencil) -> _Stencil:
 class _Addresses:
     """Addresses of tensors as C reads them; each lives as long as this."""
 
-    def __init__(self) -> None:
+    def __init__(self, *others: "_Addresses") -> None:
+        # The others too: another thread may push them out of the cache that holds them.
+        self._others = others
         self._alive: list[Tensor] = []
 
     def __call__(self, part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:
@@ -282,7 +287,7 @@ class _Addresses:
         return self._alive[-1].data_ptr()
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _of_model(model: SphereModel) -> tuple[_Task, _Addresses]:
     """Return a record with all that depends on the model alone, and what it points to."""
     at = _Addresses()

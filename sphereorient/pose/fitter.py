@@ -239,10 +239,10 @@ class Fitter:
         """Return a fitter that computes on another device."""
         return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
 
-    def of(self, camera: int) -> "Fitter":
-        """Return the fitter of one camera by itself."""
-        limb_px = self.limb_px if self.limb_px is None else self.limb_px[camera : camera + 1]
-        return replace(self, views=[self.views[camera]], light=self.light.of(camera), limb_px=limb_px)
+    def of(self, *cameras: int) -> "Fitter":
+        """Return the fitter of some cameras by themselves."""
+        limb_px = self.limb_px if self.limb_px is None else self.limb_px[list(cameras)]
+        return replace(self, views=[self.views[k] for k in cameras], light=self.light.of(*cameras), limb_px=limb_px)
 
     def disks_px(self, position_lab_mm: Tensor) -> Disks:
         """Return middles (C, B, 2) of the disks that a sphere at (B, 3), mm, shows, and the largest radius (B,), px."""

@@ -97,10 +97,10 @@ class LabLight:
         gain = self.gain.repeat(len(gloss) // len(self.gain))[:, None]
         return gain * through * difference, gain * (through * black + mirrored * gloss)
 
-    def of(self, camera: int) -> "LabLight":
-        """Return the light as one camera sees it."""
-        one = slice(camera, camera + 1)
-        return replace(self, gain=self.gain[one], noise=self.noise[one], stray=self.stray[one])
+    def of(self, *cameras: int) -> "LabLight":
+        """Return the light as some cameras see it."""
+        some = list(cameras)
+        return replace(self, gain=self.gain[some], noise=self.noise[some], stray=self.stray[some])
 
     def to(self, device: torch.device) -> "LabLight":
         """Return the light on another device."""

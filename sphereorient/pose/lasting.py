@@ -32,13 +32,13 @@ class Lasting:
         zeros = torch.zeros(cameras, 6, 6, dtype=torch.float64)
         return cls(covariance=zeros[0], own_rad2=zeros[:, :3, :3])
 
-    def of(self, camera: int) -> "Lasting":
-        """Return those of one camera by itself: its distance is not known, its rotation as well as `own_rad2` says."""
-        own = self.own_rad2[camera]
-        covariance = self.covariance.clone()
-        covariance[:3] = covariance[:, :3] = 0.0
-        covariance[:3, :3] = own
-        return Lasting(covariance=covariance, own_rad2=own[None])
+    def of(self, *cameras: int) -> "Lasting":
+        """Return those of some cameras; of one its distance is not known, its rotation as well as `own_rad2` says."""
+        own, covariance = self.own_rad2[list(cameras)], self.covariance.clone()
+        if len(cameras) == 1:
+            covariance[:3] = covariance[:, :3] = 0.0
+            covariance[:3, :3] = own[0]
+        return Lasting(covariance=covariance, own_rad2=own)
 
     def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
         """Return errors that hold the mean difference of B poses by two models, `use` (B, C), that explain as much."""

@@ -113,8 +113,8 @@ class Lighting(Protocol):
     def tables(self) -> "LightTables":
         """What `at` looks up."""
 
-    def of(self, camera: int) -> "Lighting":
-        """Return the light of one camera."""
+    def of(self, *cameras: int) -> "Lighting":
+        """Return the light of some cameras."""
 
     def to(self, device: torch.device) -> "Lighting":
         """Return the light on another device."""
@@ -195,10 +195,9 @@ class Light:
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
 
-    def of(self, camera: int) -> "Light":
-        """Return the light of one camera."""
-        one = slice(camera, camera + 1)
-        return replace(self, **{name: getattr(self, name)[one] for name in LIGHT_PARTS})
+    def of(self, *cameras: int) -> "Light":
+        """Return the light of some cameras."""
+        return replace(self, **{name: getattr(self, name)[list(cameras)] for name in LIGHT_PARTS})
 
     def to(self, device: torch.device) -> "Light":
         """Return the light on another device."""
@@ -287,13 +286,15 @@ class FromLimb:
     edge: Tensor  # (L, P), how far within the limb, standard deviations of the aperture
 
 
-def from_limb(pixels: Sights, position_lab_mm: Tensor, radius_mm: float, blur_px: float) -> FromLimb:
-    """Return where the pixels' lines of sight pass spheres at position_lab_mm (L, 3) through a Gaussian aperture."""
+def from_limb(pixels: Sights, position_lab_mm: Tensor, radius_mm: float | Tensor, blur_px: float) -> FromLimb:
+    """Return where the pixels' lines of sight pass spheres at position_lab_mm (L, 3), of one radius or of their own
+    (L, 1), through a Gaussian aperture; one disk's lines of sight may stand for all.
+    """
     d = pixels.direction
     # In double precision, once: half a metre less half a metre.
     to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
     aside = nearest_approach(to_centre, d, 1)
-    nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
+    nearest = torch.maximum((aside * aside).sum(1).sqrt(), torch.as_tensor(1e-6 * radius_mm))
     outward = aside / nearest[:, None]
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -74,35 +75,41 @@ def visible_shares(disks: DiskPlaces, neighbours: Neighbours) -> Tensor:
 
 def _spoilt(disks: DiskPlaces, neighbours: Neighbours) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Yield the disks near another one: row b * C + c, its spoilt places (P,) bool, its own `_edges`."""
-    cameras, rest = len(disks.sights), torch.zeros(3, dtype=torch.float64)
-    middles = disks.middle_px.nan_to_num().tolist()
-    for b, (X, radii, moves) in enumerate(
-        zip(neighbours.position_lab_mm, neighbours.radius_mm.tolist(), neighbours.move_mm, strict=True)
-    ):
-        for c, sight in enumerate(disks.sights):
-            direction, origin, pitch_rad, pitch_mm = sight.about(middles[c][b])
-            to_centre = X - origin
-            along = to_centre @ direction
-            # Another sphere's middle lies within its own radius and that of the stencil of this one's line of sight.
-            reach = (disks.stencil.reach + 1) * (pitch_rad * along.clamp_min(0.0) + pitch_mm)
-            away = (to_centre - along[:, None] * direction).norm(dim=-1)
-            near = [k for k, radius in enumerate(radii) if float(away[k]) < radius + float(reach[k])]
-            if not near:
-                continue
-            there, place = sight.of(middles[c][b], disks.stencil), disks.position_lab_mm[b]
-            own = _edges(there, place, rest if disks.move_mm is None else disks.move_mm[b], disks.radius_mm, disks)
+    middle_px = disks.middle_px.nan_to_num().numpy()
+    X, radii = neighbours.position_lab_mm.numpy(), neighbours.radius_mm.numpy()
+    for c, sight in enumerate(disks.sights):
+        direction, origin, pitch_rad, pitch_mm = sight.about(middle_px[c])
+        to_centre = X - origin[:, None]
+        along = (to_centre * direction[:, None]).sum(-1)
+        # Another sphere's middle lies within its own radius and that of the stencil of this one's line of sight.
+        reach = (disks.stencil.reach + 1) * (pitch_rad[:, None] * along.clip(0.0) + pitch_mm[:, None])
+        aside = to_centre - along[..., None] * direction[:, None]
+        near = np.sqrt((aside * aside).sum(-1)) < radii + reach
+        depth = ((disks.position_lab_mm.numpy() - origin) * direction).sum(-1)
+        nearer = along < depth[:, None]
+        for b in np.flatnonzero(near.any(1)).tolist():
+            there = sight.of((float(middle_px[c, b, 0]), float(middle_px[c, b, 1])), disks.stencil)
+            some = np.flatnonzero(near[b])
+            own, *others = _edges(there, disks, neighbours, b, some.tolist())
+            covered = [one.amax(0) > -CLEAR for one in others]
             spoilt = torch.zeros(own.shape[1], dtype=torch.bool)
-            for k in near:
-                covered = _edges(there, X[k], moves[k], radii[k], disks).amax(0) > -CLEAR
-                nearer = float((X[k] - place) @ direction) < 0
-                spoilt |= covered if nearer else covered & (own.amin(0) < CLEAR)
+            for before, one in zip(nearer[b, some].tolist(), covered, strict=True):
+                spoilt |= one if before else one & (own.amin(0) < CLEAR)
             if bool(spoilt.any()):
-                yield b * cameras + c, spoilt, own
+                yield b * len(disks.sights) + c, spoilt, own
 
 
-def _edges(there: Sights, X: Tensor, move: Tensor, radius_mm: float, disks: DiskPlaces) -> Tensor:
-    """Return how far within a sphere's limb places look, standard deviations of the blur, (2, P): as the shutter opens
-    and as it closes.
+def _edges(
+    there: Sights, disks: DiskPlaces, neighbours: Neighbours, pose: int, some: Sequence[int]
+) -> Sequence[Tensor]:
+    """Return how far within the limb places look, standard deviations of the blur, (2, P), as the shutter opens and as
+    it closes: of the sphere of a pose, and of some of its neighbours.
     """
-    ends = X + torch.tensor([[-0.5], [0.5]], dtype=torch.float64) * move
-    return torch.cat([from_limb(there, end[None], radius_mm, disks.blur_px).edge for end in ends])
+    still = torch.zeros(1, 3, dtype=torch.float64)
+    X = torch.cat([disks.position_lab_mm[pose : pose + 1], neighbours.position_lab_mm[pose, some]])
+    own = still if disks.move_mm is None else disks.move_mm[pose : pose + 1]
+    move = torch.cat([own, neighbours.move_mm[pose, some]])
+    ends = (X[:, None] + torch.tensor([[[-0.5], [0.5]]], dtype=torch.float64) * move[:, None]).flatten(0, 1)
+    radius = torch.cat([torch.tensor([disks.radius_mm], dtype=torch.float64), neighbours.radius_mm[pose, some]])
+    radius = radius.repeat_interleave(2)[:, None].to(there.direction.dtype)
+    return list(from_limb(there, ends, radius, disks.blur_px).edge.reshape(len(X), 2, -1))

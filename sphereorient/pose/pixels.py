@@ -108,12 +108,16 @@ class LinesOfSight:
         there = self.pitch_mm.shape[0] > 1
         return self.pitch_rad[v, u : u + 1], self.pitch_mm[v * there, u * there : u * there + 1]
 
-    def about(self, middle_px: tuple[float, float]) -> tuple[Tensor, Tensor, float, float]:
-        """Return the line of sight of the pixel nearest to a place: direction and origin, (3,) float64, and `pitch`."""
-        u, v = (min(max(round(at), 0), count - 2) for at, count in zip(middle_px, self.size, strict=True))
-        start = self.origin[:, 0, 0] if self.one_origin else self.origin[:, v, u]
-        pitch_rad, pitch_mm = self.pitch(u, v)
-        return self.direction[:, v, u].double(), start.double(), float(pitch_rad), float(pitch_mm)
+    def about(self, middle_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the lines of sight nearest to B places (B, 2), px: direction and origin (B, 3), and `pitch` (B,)."""
+        u, v = np.rint(middle_px).astype(np.int64).clip(0, np.array(self.size) - 2).T
+        parts = self.direction, self.origin, self.pitch_rad, self.pitch_mm
+        direction, origin, rad, mm = (part.numpy() for part in parts)
+        starts = origin[:, 0, 0] if self.one_origin else origin[:, v, u].T
+        pitch_mm = mm[v, u] if len(mm) > 1 else mm[0, 0]
+        found = direction[:, v, u].T, starts, rad[v, u], pitch_mm
+        shapes = (len(u), 3), (len(u), 3), (len(u),), (len(u),)
+        return tuple(np.broadcast_to(part, shape).astype(np.float64) for part, shape in zip(found, shapes, strict=True))
 
     def of(self, middle_px: tuple[float, float], stencil: "Stencil") -> Sights:
         """Return the lines of sight of one disk's places, those of `cut_pixels`."""

@@ -44,7 +44,7 @@ def cameras_agree(
         request = Request(
             experiment=replace(experiment, frames=(first, first + len(stretch[0].frame))),
             settings=settings,
-            learnt=replace(learnt, together=False),
+            learnt=replace(learnt, together=False, majority=()),
         )
         track = one_track(run(request, MemoryStore()))
     except SphereOrientError as error:
@@ -61,7 +61,8 @@ def cameras_agree(
     seen = replace(seen, outline_stretch=torch.stack(wider, 1))
     found = compare_cameras(seen, limits)
     if found.frames < FEWEST or math.isnan(found.turn_deg):
-        measured = f"cannot tell: both cameras show the ball and its paint in {found.frames} of {len(track)} frames"
+        both = "both" if len(stretch) == 2 else "two"
+        measured = f"cannot tell: {both} cameras show the ball and its paint in {found.frames} of {len(track)} frames"
         yield warning(TITLE, measured, "see the findings on the ball and on the map")
         return
     measured = f"{found} (median of {found.frames} frames)"

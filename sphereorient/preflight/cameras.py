@@ -1,15 +1,17 @@
-"""Checks of two cameras against each other: lines of sight, size of the ball, offset of the movies."""
+"""Checks of cameras against each other: lines of sight, size of the ball, offset of the movies."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from statistics import median, median_low
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.consistency import Gaps, gaps_between
-from sphereorient.cameras import Camera
+from sphereorient.calibration.consistency import Gaps, Limits, Seen, gaps_between, majority
+from sphereorient.cameras import Camera, nearest_point
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample, pair_starts
 from sphereorient.sphere.renderer import rim_directions
@@ -38,23 +40,52 @@ def sample_gaps(samples: Sequence[MovieSample]) -> Gaps:
     return gaps_between([one.camera for one in samples], [one.sightings.centre_px for one in samples])
 
 
+def sample_positions(samples: Sequence[MovieSample]) -> Tensor:
+    """Return the positions (n, 3), lab, mm, of the ball in the frames sampled by two cameras or more."""
+    return nearest_point([one.camera.rays(one.sightings.centre_px) for one in samples])[0]
+
+
+def outvoted(samples: Sequence[MovieSample]) -> list[str]:
+    """Return the cameras whose lines of sight miss those of a majority that meet; none of two cameras."""
+    if len(samples) < 3:
+        return []
+    seen = Seen(
+        cameras={one.name: one.camera for one in samples},
+        centre_px=torch.stack([one.sightings.centre_px for one in samples], 1),
+        radius_px=torch.stack([one.sightings.radius_px for one in samples], 1),
+        R_lab_body=torch.full((len(samples[0].frame), len(samples), 3, 3), torch.nan, dtype=torch.float64),
+        diameter_mm=1.0,  # of no importance: only ratios of sizes differ between cameras
+    )
+    agree = majority(seen, Limits(gap_px=BAD_PX, turn_deg=1.0, size=GOOD))
+    return [one.name for k, one in enumerate(samples) if agree and k not in agree]
+
+
 def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> Finding:
     """Judge the distance between the lines of sight; `in_step_px`: the gap after synchronising the movies."""
-    title, gaps = "lines of sight", sample_gaps(samples)
-    count = int(torch.isfinite(gaps.signed_mm).sum())
-    if count < ENOUGH:
-        measured = f"both cameras see the ball in {count} of {len(gaps.signed_mm)} frames sampled"
+    title, pairs = "lines of sight", {two: sample_gaps(two) for two in combinations(samples, 2)}
+    counts = {two: int(torch.isfinite(gaps.signed_mm).sum()) for two, gaps in pairs.items()}
+    fewest = min(counts, key=lambda two: counts[two])
+    if (count := counts[fewest]) < ENOUGH:
+        who = "both cameras see" if len(samples) == 2 else f"{fewest[0].name} and {fewest[1].name} see"
+        measured = f"{who} the ball in {count} of {len(samples[0].frame)} frames sampled"
         return warning(title, measured, f"{SEE_BALL}, and check start: the movies must show the same time")
-    gap_px = _median_size(gaps.signed_px)
-    measured = f"they miss each other by {_median_size(gaps.signed_mm):.3f} mm, {gap_px:.2f} px"
-    measured += f" (median of {count} frames)"
+    by_pair = {two: _median_size(gaps.signed_px) for two, gaps in pairs.items()}
+    worst = max(by_pair, key=lambda two: by_pair[two])
+    gap_px, gap_mm = by_pair[worst], _median_size(pairs[worst].signed_mm)
+    who = "they miss" if len(samples) == 2 else f"those of {worst[0].name} and {worst[1].name} miss"
+    measured = f"{who} each other by {gap_mm:.3f} mm, {gap_px:.2f} px (median of {counts[worst]} frames)"
+    wrong = outvoted(samples) if gap_px > BAD_PX else []
+    if wrong:
+        others = max((gap for two, gap in by_pair.items() if not {one.name for one in two} & {*wrong}))
+        measured += f"; without {' and '.join(wrong)} they meet to {others:.2f} px"
     if in_step_px is not None:
         measured += f"; {in_step_px:.2f} px once the movies are in step"
         gap_px = in_step_px
     limit = min(CLEARER * gap_px, GOOD_PX)
     # At right angles, several of these can fit: all are reported.
     better = ", or ".join(advice for gap, advice in sorted(_other_readings(samples)) if gap < limit)
-    moved = "calibrate again: a camera was moved or bumped, or cameras.yaml is of another set-up"
+    who = f"{' and '.join(wrong)} contradicts the others and" if wrong else "a camera"
+    moved = f"calibrate again: {who} was moved or bumped, or cameras.yaml is of another set-up"
     bumped = "run sphereorient check-cameras, and calibrate --refine-with: a camera may have been bumped"
     complaints = (gap_px > BAD_PX, FAULT, better or moved), (gap_px > GOOD_PX, WARNING, bumped)
     return judged(title, measured, *complaints)
@@ -65,20 +96,28 @@ def _median_size(values: Tensor) -> float:
 
 
 def _other_readings(samples: Sequence[MovieSample]) -> list[tuple[float, str]]:
-    """Return gap, px, and advice with the movies swapped, and with one of them mirrored."""
+    """Return largest gap, px, and advice with two movies swapped, and with one of them mirrored."""
     cameras, centres = [one.camera for one in samples], [one.sightings.centre_px for one in samples]
+
+    def largest(seen: Sequence[Tensor]) -> float:
+        two = combinations(range(len(samples)), 2)
+        gaps = (gaps_between((cameras[k], cameras[m]), (seen[k], seen[m])) for k, m in two)
+        return max(_median_size(one.signed_px) for one in gaps)
+
     readings = []
-    if cameras[0].image_size == cameras[1].image_size:
-        gap = _median_size(gaps_between(cameras, centres[::-1]).signed_px)
-        first, second = (one.name for one in samples)
-        readings.append((gap, f"swap {first} and {second} in movies: (then it is {gap:.2f} px)"))
+    for k, m in combinations(range(len(samples)), 2):
+        if cameras[k].image_size == cameras[m].image_size:
+            swapped = [*centres]
+            swapped[k], swapped[m] = centres[m], centres[k]
+            gap = largest(swapped)
+            advice = f"swap {samples[k].name} and {samples[m].name} in movies: (then it is {gap:.2f} px)"
+            readings.append((gap, advice))
     for k, sample in enumerate(samples):
         for how, axes in (("horizontal", (0,)), ("vertical", (1,)), ("both", (0, 1))):
             flipped = centres[k].clone()
             for axis in axes:
                 flipped[:, axis] = cameras[k].image_size[axis] - 1 - flipped[:, axis]
-            pair = [flipped if j == k else uv for j, uv in enumerate(centres)]
-            gap = _median_size(gaps_between(cameras, pair).signed_px)
+            gap = largest([flipped if j == k else uv for j, uv in enumerate(centres)])
             readings.append((gap, f"write flip: {{{sample.name}: {how}}} (then it is {gap:.2f} px)"))
     return readings
 
@@ -101,15 +140,16 @@ def outline_stretch(sample: MovieSample, position_lab_mm: Tensor, radius_mm: flo
 
 
 def ball_size(samples: Sequence[MovieSample], diameter_mm: float) -> Finding:
-    """Compare the size of the ball in the pictures of two cameras with the expected size."""
-    title, position, ratios = "size of the ball", sample_gaps(samples).position_lab_mm, {}
+    """Compare the size of the ball in the pictures of two cameras or more with the expected size."""
+    title, position, ratios = "size of the ball", sample_positions(samples), {}
     for sample in samples:
         outline = expected_outline_px(sample.camera, position, diameter_mm / 2)
         expected = (outline - outline.mean(-2, keepdim=True)).norm(dim=-1).mean(-1)
         ratios[sample.name] = sample.sightings.radius_px / expected
     middle = {name: float(ratio.nanmedian()) for name, ratio in ratios.items()}
     if any(math.isnan(ratio) for ratio in middle.values()):
-        return warning(title, "unknown: no frame shows the ball to both cameras", SEE_BALL)
+        both = "both" if len(samples) == 2 else "all"
+        return warning(title, f"unknown: no frame shows the ball to {both} cameras", SEE_BALL)
     spread = {name: 1.4826 * float((ratio - ratio.nanmedian()).abs().nanmedian()) for name, ratio in ratios.items()}
     words = ", ".join(f"{name} {ratio:.3f} +- {spread[name]:.3f}" for name, ratio in middle.items())
     measured = f"measured over expected: {words}"
@@ -118,7 +158,8 @@ def ball_size(samples: Sequence[MovieSample], diameter_mm: float) -> Finding:
     apart = max(middle.values()) - min(middle.values())
     error = max(apart, abs(mean - 1))
     if apart > GOOD + tolerance:
-        name = max(middle, key=lambda one: abs(middle[one] - 1))
+        usual = 1.0 if len(samples) == 2 else median(middle.values())
+        name = max(middle, key=lambda one: abs(middle[one] - usual))
         advice = f"check f, pixel_pitch and T of {name} in cameras.yaml: the cameras do not agree on the size"
     else:
         advice = (
@@ -174,7 +215,7 @@ def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
     starts = pair_starts(count)
     if not starts:
         return []
-    gaps = sample_gaps(samples)
+    gaps = sample_gaps(samples[:2])
     across_px = (gaps.position_lab_mm * gaps.across_lab).sum(-1) * gaps.per_mm_px
     index = np.searchsorted(samples[0].frame, starts)  # the next frame is the next one of the sample
     moved = torch.nan_to_num(across_px[index + 1] - across_px[index])
@@ -256,31 +297,45 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
     return k - REACH + 0.5 * (before - after) / bend, math.sqrt(max(0.0, here - (before - after) ** 2 / (8 * bend)))
 
 
-def in_step(scan: OffsetScan, start: Mapping[str, int]) -> Finding:
-    """Judge whether the movies are synchronised; `start` is that of the experiment."""
-    title, (first, second) = "movies in step", scan.names
-    if scan.moved_px <= MOVES_PX:
-        return judged(title, f"unknown: the ball moves {scan.moved_px:.2f} px a frame across the lines of sight")
-    if math.isnan(scan.best):
+def shifts_of(scans: Sequence[OffsetScan]) -> dict[str, float]:
+    """Return by how many frames each movie is late, NaN: unknown: of two against the first, of more against most."""
+    late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
+    known = [value for value in late.values() if not math.isnan(value)]
+    usual = median_low(known) if len(scans) > 1 else 0.0
+    return {name: value - usual for name, value in late.items()}
+
+
+def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
+    """Judge whether the movies are synchronised, from scans of each other one against the first; `start` is that of
+    the experiment.
+    """
+    title, late = "movies in step", shifts_of(scans)
+    moved_px = min(scan.moved_px for scan in scans)
+    if moved_px <= MOVES_PX:
+        return judged(title, f"unknown: the ball moves {moved_px:.2f} px a frame across the lines of sight")
+    if any(math.isnan(value) for value in late.values()):
         measured = f"unknown: within {REACH} frames no shift makes the lines of sight meet"
         return warning(title, measured, "correct the findings on ball and lines of sight first, then check again")
-    now, best = float(scan.gap_px[REACH]), float(scan.gap_px.min())
+    name = max(list(late)[1:] if len(scans) == 1 else late, key=lambda one: abs(late[one]))
     measured = (
-        f"{second} shows the same instant {abs(scan.best):.2f} frames {'later' if scan.best > 0 else 'earlier'} "
-        f"(the ball moves {scan.moved_px:.1f} px a frame across the lines of sight)"
+        f"{name} shows the same instant {abs(late[name]):.2f} frames {'later' if late[name] > 0 else 'earlier'} "
+        f"(the ball moves {moved_px:.1f} px a frame across the lines of sight)"
     )
-    if scan.shift == 0:
+    shifted = [scan for scan in scans if scan.shift]
+    if not shifted:
         advice = "trigger both cameras by one signal: start: cannot correct a part of a frame"
-        return judged(title, measured, (abs(scan.best) > IN_STEP, WARNING, advice))
+        advice = advice if len(scans) == 1 else advice.replace("both", "all")
+        return judged(title, measured, (abs(late[name]) > IN_STEP, WARNING, advice))
+    now = max(float(scan.gap_px[REACH]) for scan in shifted)
+    best = max(float(scan.gap_px.min()) for scan in shifted)
     measured += f"; the gap falls from {now:.2f} to {best:.2f} px"
-    begins = starts_in_step(start, scan)
-    advice = f"write start: {{{first}: {begins[0]}, {second}: {begins[1]}}}"
+    begins = ", ".join(f"{one}: {first}" for one, first in starts_in_step(start, late).items())
     weak = (now < CLEARLY * best, WARNING, "look at one event in both movies: this evidence is weak")
-    return judged(title, measured, weak, (True, FAULT, advice))
+    return judged(title, measured, weak, (True, FAULT, f"write start: {{{begins}}}"))
 
 
-def starts_in_step(start: Mapping[str, int], scan: OffsetScan) -> tuple[int, int]:
-    """Return the values of `start:`, not negative, that synchronise the movies of the two cameras."""
-    first, second = (start.get(name, 0) for name in scan.names)
-    second += scan.shift
-    return first + max(0, -second), max(0, second)
+def starts_in_step(start: Mapping[str, int], late: Mapping[str, float]) -> dict[str, int]:
+    """Return the values of `start:`, not negative, that synchronise movies that are late by some frames."""
+    begins = {name: start.get(name, 0) + round(frames) for name, frames in late.items()}
+    before = min(0, *begins.values())
+    return {name: begin - before for name, begin in begins.items()}

@@ -8,13 +8,14 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import agreement, cameras, movies, texture_map
 from sphereorient.preflight.finding import FAULT, OK, Finding, Severity, judged, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
+from sphereorient.preflight.scene import SceneView, look_at_scene
 from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture, load_unseen
 
@@ -29,13 +30,14 @@ class Preflight:
     timeline: Timeline
     samples: tuple[MovieSample, ...]
     closer: tuple[tuple[MovieSample, ...], ...]  # consecutive frames: by stretch, then by camera
-    scan: cameras.OffsetScan | None  # None with one camera
+    scans: tuple[cameras.OffsetScan, ...]  # of each other camera against the first
     texture: Tensor | None  # (H, 2 H)
     unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
     measures: texture_map.TextureMeasures | None
     similar: texture_map.ViewPair | None
     agreement: tuple[Finding, ...]  # of a short stretch tracked; none with one camera or without a map
     matches: tuple[texture_map.TextureMatch, ...]
+    scene: tuple[SceneView, ...] = ()  # of several balls: a picture of each camera
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -58,6 +60,8 @@ def preflight(
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
+        if len(experiment.spheres) > 1:
+            return _of_scene(recording, settings, progress)
         image, unseen = None, None
         if experiment.texture_path is not None and experiment.texture_path.exists():
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
@@ -76,7 +80,7 @@ def preflight(
         search = image is not None and pool.submit(GreySearch, image, settings.search)
         samples = tuple(one.result() for one in sampling)
         progress("frames", len(samples), len(samples))
-        closer, scan = _offsets(samples, settings, pool)
+        closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
         tracked: tuple[Finding, ...] = ()
         if learning is not None and closer:
@@ -87,7 +91,7 @@ def preflight(
             timeline=recording.timeline,
             samples=samples,
             closer=closer,
-            scan=scan,
+            scans=scans,
             texture=image,
             unseen=unseen,
             matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
@@ -97,6 +101,27 @@ def preflight(
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
+
+
+def _of_scene(recording: Recording, settings: Settings, progress: Progress) -> Preflight:
+    """Check an experiment of several balls."""
+    scene, found = look_at_scene(recording, settings, progress)
+    experiment = recording.experiment
+    return Preflight(
+        experiment=experiment,
+        timeline=recording.timeline,
+        samples=(),
+        closer=(),
+        scans=(),
+        texture=None,
+        unseen=None,
+        matches=(),
+        measures=None,
+        similar=None,
+        agreement=(),
+        scene=scene,
+        findings=(movies.frames(experiment, recording.timeline), *movies.outside(experiment), *found),
+    )
 
 
 def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:
@@ -123,12 +148,14 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
 
 def _outline_findings(seen: Preflight) -> Iterator[Finding]:
     between, diameter_mm = [], seen.experiment.diameter_mm
-    if seen.scan is not None:
-        between.append(cameras.lines_of_sight(seen.samples, seen.scan.in_step_px if seen.scan.shift else None))
-        between.append(cameras.in_step(seen.scan, seen.experiment.start))
+    if seen.scans:
+        shifted = any(scan.shift for scan in seen.scans)
+        in_step_px = max(scan.in_step_px for scan in seen.scans) if shifted else None
+        between.append(cameras.lines_of_sight(seen.samples, in_step_px))
+        between.append(cameras.in_step(seen.scans, seen.experiment.start))
         between += [] if diameter_mm is None else [cameras.ball_size(seen.samples, diameter_mm)]
     yield from (agreement.unsure(one, seen.experiment, len(seen.samples[0].stream)) for one in between)
-    if seen.scan is None or diameter_mm is None:
+    if not seen.scans or diameter_mm is None:
         yield from (cameras.ball_size_px(sample) for sample in seen.samples)
 
 
@@ -166,15 +193,19 @@ def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[st
 
 def _offsets(
     samples: Sequence[MovieSample], settings: Settings, pool: ThreadPoolExecutor
-) -> tuple[tuple[tuple[MovieSample, ...], ...], cameras.OffsetScan | None]:
-    """Sample the stretches with most motion, and scan the offset between two movies."""
-    if len(samples) != 2:
-        return (), None
+) -> tuple[tuple[tuple[MovieSample, ...], ...], tuple[cameras.OffsetScan, ...]]:
+    """Sample the stretches with most motion, and scan the offset between the first movie and each other one."""
+    if len(samples) < 2:
+        return (), ()
     parts = [
         [pool.submit(sample_more, sample, frames, settings.locate) for sample in samples]
         for frames in cameras.liveliest_stretches(samples)
     ]
     closer = tuple(tuple(one.result() for one in part) for part in parts)
-    centres = [(first.sightings.centre_px, second.sightings.centre_px) for first, second in closer]
-    names, views = [one.name for one in samples], [one.camera for one in samples]
-    return closer, cameras.scan_offsets(names, views, centres)
+    first, *others = samples
+
+    def scan(k: int, other: MovieSample) -> cameras.OffsetScan:
+        centres = [(stretch[0].sightings.centre_px, stretch[k].sightings.centre_px) for stretch in closer]
+        return cameras.scan_offsets((first.name, other.name), (first.camera, other.camera), centres)
+
+    return closer, tuple(scan(k, other) for k, other in enumerate(others, 1))

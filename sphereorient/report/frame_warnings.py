@@ -38,6 +38,7 @@ REASON_WORDS: dict[str, str] = {
     Reason.UNSEEN: "shows paint that the map does not know",
     Reason.CONTRADICTS: "contradicts the other camera",
     Reason.SECOND_BALL: "may show the second ball",
+    Reason.HIDDEN: "hidden by another ball",
     Reason.UNDECODABLE: "picture damaged",
     Reason.MISSING: "no picture",
 }

@@ -17,7 +17,7 @@ from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
-from sphereorient.preflight.cameras import REACH, expected_outline_px, sample_gaps
+from sphereorient.preflight.cameras import REACH, expected_outline_px, sample_positions
 from sphereorient.preflight.first_look import FirstLook
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, write_figure
@@ -173,11 +173,14 @@ def _circle(outline: Outline) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 def preflight_figure(result: Preflight, path: Path) -> None:
     """Write a PNG or PDF: a frame of each camera with outlines, the gap by offset, texture map, and findings."""
     lines = _lines(result)
-    agreement = result.scan is not None or result.texture is not None
+    agreement = bool(result.scans) or result.texture is not None
     heights = [PICTURE, PICTURE if agreement else 0.01, LINE * (len(lines) + 2)]
     figure = new_figure(WIDTH, sum(heights))
     top, middle, bottom = np.ravel(figure.subfigures(3, 1, height_ratios=heights, squeeze=False))
-    _cameras_part(top, result)
+    if result.samples:
+        _cameras_part(top, result)
+    else:
+        _scene_part(top, result)
     if agreement:
         gap, balance, pair = middle.subplots(1, 3, width_ratios=[1.1, 1.5, 1.4])
         _draw_gap(gap, result)
@@ -191,10 +194,11 @@ def preflight_figure(result: Preflight, path: Path) -> None:
 def _cameras_part(part: Any, result: Preflight) -> None:
     coverage = torch.stack([torch.nan_to_num(one.sightings.coverage, nan=-1.0) for one in result.samples]).amin(0)
     k = int(coverage.argmax())
-    axes = part.subplots(1, 4)
+    several = max(2, len(result.samples))
+    axes = part.subplots(1, 2 * several)
     for ax in axes[2 * len(result.samples) :]:
         ax.set_axis_off()
-    for sample, pair in zip(result.samples, axes.reshape(2, 2), strict=False):
+    for sample, pair in zip(result.samples, axes.reshape(several, 2), strict=False):
         expected = _expected_px(result, sample, k)
         for ax, near in zip(pair, (False, True), strict=True):
             _draw_ball(ax, sample, k, expected, near)
@@ -202,11 +206,24 @@ def _cameras_part(part: Any, result: Preflight) -> None:
         axes[0].legend(loc="lower left", fontsize=7, framealpha=0.8)
 
 
+def _scene_part(part: Any, result: Preflight) -> None:
+    """Draw a picture of each camera with all disks, and the names of the balls found."""
+    for ax, view in zip(part.subplots(1, max(1, len(result.scene)), squeeze=False)[0], result.scene, strict=False):
+        height, width = view.picture.shape
+        ax.imshow(view.picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(view.picture, 99.8))))
+        for outline in view.disks:
+            ax.plot(*_circle(outline), lw=1.2, color=FOUND)
+        for name, (u, v) in view.balls.items():
+            ax.text(u, v, name, color=EXPECTED, fontsize=10, ha="center", va="center", clip_on=True)
+        ax.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        ax.set_title(f"{view.name}, frame {view.frame}: disks, and the balls found by their paint", fontsize=9)
+
+
 def _expected_px(result: Preflight, sample: MovieSample, k: int) -> NDArray[np.float64] | None:
-    """Return the outline expected from both cameras and the diameter, (n, 2) px; None if unknown."""
-    if result.scan is None or result.experiment.diameter_mm is None:
+    """Return the outline expected from all cameras and the diameter, (n, 2) px; None if unknown."""
+    if not result.scans or result.experiment.diameter_mm is None:
         return None
-    position = sample_gaps(result.samples).position_lab_mm[k]
+    position = sample_positions(result.samples)[k]
     if not bool(torch.isfinite(position).all()):
         return None
     return expected_outline_px(sample.camera, position, result.experiment.diameter_mm / 2).numpy()
@@ -222,7 +239,7 @@ def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float6
         ax.plot(*_circle(outline), lw=1.4, color=FOUND, label="outline found")
     if expected is not None:
         closed = np.concatenate([expected, expected[:1]])
-        ax.plot(*closed.T, "--", lw=1.4, color=EXPECTED, label="expected from both cameras and the diameter")
+        ax.plot(*closed.T, "--", lw=1.4, color=EXPECTED, label="expected from all cameras and the diameter")
     height, width = picture.shape
     if not near or outline is None:
         ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
@@ -235,16 +252,20 @@ def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float6
 
 
 def _draw_gap(ax: Any, result: Preflight) -> None:
-    scan = result.scan
-    if scan is None:
+    if not result.scans:
         _no_data(ax, "one camera: no gap")
         return
-    ax.plot(scan.offset, scan.gap_px, "o-", ms=4, lw=1.2, color=USED, label="gap")
-    ax.plot(scan.offset, scan.varying_px, ".:", ms=4, lw=1, color="#777777", label="without its constant part")
     ax.axvline(0, lw=0.8, color="#444444")
-    if not math.isnan(scan.best):
-        ax.axvline(scan.best, ls="--", lw=1.2, color=EXPECTED, label=f"least at {scan.best:+.2f}")
-    ax.set(xlabel=f"frames later in {scan.names[1]}", ylabel="gap of the lines of sight (px)")
+    for k, scan in enumerate(result.scans):
+        of = f", {scan.names[1]}" if len(result.scans) > 1 else ""
+        color = USED if len(result.scans) == 1 else f"C{k}"
+        ax.plot(scan.offset, scan.gap_px, "o-", ms=4, lw=1.2, color=color, label=f"gap{of}")
+        if len(result.scans) == 1:
+            ax.plot(scan.offset, scan.varying_px, ".:", ms=4, lw=1, color="#777777", label="without its constant part")
+        if not math.isnan(scan.best):
+            ax.axvline(scan.best, ls="--", lw=1.2, color=EXPECTED, label=f"least at {scan.best:+.2f}{of}")
+    late = result.scans[0].names[1] if len(result.scans) == 1 else f"the other movie than in {result.scans[0].names[0]}"
+    ax.set(xlabel=f"frames later in {late}", ylabel="gap of the lines of sight (px)")
     ax.set(xlim=(-REACH - 0.5, REACH + 0.5), ylim=(0, None))
     ax.xaxis.set_major_locator(MaxNLocator(9, integer=True))
     ax.legend(fontsize=7, framealpha=0.8)

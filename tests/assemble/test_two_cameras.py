@@ -488,12 +488,9 @@ def test_single_precision_gives_the_same_in_single_precision(rng):
             assert torch.equal(value, getattr(expected, name))
 
 
-def test_no_camera_and_three_are_refused():
-    cameras = {name: single(turning(5)) for name in ("a", "b", "c")}
-    for some in ({}, cameras):
-        paths = assemble_paths(some, times(5), SETTINGS)
-        with pytest.raises(ExperimentError, match="paths: expected one or two cameras, got"):
-            fuse(paths, some, times(5), SETTINGS)
+def test_no_camera_is_refused():
+    with pytest.raises(ExperimentError, match="paths: expected one camera or more, got 0"):
+        fuse({}, {}, times(5), SETTINGS)
 
 
 def test_candidates_of_another_camera_are_refused():
@@ -501,3 +498,43 @@ def test_candidates_of_another_camera_are_refused():
     paths = assemble_paths(cameras, times(5), SETTINGS)
     with pytest.raises(ShapeError, match="camera 'a': expected 5 frames, got 5 in the path, 0 in the candidates"):
         fuse(paths, {"b": cameras["a"]}, times(5), SETTINGS)
+
+
+def of_three(wrong: str, deceived) -> Fused:
+    """Fuse three cameras of which one follows its best candidate, which in the stretch is false."""
+    cameras = {name: sees(turning(60)) for name in ("cam1", "cam2", "cam3")} | {wrong: deceived}
+    paths = assemble_paths(cameras, times(60), SETTINGS)
+    R, score, _ = cameras[wrong].padded()
+    best = candidates_of([[(R[k, 0], float(score[k, 0]))] for k in range(60)])
+    return fuse(paths | {wrong: assemble_path(best, times(60), SETTINGS)}, cameras, times(60), SETTINGS)
+
+
+@pytest.mark.parametrize("wrong", ["cam1", "cam2", "cam3"])
+def test_two_of_three_cameras_overrule_the_third_whatever_its_score(wrong):
+    mended = of_three(wrong, sees(turning(60), false_in=STRETCH, false_score=0.99, true_score=0.6))
+    assert_close(mended.R_lab_body, turning(60), 1e-9)
+    assert torch.nonzero(mended.repaired[wrong]).flatten().tolist() == list(STRETCH)
+    assert sum(int(each.sum()) for each in mended.repaired.values()) == len(STRETCH)
+    assert has(mended, Flag.AMBIGUOUS) == []
+    dropped = of_three(wrong, sees(turning(60), false_in=STRETCH, true_in=()))
+    assert_close(dropped.R_lab_body, turning(60), 1e-9)
+    assert (dropped.weight[wrong][list(STRETCH)] == 0).all()
+    assert has(dropped, Flag.ONE_CAMERA) == []
+
+
+def test_where_only_two_of_three_cameras_see_the_sphere_the_better_one_of_these_leads():
+    R = turning(60)
+    cameras = {"cam1": sees(R, false_in=STRETCH), "cam2": sees(R), "cam3": sees(R, nothing_in=STRETCH)}
+    paths = assemble_paths(cameras, times(60), SETTINGS)
+    all_R, score, _ = cameras["cam1"].padded()
+    best = candidates_of([[(all_R[k, 0], float(score[k, 0]))] for k in range(60)])
+    mended = fuse(paths | {"cam1": assemble_path(best, times(60), SETTINGS)}, cameras, times(60), SETTINGS)
+    assert_close(mended.R_lab_body, R, 1e-9)
+    assert torch.nonzero(mended.repaired["cam1"]).flatten().tolist() == list(STRETCH)
+
+
+def test_the_sigma_of_three_cameras_is_the_error_of_their_mean(rng):
+    cameras = {name: single(noisy(turning(4000), 0.02, rng)) for name in ("a", "b", "c")}
+    track = fused(cameras)
+    off = so3.log(track.R_lab_body @ turning(4000).mT)
+    assert float(off.square().mean().sqrt()) == pytest.approx(float(track.sigma_rad.median()), rel=0.05)

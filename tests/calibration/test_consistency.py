@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
+from sphereorient.calibration.consistency import Limits, Seen, compare_cameras, majority
 from sphereorient.cameras import Camera, R_cam_view, TsaiCamera, sphere_radius_px
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
@@ -173,3 +173,60 @@ def test_a_camera_that_says_nothing_in_some_frames_does_not_matter():
     found = compare_cameras(seen, LIMITS)
     assert found.frames == 20
     assert "18.9" in found.advice
+
+
+THREE, FOUR = (default_cameras(SynthSettings(cameras=count)) for count in (3, 4))
+
+
+def shifted(camera: Camera, axis: int, mm: float) -> Camera:
+    assert isinstance(camera, TsaiCamera)
+    off = mm * torch.eye(3, dtype=torch.float64)[axis]
+    return replace(camera, T_cam_lab_mm=camera.T_cam_lab_mm + off)
+
+
+def late(seen: Seen, camera: int) -> Seen:
+    centre, R = seen.centre_px.clone(), seen.R_lab_body.clone()
+    centre[1:, camera], R[1:, camera] = seen.centre_px[:-1, camera], seen.R_lab_body[:-1, camera]
+    centre[0, camera], R[0, camera] = torch.nan, torch.nan
+    return replace(seen, centre_px=centre, R_lab_body=R, frame=torch.arange(len(R)))
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_of_three_cameras_the_one_that_contradicts_the_others_is_named_alone(wrong):
+    name = list(THREE)[wrong]
+    others = tuple(k for k in range(3) if k != wrong)
+    turned_one = reported(seen_by(THREE), THREE | {name: turned(THREE[name], 1.5, 0)})
+    assert majority(turned_one, LIMITS) == others
+    found = compare_cameras(turned_one, LIMITS)
+    assert found.contradicts
+    assert found.advice.startswith(f"{name} turned by 1.5 degrees")
+    assert not any(other in found.advice for other in THREE if other != name)
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_a_late_movie_of_three_is_named(wrong):
+    name = list(THREE)[wrong]
+    seen = late(seen_by(THREE, noise=0.1), wrong)
+    strict = Limits(gap_px=1.0, turn_deg=0.2, size=0.01)
+    assert majority(seen, strict) == tuple(k for k in range(3) if k != wrong)
+    assert f"the movie of {name} 1 frames late" in compare_cameras(seen, strict).advice
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_shift_that_two_of_three_cameras_measure_is_decided_by_the_size_in_the_third(wrong, axis):
+    name = list(THREE)[wrong]
+    seen = reported(seen_by(THREE, noise=0.2), THREE | {name: shifted(THREE[name], axis, 2.0)})
+    assert majority(seen, LIMITS) == tuple(k for k in range(3) if k != wrong)
+    advice = compare_cameras(seen, LIMITS).advice
+    assert name in advice
+    assert not any(other in advice for other in THREE if other != name)
+
+
+def test_of_four_cameras_two_that_agree_are_no_majority():
+    cameras = dict(FOUR)
+    for k, name in enumerate(("cam3", "cam4")):
+        cameras[name] = turned(FOUR[name], 2.0 + 3 * k, k)
+    assert majority(reported(seen_by(FOUR), cameras), LIMITS) == ()
+    assert majority(reported(seen_by(FOUR), FOUR | {"cam4": cameras["cam4"]}), LIMITS) == (0, 1, 2)
+    assert majority(seen_by(FOUR), LIMITS) == (0, 1, 2, 3)

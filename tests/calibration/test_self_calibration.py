@@ -11,6 +11,8 @@ from sphereorient import so3
 from sphereorient.calibration.self_calibration import MOVED, CameraObservations, self_calibrate
 from sphereorient.cameras import ParameterCovariance
 from sphereorient.errors import CameraError
+from sphereorient.synth import SynthSettings
+from sphereorient.synth.write import default_cameras
 
 FRAMES = 160
 NOISE_PX, NOISE_DEG = 0.03, 0.08
@@ -139,3 +141,16 @@ def test_too_few_frames_and_one_camera_are_refused(rng):
         self_calibrate(calibrated, says)
     with pytest.raises(CameraError, match="two or more"):
         self_calibrate({"cam1": calibrated["cam1"]}, says)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cam1", "cam3"])
+def test_of_three_cameras_the_bumped_one_is_put_right_and_the_others_stay(rng, name):
+    calibrated = default_cameras(SynthSettings(cameras=3))
+    turn, move = bump(rng)
+    truly = calibrated | {name: bumped(calibrated[name], 3 * turn, 3 * move)}
+    result = self_calibrate(calibrated, told(calibrated, truly, rng))
+    for one, camera in result.cameras.items():
+        assert float(torch.rad2deg(so3.geodesic_distance(camera.R_cam_lab, truly[one].R_cam_lab))) < 0.06, one
+    assert name in result.moved
+    assert result.gap_after_mm < 0.5 * result.gap_before_mm

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from camera_examples import f64, tsai, turned
 from conftest import assert_close
 
-from sphereorient.cameras import Rays, triangulate
+from sphereorient.cameras import Rays, nearest_point, triangulate
 from sphereorient.errors import ShapeError
 
 A = tsai(R_cam_lab=turned((0.1, 0.2, 0.3)))
@@ -110,3 +111,46 @@ def test_another_shape_is_refused():
     bad = Rays(origin_lab_mm=torch.zeros(4, 2), direction_lab=torch.zeros(4, 2))
     with pytest.raises(ShapeError, match="rays_a"):
         triangulate(bad, bad)
+
+
+C = tsai(R_cam_lab=turned((0.7, -0.9, 0.4)))
+
+
+def aside(rays: Rays, rng: torch.Generator) -> Rays:
+    """Rays that pass their points at a distance."""
+    off = 0.3 * torch.randn(rays.origin_lab_mm.shape, generator=rng, dtype=torch.float64)
+    return Rays(origin_lab_mm=rays.origin_lab_mm + off, direction_lab=rays.direction_lab)
+
+
+def test_the_point_of_three_rays_has_the_least_squares_of_distances(rng):
+    x_lab_mm = points(rng, 5)
+    rays = [aside(one, rng) for one in (*seen(x_lab_mm), C.rays(C.project(x_lab_mm)))]
+    point, gap = nearest_point(rays)
+    for k in range(5):
+        # Oracle: lstsq of what each ray says of the two components across it.
+        across = [np.linalg.svd(ray.direction_lab[k].numpy()[None])[2][1:] for ray in rays]
+        says = [rows @ ray.origin_lab_mm[k].numpy() for rows, ray in zip(across, rays, strict=True)]
+        expected = np.linalg.lstsq(np.concatenate(across), np.concatenate(says), rcond=None)[0]
+        np.testing.assert_allclose(point[k].numpy(), expected, atol=1e-8)
+    assert_close(gap, torch.stack([triangulate(rays[k], rays[m])[1] for k, m in ((0, 1), (0, 2), (1, 2))]).amax(0))
+
+
+def test_a_ray_that_is_missing_takes_no_part_and_one_alone_gives_no_point(rng):
+    x_lab_mm = points(rng, 3)
+    a, b = (aside(one, rng) for one in seen(x_lab_mm))
+    pixels = C.project(x_lab_mm)
+    pixels[0] = torch.nan
+    c = C.rays(pixels)
+    b.direction_lab[2], a.direction_lab[2] = torch.nan, torch.nan
+    point, gap = nearest_point([a, b, c])
+    two = triangulate(a, b)
+    assert_close(point[0], two[0][0], atol=1e-9)
+    assert_close(gap[0], two[1][0])
+    assert torch.isfinite(point[1]).all()
+    assert point[2].isnan().all()
+    assert gap[2].isnan()
+
+
+def test_parallel_rays_meet_nowhere():
+    along = [Rays(origin_lab_mm=f64((0.0, float(k), 0.0)), direction_lab=f64((1.0, 0.0, 0.0))) for k in range(3)]
+    assert nearest_point(along)[0].isnan().all()

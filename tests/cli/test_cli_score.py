@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from sphereorient.cli import app
 from sphereorient.errors import TrackError
 from sphereorient.evaluate import score_track
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Tracks, Trajectory
 
 TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"
 
@@ -76,3 +76,40 @@ def test_files_of_another_kind_are_refused_in_one_line(track, tmp_path):
     assert "none.h5" in refused(track, tmp_path / "none.h5")
     assert "truth.h5" in refused(TRUTH, track)  # swapped
     assert "got a track" in refused(track, track)
+
+
+def swarm(folder: Path) -> tuple[Path, Path]:
+    """Two balls that look alike, and tracks that have exchanged names, but not in frame 30; a truth without rates."""
+    with h5py.File(TRUTH) as file, h5py.File(folder / "truth.h5", "w") as out:
+        true = {key: file[key][()] for key in ("time", "position", "orientation")}
+        for name, shift in (("a", 0.0), ("b", 40.0)):
+            group = out.create_group(f"spheres/{name}")
+            for key, values in true.items():
+                group[key] = values + shift * (key == "position")
+    empty = Trajectory.empty(true["time"], cameras=("cam1",), frame_rate=600.0, method="precise")
+    track = replace(empty, orientation=true["orientation"], valid=np.ones(len(empty), bool))
+    shifted = true["position"] + 40.0
+    shifted[30] -= 40.0
+    there = {"a": replace(track, position=shifted), "b": replace(track, position=true["position"])}
+    Tracks(there).save(folder / "tracks.h5")
+    return folder / "tracks.h5", folder / "truth.h5"
+
+
+def test_several_balls_are_scored_by_name_and_alike_ones_may_be_exchanged(tmp_path):
+    tracks, truth = swarm(tmp_path)
+    run = CliRunner().invoke(app, ["score", str(tracks), str(truth)])
+    assert "ball a: 39 frames given to another ball, 2 exchanges" in run.output
+    run = CliRunner().invoke(app, ["score", str(tracks), str(truth), "--alike", "a,b"])
+    assert run.exit_code == 0, run.exception
+    assert "Errors of ball a against the exact truth, 40 of 40" in run.output
+    assert "ball a: 0 frames given to another ball, 0 exchanges" in run.output
+    assert "ball b: 1 frames given to another ball, 2 exchanges" in run.output
+    alone = CliRunner().invoke(app, ["score", str(tracks), str(truth), "--alike", "a,b", "--sphere", "b"])
+    assert "ball a" not in alone.output
+    assert "expected a, b, got 'c'" in refused(tracks, truth, "--alike", "a,c")
+    assert "expected the truth of one ball, got that of a, b" in refused_of_one(tmp_path, truth)
+
+
+def refused_of_one(folder: Path, truth: Path) -> str:
+    replace(Tracks.load(folder / "tracks.h5")["a"], sphere="").save(folder / "one.h5")
+    return refused(folder / "one.h5", truth)

@@ -183,3 +183,18 @@ def test_times_off_any_grid_are_refused_for_methods_that_need_one():
 def test_movies_of_one_length_need_no_remark(folder):
     save_movie(folder / "films" / "cam2.npy", 12)
     assert not line(folder, BOTH).remarks
+
+
+def test_stamps_of_three_cameras_make_one_frame_whatever_each_lost(folder):
+    grid = np.arange(6) * 0.01
+    save_stamped(folder / "cam1.h5", np.delete(grid, 1).tolist())
+    save_stamped(folder / "films" / "cam2.h5", (np.delete(grid, [1, 3]) + 0.0002).tolist())
+    save_stamped(folder / "cam3.h5", (np.delete(grid, 4) + 0.0004).tolist())
+    cameras = (folder / "cameras.yaml").read_text()
+    own = cameras.split("cam2:")[1].split("\n\n")[0]
+    (folder / "cameras.yaml").write_text(cameras + f"  cam3:{own}")
+    frames = line(folder, STAMPED.replace("cam2:", "cam3: cam3.h5, cam2:"))
+    assert frames.rows["cam1"].tolist() == [0, NONE, 1, 2, 3, 4]
+    assert frames.rows["cam2"].tolist() == [0, NONE, 1, NONE, 2, 3]
+    assert frames.rows["cam3"].tolist() == [0, 1, 2, 3, NONE, 4]
+    np.testing.assert_allclose(frames.time_s, grid + np.array([2, 4, 2, 2, 1, 2]) * 1e-4, atol=1e-9)

@@ -29,7 +29,7 @@ class Several:
     R_lab_body: dict[str, np.ndarray]  # (N, 3, 3)
 
 
-def write_several(folder: Path, balls: str = "abc", cameras: int = 2) -> Several:
+def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several:
     """Balls that cross in the pictures: a passes before b in the first camera, c follows behind."""
     settings = SynthSettings(
         frames=FRAMES,
@@ -38,6 +38,7 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 2) -> Several
         diameter_px=52.0,
         diameter_mm=DIAMETER_MM,
         distance_mm=520.0,
+        black=70.0,
         exposure=0.0,
         exposure_samples=1,
     )
@@ -73,6 +74,8 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 2) -> Several
             for k in range(FRAMES)
         ]
         np.save(folder / f"{name}.npy", np.stack(movie))
+        height, width = movie[0].shape
+        write_picture(folder / f"empty_{name}.png", np.full((height, width), round(settings.background), np.uint8))
     spheres = {name: {"diameter": DIAMETER_MM, "texture": f"texture_{PAINTS[name]}.png"} for name in balls}
     document = {
         "schema": "sphereorient-experiment/1",
@@ -80,6 +83,7 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 2) -> Several
         "frame_rate": RATE_HZ,
         **({"spheres": spheres} if len(balls) > 1 else {"sphere": spheres[balls]}),
         "cameras": "cameras.yaml",
+        "backgrounds": {name: f"empty_{name}.png" for name in seen},
         "movies": {name: f"{name}.npy" for name in seen},
     }
     path = folder / "experiment.yaml"

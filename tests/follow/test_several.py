@@ -93,7 +93,7 @@ def test_a_cut_run_goes_on_to_the_same_tracks(tracks, movie, tmp_path):
 
 
 def test_one_ball_followed_as_a_scene_is_followed_as_ever(tmp_path):
-    movie = write_several(tmp_path, "b")
+    movie = write_several(tmp_path, "b", cameras=2)
     with open_recording(movie.experiment) as recording, one_thread():
         job = Job(recording=recording, settings=load_settings(None, (CHUNK,)), device=torch.device("cpu"))
         follower = precise.learn(job, silent)

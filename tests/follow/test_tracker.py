@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,9 @@ from refine_examples import f64
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.follow.poses import Poses
+from sphereorient.follow.follower import cameras_disagree
+from sphereorient.follow.initialise import by_decreasing_size
+from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.follow.tracker import ChunkTracker, _Chunk
 from sphereorient.trajectory import Reason
 
@@ -104,3 +107,36 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
     assert not disagree(0.003, -0.003), "four times the usual angle are 0.008"
     assert not disagree(0.006, -0.006, sigma=0.005), "no more than their errors"
     assert not disagree(0.006, -0.006, both=False), "one camera"
+
+
+def part(turn: float, cameras: int) -> Poses:
+    """What some cameras say of a ball, that is turned about x from where others see it."""
+    whole = seen(0.0, 0.0)
+    names = ("own_turn", "own_covariance", "own_move", "own_sigma_mm", "excess", "score")
+    return replace(
+        whole,
+        R_lab_body=so3.exp(f64([[turn, 0.0, 0.0]])),
+        use=torch.ones(cameras, dtype=torch.bool),
+        reason=(Reason.OK,) * cameras,
+        **{name: getattr(whole, name)[:, :cameras] for name in names},
+    )
+
+
+def test_those_that_agree_give_the_pose_and_the_other_contradicts():
+    found = cameras_disagree([part(0.0, 2), part(0.3, 1)], [(0, 2), (1,)])
+    assert found.use.tolist() == [True, False, True]
+    assert found.reason == (Reason.OK, Reason.CONTRADICTS, Reason.OK)
+    assert_close(found.own_turn[0], f64([[0.0] * 3, [0.3, 0.0, 0.0], [0.0] * 3]))
+
+
+def test_where_those_that_agree_do_not_see_it_the_other_gives_the_pose():
+    lost = no_pose(2, [Reason.NOT_FOUND, Reason.DARK])
+    found = cameras_disagree([lost, part(0.3, 1)], [(0, 2), (1,)])
+    assert found.use.tolist() == [False, True, False]
+    assert found.reason == (Reason.NOT_FOUND, Reason.OK, Reason.DARK)
+
+
+def test_subsets_come_by_decreasing_size():
+    assert list(by_decreasing_size([0, 1])) == [[(0,), (1,)]]  # of two cameras: each alone
+    assert list(by_decreasing_size([0, 2, 3])) == [[(0, 2), (0, 3), (2, 3)], [(0,), (2,), (3,)]]
+    assert list(by_decreasing_size([1])) == []

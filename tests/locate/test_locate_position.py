@@ -201,3 +201,23 @@ def agree(places: Tensor, covariance: Tensor) -> None:
     variances = torch.linalg.eigvalsh(real)
     assert (variances > 0.8).all(), variances
     assert (variances < 1.2).all(), variances
+
+
+def test_three_cameras_place_the_sphere_with_those_that_see_it():
+    cameras = {"cam1": looking_along_y(), "cam2": looking_down(), "cam3": oblique()}
+    seen = {}
+    for k, (name, camera) in enumerate(cameras.items()):
+        centre = camera.project(PLACES)
+        centre[: k + 1] = torch.nan  # 0 of none, 1 of the first alone, 2 of two, 3 of all
+        centre[0] = torch.nan
+        seen[name] = sightings(centre, exact_radius_px(camera, PLACES))
+    seen["cam1"] = sightings(
+        torch.where(PLACES[:, :1] == PLACES[0, 0], torch.nan, cameras["cam1"].project(PLACES)),
+        exact_radius_px(cameras["cam1"], PLACES),
+    )
+    found = find_positions(seen, cameras, DIAMETER_MM)
+    assert found.position_lab_mm[0].isnan().all()
+    assert (found.position_lab_mm[1] - PLACES[1]).norm() < 3
+    assert_close(found.position_lab_mm[2:], PLACES[2:], atol=1e-6)
+    assert found.flags.tolist() == [0, int(Flag.ONE_CAMERA), 0, 0]
+    assert found.covariance_mm2[3].trace() < found.covariance_mm2[2].trace() < found.covariance_mm2[1].trace()

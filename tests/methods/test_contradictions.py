@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.cameras import sphere_radius_px
+from sphereorient.cameras import Camera, sphere_radius_px
 from sphereorient.methods.results import _missed, with_contradictions, with_lasting_errors
 from sphereorient.pose.fitter import CameraView
 from sphereorient.pose.lasting import Lasting
@@ -24,13 +24,18 @@ NOTHING = Lasting.none(len(CAMERAS))
 FRAMES, MM, SIGMA_RAD = 12, 18.0, math.radians(0.02)
 
 
-def track_of(turn_deg: dict[str, float], shift_px: dict[str, float], why: Reason = Reason.OK) -> Trajectory:
+def track_of(
+    turn_deg: dict[str, float],
+    shift_px: dict[str, float],
+    why: Reason = Reason.OK,
+    of: dict[str, Camera] = CAMERAS,
+) -> Trajectory:
     """Return a track whose cameras alone are off by rotations about x, by pixels along v; `why`: of cam2."""
     motion = motion_of(SynthSettings()).at(frame_times_s(SynthSettings(frames=FRAMES)))
     X, R = motion.position_lab_mm, motion.R_lab_body
-    track = Trajectory.empty(motion.time_s.numpy(), cameras=tuple(CAMERAS))
+    track = Trajectory.empty(motion.time_s.numpy(), cameras=tuple(of))
     cameras = {}
-    for name, camera in CAMERAS.items():
+    for name, camera in of.items():
         turn = so3.exp(torch.tensor([math.radians(turn_deg.get(name, 0.0)), 0.0, 0.0]).double())
         off = torch.tensor([shift_px.get(name, 0.0), 0.0]).double()
         radius_px = sphere_radius_px(camera, X, MM / 2).numpy()
@@ -191,3 +196,33 @@ def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_noticed(why, u
     assert camera.image_size == (650, 650)
     view = CameraView(name="cam1", camera=camera, background=scene, diameter_px=80.0, sight=None)
     assert _missed(view, track).tolist() == [missed, False]
+
+
+THREE = default_cameras(SynthSettings(cameras=3))
+
+
+def test_a_camera_that_two_others_overrule_widens_nothing_and_marks_nothing():
+    track = track_of({"cam2": 2.0}, {"cam2": 9.0}, Reason.CONTRADICTS, THREE)
+    marked, found = with_contradictions(track, THREE, MM, True, Lasting.none(3))
+    assert not marked.flags.any()
+    np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
+    np.testing.assert_array_equal(marked.position_cov, track.position_cov)
+    assert found.contradicts
+    assert "cam2" in found.advice
+    assert "cam1" not in found.advice
+
+
+def test_of_three_cameras_in_use_one_that_is_off_moves_the_mean_by_a_third():
+    marked, _ = with_contradictions(track_of({"cam3": 1.0}, {}, of=THREE), THREE, MM, True, Lasting.none(3))
+    assert (marked.flags == Flag.CONTRADICTION).all()
+    sigma = np.degrees(np.sqrt(marked.orientation_cov[:, 0, 0]))
+    # Two pairs tell of it.
+    np.testing.assert_allclose(sigma, math.hypot(math.sqrt(2) / 3, math.degrees(SIGMA_RAD) / math.sqrt(2)), rtol=1e-6)
+
+
+def test_lasting_errors_are_larger_where_fewer_cameras_count():
+    lasting = replace(Lasting.none(3), covariance=torch.eye(6, dtype=torch.float64))
+    all_three = track_of({}, {}, of=THREE)
+    two = track_of({}, {}, Reason.LOW_SCORE, THREE)
+    added = [with_lasting_errors(one, lasting).position_cov[0, 0, 0] - 1e-6 for one in (all_three, two)]
+    np.testing.assert_allclose(added, [1.0, 1.5])

@@ -25,10 +25,11 @@ from sphereorient.preflight.cameras import (
     REACH,
     OffsetScan,
     expected_outline_px,
+    in_step,
     scan_offsets,
     starts_in_step,
 )
-from sphereorient.preflight.finding import worst
+from sphereorient.preflight.finding import FAULT, OK, worst
 from sphereorient.preflight.movies import limb_blur_px
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
 
@@ -124,9 +125,7 @@ def test_a_ball_that_hardly_moves_tells_nothing():
 
 @given(st.integers(0, 30), st.integers(0, 30), st.integers(-REACH, REACH))
 def test_the_start_advised_shifts_by_the_offset_and_is_never_negative(first, second, shift):
-    zero = torch.zeros(2 * REACH + 1)
-    steps = OffsetScan(offset=zero, gap_px=zero, varying_px=zero, moved_px=1.0, best=float(shift), names=("a", "b"))
-    new_first, new_second = starts_in_step({"a": first, "b": second}, steps)
+    new_first, new_second = starts_in_step({"a": first, "b": second}, {"a": 0.0, "b": float(shift)}).values()
     assert new_second - new_first == second - first + shift
     assert min(new_first, new_second) >= 0
     assert new_first == first or new_second == 0  # no frame more is lost than must be
@@ -197,3 +196,41 @@ def test_a_telecentric_camera_expects_its_own_scale():
     outline = expected_outline_px(camera, f64([5.0, 1.0, 2.0]), 9.0)
     radius = (outline - outline.mean(0)).norm(dim=-1)
     assert_close(radius, torch.full_like(radius, 9.0 / 0.25), atol=0.02)
+
+
+def scans_of(best: dict[str, float]) -> list[OffsetScan]:
+    """Scans of other movies against the first; the gap is least at the offsets given."""
+    first, *others = best
+    offset = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
+    return [
+        OffsetScan(
+            offset=offset,
+            gap_px=0.1 + (offset - best[name]).abs(),
+            varying_px=offset,
+            moved_px=1.0,
+            best=best[name],
+            names=(first, name),
+        )
+        for name in others
+    ]
+
+
+@pytest.mark.parametrize(
+    ("late", "start"),
+    [
+        ({"cam1": 0.0, "cam2": 0.02, "cam3": 1.01}, "write start: {cam1: 0, cam2: 0, cam3: 1}"),
+        ({"cam1": 0.0, "cam2": -1.02, "cam3": -1.01}, "write start: {cam1: 1, cam2: 0, cam3: 0}"),
+        ({"cam1": 0.0, "cam2": -2.0, "cam3": 0.01}, "write start: {cam1: 2, cam2: 0, cam3: 2}"),
+    ],
+    ids=["the last", "the first", "one that is early"],
+)
+def test_of_three_movies_the_one_out_of_step_is_named(late, start):
+    found = in_step(scans_of(late), {})
+    assert found.severity is FAULT
+    wrong = {"cam3: 1}": "cam3", "cam1: 1,": "cam1"}
+    assert found.measured.startswith(next((name for part, name in wrong.items() if part in start), "cam2"))
+    assert found.advice == start
+
+
+def test_three_movies_in_step_are_left_in_peace():
+    assert in_step(scans_of({"cam1": 0.0, "cam2": 0.03, "cam3": -0.02}), {}).severity is OK

@@ -78,7 +78,7 @@ def test_one_camera_is_checked_alone(clean, tmp_path):
     one = replace(clean, pictures={"cam1": clean.pictures["cam1"]})
     result = checked(one, tmp_path, backgrounds={"cam1": "empty_cam1.png"})
     assert {one.title for one in result.findings if one.severity is not OK} == {"paint"}  # no map
-    assert result.scan is None
+    assert result.scans == ()
 
 
 @pytest.mark.slow

@@ -86,13 +86,7 @@ X = LineStyle(name="x", colour=AXIS_COLOURS[0], line="-", marker="o")
 Y = LineStyle(name="y", colour=AXIS_COLOURS[1], line=(0, (6, 1.5)), marker="s", hatch="////")
 Z = LineStyle(name="z", colour=AXIS_COLOURS[2], line=(0, (6, 1.5, 1.2, 1.5)), marker="^", hatch="....")
 ALL = LineStyle(name="all", colour=BLACK, line="-", marker="D", width=1.7)
-BALLS = (
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#8C6D31",
-    "#7B4173",
-)  # of the second ball and more, of other hues than the axes
+BALLS = "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7B4173"  # of the second ball and more; no hues of the axes
 SECOND = LineStyle(name="second", colour=BLACK, line=(0, (3, 2)), marker="x")  # a law, or a reference
 PLAIN = LineStyle(name="", colour=GREY, line="-", marker="o")  # of legends that hold for all components
 COMPONENTS = (X, Y, Z)

@@ -1,0 +1,181 @@
+"""The check of several balls: how many disks each camera shows, which of the named balls are found, and their sizes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient.experiment.recording import Progress, Recording, load_map
+from sphereorient.follow.follower import sample_frames
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses
+from sphereorient.follow.scene_start import SceneStart
+from sphereorient.locate import Frame, find_disks
+from sphereorient.locate.outline import Outline
+from sphereorient.methods.method import Job
+from sphereorient.methods.proposers import open_scene
+from sphereorient.methods.settings import Settings
+from sphereorient.methods.several import unlit
+from sphereorient.preflight import texture_map
+from sphereorient.preflight.cameras import BAD, GOOD, OUTLINE_PX
+from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged
+
+FRAMES = 8  # spread over the movies
+SEEN = 0.8  # share of the frames in which a ball should be found
+OWN = 0.35  # of the radius: a disk whose middle is that near to a ball is its own
+WHOLE = 0.7  # share of the rim of a disk that tells the size of a ball
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneView:
+    """A picture of one camera with the disks in it, and the balls found; read by the figure."""
+
+    name: str
+    frame: int  # among the frames in use
+    picture: NDArray[Any]  # (H, W)
+    disks: tuple[Outline, ...]
+    balls: Mapping[str, tuple[float, float]]  # centre, px
+
+
+def look_at_scene(
+    recording: Recording, settings: Settings, progress: Progress
+) -> tuple[tuple[SceneView, ...], list[Finding]]:
+    """Look for the balls of an experiment in a few frames; return a picture of each camera, and the findings."""
+    spheres = recording.experiment.spheres
+    missing = [one for one in spheres if one.texture_path is None or not one.texture_path.exists()]
+    if missing:
+        return (), [_no_map(sphere.name, None if (p := sphere.texture_path) is None else str(p)) for sphere in missing]
+    loaded = {path: load_map(path) for path in dict.fromkeys(one.texture_path for one in spheres) if path is not None}
+    maps = {one.name: loaded[one.texture_path] for one in spheres if one.texture_path is not None}
+    job = Job(recording=replace(recording, maps=maps), settings=settings, device=torch.device("cpu"))
+    views = open_scene(job.recording, settings, progress)
+    balls = unlit(job, views)
+    frames, places = sample_frames(job.recording, next(iter(views.values())), FRAMES)
+    start, found, disks = SceneStart(balls), [], []
+    for k, shots in enumerate(frames):
+        progress("balls", k, len(frames))
+        disks.append(_disks(shots, balls))
+        found.append(start(shots, list(balls), {}))
+    progress("balls", len(frames), len(frames))
+    best = max(range(len(frames)), key=lambda k: sum(len(one) > 0 for one in found[k].values()))
+    cameras = next(iter(balls.values())).fitter.views
+    seen = tuple(
+        SceneView(
+            name=view.name,
+            frame=places[best],
+            picture=np.asarray(shot.picture[:, :]),
+            disks=tuple(disks[best][c]),
+            balls={name: _middle(balls[name], one, c) for name, one in found[best].items() if len(one)},
+        )
+        for c, (view, shot) in enumerate(zip(cameras, frames[best], strict=True))
+        if shot.usable
+    )
+    texts = [texture_map.contrast(texture_map.measure_texture(one.grey), _least_px(balls)) for one in loaded.values()]
+    told = [
+        replace(text, title=f"{text.title} {path.name}") if len(loaded) > 1 else text
+        for text, path in zip(texts, loaded, strict=True)
+    ]
+    return seen, [*_counts(disks, balls), *_found(found, balls), *_sizes(found, disks, balls), *told]
+
+
+def _no_map(name: str, path: str | None) -> Finding:
+    measured = "no texture map is given" if path is None else f"no texture map: {path} is not there"
+    do = f"learn it with `sphereorient map`, or correct spheres.{name}.texture"
+    return judged(f"paint of ball {name}", measured, (True, FAULT, do))
+
+
+def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:
+    """Return the disks in the pictures of one instant."""
+    each = list(balls.values())
+    return [
+        find_disks(
+            shot.picture,
+            each[0].fitter.views[c].background,
+            [one.fitter.views[c].diameter_px for one in each],
+            each[0].locating,
+        )
+        if shot.usable
+        else []
+        for c, shot in enumerate(shots)
+    ]
+
+
+def _middle(ball: Initialiser, poses: Poses, camera: int) -> tuple[float, float]:
+    u, v = ball.fitter.views[camera].camera.project(poses.position_lab_mm[0]).tolist()
+    return u, v
+
+
+def _least_px(balls: Mapping[str, Initialiser]) -> float:
+    return min(view.diameter_px / 2 for one in balls.values() for view in one.fitter.views)
+
+
+def _counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+    """Compare the number of disks of each camera with the number of balls."""
+    for c, view in enumerate(next(iter(balls.values())).fitter.views):
+        counts = [len(one[c]) for one in disks]
+        measured = f"{median(counts):g} disks in the usual frame ({min(counts)} to {max(counts)}), {len(balls)} named"
+        more = "name the other balls under `spheres`; mask what is round and no ball (`sphereorient mark`)"
+        fewer = "leave out of `spheres` what is not there; give backgrounds: where the balls hardly move"
+        yield judged(
+            f"balls {view.name}",
+            measured,
+            (median(counts) > len(balls), WARNING, more),
+            (max(counts) < len(balls), WARNING, fewer),
+        )
+
+
+def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+    """Count the frames in which each ball is found by its paint."""
+    for name in balls:
+        count = sum(len(one[name]) > 0 for one in found)
+        none = f"check texture and diameter under spheres.{name}, or leave it out where it is not there"
+        few = "it is hidden, out of the pictures, or wears another map than the one named"
+        measured = f"found by its paint in {count} of {len(found)} frames"
+        complaints = (not count, FAULT, none), (count < SEEN * len(found), WARNING, few)
+        yield judged(f"ball {name}", measured, *complaints)
+
+
+def _sizes(
+    found: Sequence[Mapping[str, Poses]],
+    disks: Sequence[Sequence[Sequence[Outline]]],
+    balls: Mapping[str, Initialiser],
+) -> Iterator[Finding]:
+    """Compare the diameters of balls that several cameras see with the named ones."""
+    ratios: dict[str, float] = {}
+    for name, ball in balls.items():
+        seen = [
+            disk.radius_px / float(view.radius_px(poses[name].position_lab_mm[:1], ball.fitter.radius_mm)[0])
+            for poses, frame in zip(found, disks, strict=True)
+            if len(poses[name]) and int(poses[name].use.sum()) > 1
+            for c, view in enumerate(ball.fitter.views)
+            for disk in frame[c]
+            if disk.coverage > WHOLE and _is_of(disk, _middle(ball, poses[name], c))
+        ]
+        if seen:
+            ratios[name] = median(seen)
+    named = {name: 2 * balls[name].fitter.radius_mm for name in ratios}
+    measured = {name: ratio * named[name] for name, ratio in ratios.items()}
+    tolerance = OUTLINE_PX / _least_px(balls)
+    for name, mm in measured.items():
+        error = abs(ratios[name] - 1)
+        other = next((one for one in measured if _exchanged(name, one, measured, named)), None)
+        advice = f"measure it: spheres.{name}.diameter {mm:.3g} would fit"
+        if other is not None:
+            advice = f"the diameters, or the textures, of {name} and {other} are exchanged: correct `spheres`"
+        words = f"{mm:.4g} mm in the pictures, {named[name]:g} mm named"
+        wrong = (error > BAD + tolerance, FAULT, advice), (error > GOOD + tolerance, WARNING, advice)
+        yield judged(f"size of ball {name}", words, *wrong)
+
+
+def _is_of(disk: Outline, middle_px: tuple[float, float]) -> bool:
+    return bool(np.hypot(disk.u_px - middle_px[0], disk.v_px - middle_px[1]) < OWN * disk.radius_px)
+
+
+def _exchanged(one: str, other: str, measured: Mapping[str, float], named: Mapping[str, float]) -> bool:
+    """Return whether two balls of unlike diameters each have about that of the other."""
+    apart = abs(named[one] / named[other] - 1) > BAD
+    return apart and all(abs(measured[a] / named[b] - 1) < BAD for a, b in ((one, other), (other, one)))

@@ -1,0 +1,103 @@
+"""The check of several balls: too many or too few named, balls that are not found, sizes, and what is exchanged."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+
+from sphereorient.experiment import Sphere
+from sphereorient.locate.outline import Outline
+from sphereorient.preflight.finding import FAULT, OK, WARNING
+from sphereorient.preflight.scene import _counts, _found, _sizes, look_at_scene
+
+PX_PER_MM = 4.0
+
+
+class Camera:
+    """A telecentric camera that looks along z."""
+
+    def project(self, position_lab_mm: torch.Tensor) -> torch.Tensor:
+        return PX_PER_MM * position_lab_mm[..., :2]
+
+
+def view(name: str, diameter_mm: float) -> SimpleNamespace:
+    size = PX_PER_MM * diameter_mm
+    radius = lambda X, radius_mm: torch.full((len(X),), PX_PER_MM * radius_mm)  # noqa: E731
+    return SimpleNamespace(name=name, camera=Camera(), diameter_px=size, radius_px=radius)
+
+
+def balls(**diameters_mm: float) -> dict[str, SimpleNamespace]:
+    return {
+        name: SimpleNamespace(fitter=SimpleNamespace(views=[view("cam1", mm), view("cam2", mm)], radius_mm=mm / 2))
+        for name, mm in diameters_mm.items()
+    }
+
+
+def poses(x_mm: float | None) -> SimpleNamespace:
+    """A pose of both cameras at (x, 0, 0), or none."""
+
+    class Found(SimpleNamespace):
+        def __len__(self) -> int:
+            return int(x_mm is not None)
+
+    return Found(position_lab_mm=torch.tensor([[x_mm or 0.0, 0.0, 0.0]]).double(), use=torch.ones(2, dtype=torch.bool))
+
+
+def disk(x_mm: float, diameter_mm: float) -> Outline:
+    return Outline(u_px=PX_PER_MM * x_mm, v_px=0.0, radius_px=PX_PER_MM * diameter_mm / 2, rms_px=0.1, coverage=0.9)
+
+
+def told(x_mm: dict[str, float | None], true_mm: dict[float, float], **named: float):
+    """The findings on sizes where balls are found at x, and disks of true diameters are there."""
+    seen = [disk(x, mm) for x, mm in true_mm.items()]
+    found = {name: poses(x) for name, x in x_mm.items()}
+    return {one.title.removeprefix("size of ball "): one for one in _sizes([found], [[seen, seen]], balls(**named))}
+
+
+def test_more_and_fewer_disks_than_named_balls_are_told():
+    seen = [[[disk(0, 14), disk(30, 14)], [disk(0, 14)]]] * 3
+    first, second = _counts(seen, balls(a=14.0))
+    assert (first.severity, second.severity) == (WARNING, OK)
+    assert "2 disks in the usual frame (2 to 2), 1 named" in first.measured
+    assert "name the other balls" in first.advice
+    first, second = _counts(seen, balls(a=14.0, b=14.0))
+    assert (first.severity, second.severity) == (OK, WARNING)
+    assert "leave out of `spheres` what is not there" in second.advice
+
+
+def test_a_ball_that_is_never_found_is_a_fault_and_one_found_now_and_then_a_warning():
+    found = [{"a": poses(0.0), "b": poses(None), "c": poses(0.0 if k < 2 else None)} for k in range(4)]
+    a, b, c = _found(found, balls(a=14.0, b=14.0, c=14.0))
+    assert [a.severity, b.severity, c.severity] == [OK, FAULT, WARNING]
+    assert b.measured == "found by its paint in 0 of 4 frames"
+    assert "spheres.b" in b.advice
+
+
+def test_sizes_are_measured_and_wrong_ones_told_with_the_one_that_fits():
+    right = told({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 20.0}, a=14.0, b=20.0)
+    assert [one.severity for one in right.values()] == [OK, OK]
+    wrong = told({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 18.0}, a=14.0, b=20.0)
+    assert [one.severity for one in wrong.values()] == [OK, FAULT]
+    assert "spheres.b.diameter 18 would fit" in wrong["b"].advice
+    assert wrong["b"].measured == "18 mm in the pictures, 20 mm named"
+
+
+def test_exchanged_diameters_or_maps_are_told_of_both_balls():
+    found = told({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 16.0}, a=16.0, b=14.0)
+    assert [one.severity for one in found.values()] == [FAULT, FAULT]
+    assert found["a"].advice == "the diameters, or the textures, of a and b are exchanged: correct `spheres`"
+
+
+def test_a_disk_elsewhere_says_nothing_of_a_ball():
+    assert told({"a": 0.0}, {30.0: 18.0}, a=14.0) == {}
+
+
+def test_missing_maps_are_told_ball_by_ball(tmp_path):
+    spheres = (Sphere(name="a", diameter_mm=14.0), Sphere(name="b", diameter_mm=14.0, texture_path=tmp_path / "t.png"))
+    recording = SimpleNamespace(experiment=SimpleNamespace(spheres=spheres))
+    scene, found = look_at_scene(recording, SimpleNamespace(), lambda *_: None)
+    assert scene == ()
+    assert [one.title for one in found] == ["paint of ball a", "paint of ball b"]
+    assert {one.severity for one in found} == {FAULT}
+    assert "t.png is not there" in found[1].measured
