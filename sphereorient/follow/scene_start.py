@@ -31,7 +31,7 @@ MISSED = 4.0  # price of a picture that holds the place of a ball but not its di
 SIZE_SIGMA = 0.06  # relative, of the radius of a disk
 DEPTH_SIGMA = 0.15  # relative, of the distance of a ball of which one camera alone tells
 PROPOSED_RAD, PLACED_SHARE = 0.05, 0.1  # errors of proposals and, in radii, of matches beside a prediction
-FREEDOM = 6.0  # of a pose; predictions err by more than normal errors now and then
+FREEDOM = 6.0  # of Student's distribution: motions change, and diameters are entered wrongly
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,7 +150,7 @@ class SceneStart:
             off = (radius / view.radius_px(X, ball.fitter.radius_mm) - 1) / SIZE_SIGMA
             alone = (2 * radius / view.diameter_px - 1) / DEPTH_SIGMA
             one = torch.tensor([match.number == 1 for match in matches])
-            cost += 0.5 * torch.where(one, alone, off).square().nan_to_num().numpy()
+            cost += _heavy_tailed(torch.where(one, alone, off).square().nan_to_num())
         if ahead is not None:
             R = torch.stack([one.R_lab_body[0] if len(one.R_lab_body) else ahead.R_lab_body for one in look])
             cost += _surprise(ahead, X, places.covariance_mm2, R, ball.fitter.radius_mm)
@@ -197,6 +197,11 @@ def _surprise(ahead: Ahead, X: Tensor, covariance_mm2: Tensor, R: Tensor, radius
     spread[:, :3, :3] += PROPOSED_RAD**2 * torch.eye(3)
     spread[:, 3:, 3:] += covariance_mm2.nan_to_num() + (PLACED_SHARE * radius_mm) ** 2 * torch.eye(3)
     chi2 = (away[:, None] @ torch.linalg.solve(spread, away[..., None]))[:, 0, 0]
+    return _heavy_tailed(chi2)
+
+
+def _heavy_tailed(chi2: Tensor) -> Floats:
+    """Return negative log-likelihoods of chi2 (N,): half of it where it is small, but no paint is refused by it."""
     return np.asarray(0.5 * FREEDOM * torch.log1p(chi2 / FREEDOM).numpy())
 
 

@@ -20,6 +20,7 @@ from sphereorient.locate.sightings import find_ball
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
 LOUD, LOUD_SHARE = 5.0, 0.1  # times the typical noise; share of such pixels in the disk that triggers `_quieter`
+NOISIEST = 4.0  # times the typical noise
 CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in sigmas
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
@@ -119,10 +120,12 @@ def learn_background(
     if empty is not None:
         return _quieter(background, pictures, sizes, settings)
     first, before = background, 0
+    if len(sizes) > 1:  # where spheres dwell, they are the noise that hides them
+        quiet = replace(first, noise=np.minimum(first.noise, NOISIEST * first.typical_noise))
+        background = without_ball(first, pictures, _covered(pictures, quiet, sizes, settings)[0])
     for _ in range(ROUNDS):
-        disks = [_disks(picture, background, sizes, settings) for picture in pictures]
-        background = without_ball(first, pictures, _covered(pictures, disks))
-        found = sum(len(some) for some in disks)
+        covered, found = _covered(pictures, background, sizes, settings)
+        background = without_ball(first, pictures, covered)
         if found <= before or found == len(pictures) * len(sizes):
             break
         before = found
@@ -156,13 +159,16 @@ def _disks(
     return [] if outline is None else [outline]
 
 
-def _covered(pictures: NDArray[Any], disks: Sequence[Sequence[Outline]]) -> NDArray[np.bool_]:
-    """Return the spheres' pixels in frames (n, H, W), by the disks of each frame."""
-    covered = np.zeros(pictures.shape, bool)
-    for mask, some in zip(covered, disks, strict=True):
-        for disk in some:
+def _covered(
+    pictures: NDArray[Any], background: Background, sizes: Sequence[float], settings: LocateSettings
+) -> tuple[NDArray[np.bool_], int]:
+    """Return the pixels of all disks found in frames (n, H, W), and their number."""
+    covered, found = np.zeros(pictures.shape, bool), 0
+    for picture, mask in zip(pictures, covered, strict=True):
+        for disk in _disks(picture, background, sizes, settings):
             cover(mask, disk, RIM, True)
-    return covered
+            found += 1
+    return covered, found
 
 
 def fixed_ball(

@@ -65,6 +65,14 @@ def test_a_ball_cut_by_the_border_is_found(place):
     assert astray(disks, 150, 130) < 1.5
 
 
+def test_a_ball_whose_black_paint_does_not_show_is_found():
+    def half_black(x, y):  # two thirds of the disk look like what is behind it
+        return np.where((np.abs(y) < 0.3) | (x > 0.75), 170.0, BACK).astype(np.float32)
+
+    disks = found(scene((half_black, 100, 100, 30.0), (blobs, 220, 120, 30.0)), 60, 60)
+    assert astray(disks, 100, 100) < 4
+
+
 def test_balls_of_other_diameters_are_found_with_their_own():
     disks = found(scene((checker, 80, 100, 20.0), (blobs, 200, 120, 40.0)), 40, 80)
     assert nearest(disks, 80, 100).radius_px == pytest.approx(20, abs=1)
