@@ -90,8 +90,8 @@ class Appearance:
 
     def of(self, *cameras: int) -> "Appearance":
         """Return the appearance in some cameras."""
-        fitter, still, lasting = (one.of(*cameras) for one in (self.fitter, self.still, self.lasting))
-        return replace(self, fitter=fitter, still=still, lasting=lasting)
+        lasting = self.lasting.of(*cameras)
+        return replace(self, fitter=self.fitter.of(*cameras), still=self.still.of(*cameras), lasting=lasting)
 
     def on(self, device: torch.device) -> "Appearance":
         """Return an appearance whose fits are computed on another device."""
