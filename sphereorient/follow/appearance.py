@@ -90,8 +90,8 @@ class Appearance:
 
     def of(self, *cameras: int) -> "Appearance":
         """Return the appearance in some cameras."""
-        lasting = self.lasting.of(*cameras)
-        return replace(self, fitter=self.fitter.of(*cameras), still=self.still.of(*cameras), lasting=lasting)
+        fitter, still, lasting = self.fitter.of(*cameras), self.still.of(*cameras), self.lasting.of(*cameras)
+        return replace(self, fitter=fitter, still=still, lasting=lasting)
 
     def on(self, device: torch.device) -> "Appearance":
         """Return an appearance whose fits are computed on another device."""

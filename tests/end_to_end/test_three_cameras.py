@@ -102,7 +102,7 @@ def test_where_one_camera_shows_other_frames_the_two_others_go_on_together(rende
     track = tracked(rendered, tmp_path)
     why = reasons(track)
     assert set(why["cam1"]) == set(why["cam3"]) == {Reason.OK}
-    assert set(why["cam2"][20:30]) <= {Reason.CONTRADICTS, Reason.LOW_SCORE}
+    assert set(why["cam2"][20:25] + why["cam2"][26:30]) == {Reason.CONTRADICTS}  # 25 is in its place
     assert set(why["cam2"][:20] + why["cam2"][31:]) == {Reason.OK}
     assert not (track.flags & Flag.ONE_CAMERA).any()
     assert score_track(track, rendered / "truth.h5").percentiles_deg()[3] < 0.3
