@@ -302,10 +302,11 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
     """Judge whether the movies are synchronised, from scans of each other one against the first; `start` is that of
     the experiment.
     """
-    title, late = "movies in step", shifts_of(scans)
-    moved_px = min(scan.moved_px for scan in scans)
+    title, moved_px = "movies in step", max(scan.moved_px for scan in scans)
     if moved_px <= MOVES_PX:
         return judged(title, f"unknown: the ball moves {moved_px:.2f} px a frame across the lines of sight")
+    scans = [scan for scan in scans if scan.moved_px > MOVES_PX]
+    late = shifts_of(scans)
     if any(math.isnan(value) for value in late.values()):
         measured = f"unknown: within {REACH} frames no shift makes the lines of sight meet"
         return warning(title, measured, "correct the findings on ball and lines of sight first, then check again")
