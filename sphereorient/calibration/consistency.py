@@ -36,6 +36,9 @@ class Limits:
     size: float  # relative
 
 
+OUTLINES = Limits(gap_px=1.5, turn_deg=1.0, size=0.01)  # of outlines alone: they jump where paint is dark
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
     """What each of C cameras alone says of N frames; NaN where it says nothing."""
@@ -188,6 +191,16 @@ def majority(seen: Seen, limits: Limits) -> tuple[int, ...]:
     """
     compare = _Comparison(seen, limits)
     return compare.majority(compare(compare.sights()))
+
+
+def majority_by_outlines(cameras: Mapping[str, Camera], centre_px: Tensor, radius_px: Tensor) -> tuple[int, ...]:
+    """Return the cameras that agree, see `majority`, of outlines (N, C, 2), (N, C), px, alone; none of one or two."""
+    if len(cameras) < 3:
+        return ()
+    R = torch.full((*radius_px.shape, 3, 3), torch.nan, dtype=torch.float64)
+    # Only ratios of sizes differ between cameras: the diameter is of no importance.
+    seen = Seen(cameras=cameras, centre_px=centre_px, radius_px=radius_px, R_lab_body=R, diameter_mm=1.0)
+    return majority(seen, OUTLINES)
 
 
 class _Comparison:

@@ -30,7 +30,7 @@ VFOV_DEG = 30.0  # of a camera of which nothing is known: its ball is far, and n
 @app.command()
 def init(
     movies: Annotated[
-        list[Path] | None, typer.Argument(metavar="[MOVIE] [MOVIE]", help="One or two movies of the ball.")
+        list[Path] | None, typer.Argument(metavar="[MOVIE]...", help="Movies of the ball, one a camera.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="experiment.yaml here without it; calibration.yaml with --plate.")
@@ -100,11 +100,12 @@ def mark(
 
 
 def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: float | None, quiet: bool) -> None:
+    from sphereorient.experiment.experiment import MAX_CAMERAS
     from sphereorient.preflight.draft import camera_keys
 
-    if len(movies) > 2:
-        do = "name those of one ball; track other pairs as experiments of their own"
-        raise SettingsError(refusal("MOVIE", expected="one or two movies", got=f"{len(movies)}", do=do))
+    if len(movies) > MAX_CAMERAS:
+        do = "name those of one ball; track others as experiments of their own"
+        raise SettingsError(refusal("MOVIE", expected=f"one to {MAX_CAMERAS} movies", got=f"{len(movies)}", do=do))
     cameras = target.parent / "cameras.yaml"
     alone = len(movies) == 1 and not cameras.exists()
     looks = _looked(movies, target, quiet)

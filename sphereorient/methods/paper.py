@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import assemble, locate, motion
+from sphereorient.calibration.consistency import majority_by_outlines
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
@@ -36,7 +37,12 @@ def track(job: Job, follower: Follower | None, measured: Iterable[Measured], pro
     cameras, clock = grid.cameras, grid.clock
     sightings = {stream.name: locate_sphere(grid, stream, settings, progress) for stream in grid.streams}
     locate.check_seen(sightings)
-    positions = locate.find_positions(sightings, cameras, grid.experiment.diameter_mm)
+    centre_px, radius_px = (
+        torch.stack([getattr(one, name) for one in sightings.values()], 1) for name in ("centre_px", "radius_px")
+    )
+    agree = majority_by_outlines(cameras, centre_px, radius_px) or range(len(sightings))
+    counted = {name: one for k, (name, one) in enumerate(sightings.items()) if k in agree}
+    positions = locate.find_positions(counted, cameras, grid.experiment.diameter_mm)
     proposer_of = cache(partial(paper_proposer, grid.texture, settings=settings))  # cameras of one scale share a bank
     candidates = {
         stream.name: propose_orientations(stream, sightings[stream.name], proposer_of, settings, progress)

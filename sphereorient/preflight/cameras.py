@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.consistency import Gaps, Limits, Seen, gaps_between, majority
+from sphereorient.calibration.consistency import Gaps, gaps_between, majority_by_outlines
 from sphereorient.cameras import Camera, nearest_point
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample, pair_starts
@@ -47,16 +47,9 @@ def sample_positions(samples: Sequence[MovieSample]) -> Tensor:
 
 def outvoted(samples: Sequence[MovieSample]) -> list[str]:
     """Return the cameras whose lines of sight miss those of a majority that meet; none of two cameras."""
-    if len(samples) < 3:
-        return []
-    seen = Seen(
-        cameras={one.name: one.camera for one in samples},
-        centre_px=torch.stack([one.sightings.centre_px for one in samples], 1),
-        radius_px=torch.stack([one.sightings.radius_px for one in samples], 1),
-        R_lab_body=torch.full((len(samples[0].frame), len(samples), 3, 3), torch.nan, dtype=torch.float64),
-        diameter_mm=1.0,  # of no importance: only ratios of sizes differ between cameras
-    )
-    agree = majority(seen, Limits(gap_px=BAD_PX, turn_deg=1.0, size=GOOD))
+    centre_px = torch.stack([one.sightings.centre_px for one in samples], 1)
+    radius_px = torch.stack([one.sightings.radius_px for one in samples], 1)
+    agree = majority_by_outlines({one.name: one.camera for one in samples}, centre_px, radius_px)
     return [one.name for k, one in enumerate(samples) if agree and k not in agree]
 
 

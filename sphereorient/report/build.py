@@ -163,7 +163,7 @@ def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
         of = "" if len(tracks) == 1 else f" of {', '.join(together)}"
         yield "path", f"Path{of}", "With the sphere's axes.", partial(plots.path_figure, *together.values())
     if any(len(one.distance_rad) for one in distances):
-        caption = "PDF of the angle between the two cameras' own orientations."
+        caption = "PDF of the angle between two cameras' own orientations."
         yield "camera_distance", "Distance of the cameras", caption, lambda: plots.camera_distance_figure(distances)
     caption = "Share of each variance that is noise, or was smoothed away."
     if summary.ensemble.segments:

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain, zip_longest
+from itertools import chain, combinations, zip_longest
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ REASON_WORDS: dict[str, str] = {
     Reason.LOW_SCORE: "no orientation explains the picture",
     Reason.AMBIGUOUS: "orientation ambiguous",
     Reason.UNSEEN: "shows paint that the map does not know",
-    Reason.CONTRADICTS: "contradicts the other camera",
+    Reason.CONTRADICTS: "contradicts the other cameras",
     Reason.SECOND_BALL: "may show the second ball",
     Reason.HIDDEN: "hidden by another ball",
     Reason.UNDECODABLE: "picture damaged",
@@ -107,9 +107,9 @@ def _kinds(track: Trajectory) -> Iterator[Ranked]:
     """Yield the bad frames of each kind of problem."""
     yield _gaps(track)
     yield _flags(track)
-    seen = [camera.orientation for camera in track.cameras.values()]
-    if len(seen) == 2:
-        yield _outliers(distance_deg(*seen), "cameras {:.2g}\u00b0 apart, usually {:.2g}\u00b0")
+    apart = _cameras_apart_deg(track)
+    if apart is not None:
+        yield _outliers(apart, "cameras {:.2g}\u00b0 apart, usually {:.2g}\u00b0")
     yield chain.from_iterable(
         _outliers(-camera.score, f"{name}: score {{:.3f}}, usually {{:.3f}}", sign=-1)
         for name, camera in track.cameras.items()
@@ -210,7 +210,7 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
     numbers = frame_numbers(track) if numbers is None else numbers
     status = status_of(track)
     codes, words = _reason_codes(track)
-    seen = [camera.orientation for camera in track.cameras.values()]
+    apart = _cameras_apart_deg(track)
 
     def first(wanted: NDArray[np.bool_]) -> Ints:
         """Return the first such frame of every bin; else the first of the bin."""
@@ -243,13 +243,20 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
             }
             for name, camera in track.cameras.items()
         ],
-        # Between the two cameras' own orientations, the largest; None without two cameras.
-        "apart_deg": _short(largest(distance_deg(*seen))) if len(seen) == 2 else None,
+        # Between two cameras' own orientations, the largest; None without two cameras.
+        "apart_deg": None if apart is None else _short(largest(apart)),
         "flags": np.bitwise_or.reduceat(shown_flags(track), starts).tolist(),  # those of all frames of the bin
         "status_words": STATUS_WORDS,
         "reason_words": words,
         "flag_words": [(int(flag), words) for flag, words in FLAG_WORDS.items()],  # bit and its meaning
     }
+
+
+def _cameras_apart_deg(track: Trajectory) -> Floats | None:
+    """Return the largest angle between two cameras' own orientations, (N,), degrees; None of one camera."""
+    seen = [camera.orientation for camera in track.cameras.values()]
+    pairs = [distance_deg(one, other) for one, other in combinations(seen, 2)]
+    return np.asarray(np.fmax.reduce(pairs), np.float64) if pairs else None
 
 
 def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:

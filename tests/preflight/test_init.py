@@ -306,7 +306,7 @@ def test_a_movie_in_place_of_an_experiment_is_told(clean):
         load_experiment(clean.folder / "cam1.mkv")
 
 
-@pytest.mark.parametrize("arguments", [[], ["a.mkv", "--plate", "b"], ["a.mkv", "b.mkv", "c.mkv"]])
+@pytest.mark.parametrize("arguments", [[], ["a.mkv", "--plate", "b"], [f"{k}.mkv" for k in range(9)]])
 def test_one_source_is_named(tmp_path, arguments):
     with pytest.raises(SettingsError):
         init(*arguments, "--out", tmp_path / "experiment.yaml")
