@@ -46,8 +46,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     views = open_scene(recording, job.settings, progress)
     progress("appearance", 0, 1)
     any_views = next(iter(views.values()))
-    count = MORE_FRAMES * refine.appearance_frames
-    frames, places = sample_frames(recording, any_views, count)
+    frames, places = sample_frames(recording, any_views, MORE_FRAMES * refine.appearance_frames)
     paints = [_Paint.of(job, names, views[names[0]]) for names in alike(job)]
     first = {name: paint.first for paint in paints for name in paint.names}
     start = SceneStart(first)
@@ -60,7 +59,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     for paint in paints:
         rows = _mostly_seen(paint, first, found)
         # Mixed: light is judged from halves of them, and any half should hold all balls at all times.
-        rows = [rows[k] for k in np.random.default_rng(0).permutation(len(rows))[:count]]
+        rows = [rows[k] for k in np.random.default_rng(0).permutation(len(rows))]
         if not rows:
             raise ExperimentError(_none(paint.names))
         followed = None
