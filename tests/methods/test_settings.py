@@ -369,10 +369,9 @@ def two_folders(folder: Path):
         (folder / name).write_bytes(content)
     sides = {"cam1": "left", "cam2": "right"}
     return files, replace(
-        experiment,
+        experiment.with_sphere(texture_path=folder / "texture.png"),
         path=folder / "experiment.yaml",
         cameras_path=folder / "cameras.yaml",
-        texture_path=folder / "texture.png",
         movie_paths={name: folder / side / "movie.mkv" for name, side in sides.items()},
         background_paths={name: folder / side / "empty.png" for name, side in sides.items()},
     )
