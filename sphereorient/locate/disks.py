@@ -23,11 +23,11 @@ from sphereorient.locate.settings import LocateSettings
 STEP_PX = 2.5  # between the radii for which edges vote, about the scatter of the votes of one rim
 SCATTER_PX = 2.0  # Gaussian by which votes are joined
 SHRINK = 2  # votes are counted on a picture reduced by this factor
-DEPTH = 0.2  # most relative deviation of a radius from the expected one that is voted for
+DEPTH = 0.5  # of the setting `diameter_tolerance`: largest deviation of a radius that is voted for
 LEAST_VOTES = 0.08  # share of a rim that must vote for its middle
 PEAK, MOST = 5, 80  # reduced px within which the best middle of a radius counts; circles that are looked at
 VOTED_PX = 2.5  # error of a voted circle
-USUAL = 0.15  # relative: circles of paint are usually further from the expected radius than rims
+USUAL = 0.75  # of this deviation: circles of paint are usually further from the expected radius than rims
 LEAST_RIM = 0.2  # share of all directions with an edge on the rim, less half of those with one just outside
 LEAST_BESIDE = 0.15  # share of the pixels about an edge that differ from the background
 HALO, LEAST_NEW = 1.05, 0.06  # of the radius; share of a disk that lies in no disk of more rim
@@ -72,12 +72,13 @@ def find_disks(
     side = max(3, round(min(diameters_px) / 2) | 1)
     column, row = edges.point.astype(np.int64).T
     edges = edges.where(cv2.boxFilter(full, cv2.CV_32F, (side, side))[row, column] > LEAST_BESIDE)
-    circles = _voted(edges, picture.shape, diameters_px, min(settings.diameter_tolerance, DEPTH))
+    tolerance = DEPTH * settings.diameter_tolerance
+    circles = _voted(edges, picture.shape, diameters_px, tolerance)
     circles = circles[_square_share(full, background.shown, circles) > LEAST_FULL]
     found: list[Outline] = []
     rest = full.copy()  # without the disks found
     while len(circles) and len(found) < len(diameters_px) + FURTHER:
-        merit = _usual(circles[:, 2], diameters_px) * support(circles, edges, VOTED_PX) / DIRECTIONS
+        merit = _usual(circles[:, 2], diameters_px, tolerance) * support(circles, edges, VOTED_PX) / DIRECTIONS
         best = int(merit.argmax())
         if merit[best] < LEAST_RIM:
             break
@@ -117,10 +118,10 @@ def _voted(edges: Edges, shape: tuple[int, ...], diameters_px: Sequence[float], 
     return circles[np.argsort(-circles[:, 3], kind="stable")[:MOST], :3]
 
 
-def _usual(radius: Points, diameters_px: Sequence[float]) -> Points:
+def _usual(radius: Points, diameters_px: Sequence[float], tolerance: float) -> Points:
     """Return a weight (n,) of radii, px: 1 of the expected ones, less of those that only part of the paint may have."""
     off = np.abs(2 * radius[:, None] / np.asarray(diameters_px) - 1).min(1)
-    return np.asarray(np.exp(-0.5 * (off / USUAL) ** 2))
+    return np.asarray(np.exp(-0.5 * (off / (USUAL * tolerance)) ** 2))
 
 
 def _radii(diameters_px: Sequence[float], tolerance: float) -> list[float]:

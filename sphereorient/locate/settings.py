@@ -16,7 +16,10 @@ class LocateSettings(BaseModel, frozen=True, extra="forbid"):
         None, gt=4, description="expected diameter, px; null takes it from the sphere's diameter and the camera"
     )
     diameter_tolerance: float = Field(
-        0.4, gt=0, lt=1, description="accepted relative deviation from the expected diameter: the depth of the volume"
+        0.4,
+        gt=0,
+        lt=1,
+        description="accepted relative deviation from the expected diameter, by depth; half of it for several balls",
     )
     blob_candidates: int = Field(4, ge=1, description="round blobs whose variance and roundness are compared")
     noise_factor: float = Field(
