@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import Bounds, LinearConstraint, milp
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, sphere_disk_px
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.locate import Frame, Match, find_disks, match_disks, places_of
+from sphereorient.locate import Frame, Match, assigned, find_disks, match_disks, places_of
 from sphereorient.locate.outline import Outline
 from sphereorient.trajectory import Reason
 
@@ -203,25 +202,3 @@ def _surprise(ahead: Ahead, X: Tensor, covariance_mm2: Tensor, R: Tensor, radius
 def _heavy_tailed(chi2: Tensor) -> Floats:
     """Return negative log-likelihoods of chi2 (N,): half of it where it is small, but no paint is refused by it."""
     return np.asarray(0.5 * FREEDOM * torch.log1p(chi2 / FREEDOM).numpy())
-
-
-def assigned(cost: Floats, matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """Return pairs (ball, match) of the least sum of costs (n, N): each ball at most once, and each disk for at most
-    one ball. Pairs of cost 0 or more are left out.
-    """
-    ball, match = np.nonzero(cost < 0)
-    if not len(ball):
-        return []
-    disks = sorted({(k, disk) for one in matches for k, disk in enumerate(one.chosen) if disk >= 0})
-    rows = np.zeros((len(cost) + len(disks), len(ball)))
-    rows[ball, np.arange(len(ball))] = 1
-    for row, (k, disk) in enumerate(disks, len(cost)):
-        rows[row] = [matches[n].chosen[k] == disk for n in match.tolist()]
-    found = milp(
-        cost[ball, match],
-        integrality=np.ones(len(ball), np.int64),
-        bounds=Bounds(0, 1),
-        constraints=LinearConstraint(rows, ub=1),
-    )
-    assert found.x is not None  # leaving all out is a solution
-    return [(int(ball[n]), int(match[n])) for n in np.flatnonzero(found.x > 0.5)]

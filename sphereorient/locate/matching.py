@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.stats import chi2
 
 from sphereorient.cameras import Camera, nearest_point
@@ -57,6 +58,28 @@ def match_disks(disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -
         )
         for n in order
     ]
+
+
+def assigned(cost: NDArray[np.float64], matches: Sequence[Match]) -> list[tuple[int, int]]:
+    """Return pairs (ball, match) of the least sum of costs (n, N): each ball at most once, and each disk for at most
+    one ball. Pairs of cost 0 or more are left out.
+    """
+    ball, match = np.nonzero(cost < 0)
+    if not len(ball):
+        return []
+    disks = sorted({(k, disk) for one in matches for k, disk in enumerate(one.chosen) if disk >= 0})
+    rows = np.zeros((len(cost) + len(disks), len(ball)))
+    rows[ball, np.arange(len(ball))] = 1
+    for row, (k, disk) in enumerate(disks, len(cost)):
+        rows[row] = [matches[n].chosen[k] == disk for n in match.tolist()]
+    found = milp(
+        cost[ball, match],
+        integrality=np.ones(len(ball), np.int64),
+        bounds=Bounds(0, 1),
+        constraints=LinearConstraint(rows, ub=1),
+    )
+    assert found.x is not None  # leaving all out is a solution
+    return [(int(ball[n]), int(match[n])) for n in np.flatnonzero(found.x > 0.5)]
 
 
 def places_of(matches: Sequence[Match], cameras: Mapping[str, Camera], diameter_mm: float) -> Positions:

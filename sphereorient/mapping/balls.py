@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from sphereorient.cameras import Camera
@@ -15,7 +14,7 @@ from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.locate import LocateSettings, screened_frames
 from sphereorient.locate.disks import find_disks
-from sphereorient.locate.matching import Match, match_disks, places_of
+from sphereorient.locate.matching import Match, assigned, match_disks, places_of
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import CameraScene, find_scenes
 from sphereorient.mapping.disks import Crop, Crops, cut_crop
@@ -26,7 +25,6 @@ FREE = 1.1  # sums of two radii: disks that are nearer than this are not used
 AWAY = 0.1  # of the radius, for each frame since it was seen: how far a sphere may be from where it is expected
 SIZE_SIGMA = 0.08  # relative error of a disk's radius
 FARTHEST = 9.0  # chi2 at which a sphere is rather not seen than there
-NEVER = 1e6  # chi2 of what is not possible
 FORGOTTEN = 20  # frames after which motion is not known any more
 
 Floats = NDArray[np.float64]
@@ -175,25 +173,10 @@ def _misfit(
 
 def _assigned(cost: Floats, matches: Sequence[Match]) -> NDArray[np.int64]:
     """Return the match (K,) of each sphere, -1: none, of least chi2 together; no disk is in two of them."""
-    unseen = np.full((len(cost), len(cost)), FARTHEST)
-
-    def solved(allowed: NDArray[np.bool_], most: float) -> tuple[float, NDArray[np.int64]]:
-        rows, columns = linear_sum_assignment(np.hstack([np.where(allowed, cost, NEVER), unseen]))
-        found = np.where(columns < cost.shape[1], columns, -1)[np.argsort(rows)]
-        whole = float(sum(cost[n, m] if m >= 0 else FARTHEST for n, m in enumerate(found.tolist())))
-        if whole >= most:
-            return np.inf, found
-        for n, m in combinations(np.flatnonzero(found >= 0).tolist(), 2):
-            if matches[found[n]].shares(matches[found[m]]):
-                best = np.inf, found
-                for k in (n, m):  # one of them has another match
-                    rest = allowed.copy()
-                    rest[k, found[k]] = False
-                    best = min(best, solved(rest, min(most, best[0])), key=lambda one: one[0])
-                return best
-        return whole, found
-
-    return solved(np.ones(cost.shape, bool), np.inf)[1]
+    found = np.full(len(cost), -1)
+    for n, match in assigned(cost - FARTHEST, matches):
+        found[n] = match
+    return found
 
 
 def _places(chosen: NDArray[np.int64], instants: Sequence[_Instant]) -> Floats:

@@ -267,6 +267,24 @@ class Fitter:
         """Return the places of a disk of some radius, px, at a level."""
         return level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
 
+    def decoded(
+        self, pictures: Sequence[Sequence[Shown]], middle_px: Tensor, stencil: Stencil, blur_px: float = 0.0
+    ) -> list[list[Picture]]:
+        """Return pictures that hold at least the disks about `middle_px` (C, B, 2), and what a blur reads around."""
+        middles = middle_px.nan_to_num().tolist()
+
+        def window(b: int, c: int) -> tuple[int, int, int, int]:
+            return window_of(middles[c][b], stencil, blur_px, self.views[c].sight.size)
+
+        for b, frames in enumerate(pictures):
+            for c, frame in enumerate(frames):
+                if isinstance(frame, OnDemand):  # all of them, before the first is waited for
+                    frame.ask(*window(b, c))
+        return [
+            [frame.part(*window(b, c)) if isinstance(frame, OnDemand) else frame for c, frame in enumerate(frames)]
+            for b, frames in enumerate(pictures)
+        ]
+
     def pixels(
         self,
         pictures: Sequence[Sequence[Shown]],
@@ -289,10 +307,7 @@ class Fitter:
             radius_px = max(1.0, float(largest_px.max()))
             radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
         stencil = self.stencil(level, radius_px)
-        for b, frames in enumerate(pictures):
-            for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
-                if isinstance(frame, OnDemand):  # all of them, before the first is waited for
-                    frame.ask(*window_of(middles[c][b], stencil, level.extra_px, view.sight.size))
+        pictures = self.decoded(pictures, middle_px, stencil, level.extra_px)
         disks = []
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):

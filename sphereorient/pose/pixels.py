@@ -14,7 +14,6 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 from sphereorient.locate import Background
-from sphereorient.movies import OnDemand
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 # Parts of `Pixels`, the places along their last axis.
@@ -202,7 +201,7 @@ def window_of(
 
 
 def cut_pixels(
-    frame: NDArray[Any] | OnDemand,
+    frame: NDArray[Any],
     background: Background,
     sight: LinesOfSight,
     middle_px: tuple[float, float],
@@ -224,14 +223,12 @@ def cut_pixels(
     if background.shown is not None:
         shown = background.shown.take(place)
         inside = shown if inside is None else inside & shown
-    window = window_of(middle_px, stencil, blur_px, sight.size)
-    picture = frame.part(*window) if isinstance(frame, OnDemand) else frame
-    grey, behind = picture.take(place), background.mean.take(place)
+    grey, behind = frame.take(place), background.mean.take(place)
     clipped = grey >= background.full_scale
     if blur_px > 0:
-        left, top, last_right, last_down = window
+        left, top, last_right, last_down = window_of(middle_px, stencil, blur_px, sight.size)
         around = np.s_[top : last_down + 1, left : last_right + 1]
-        pictures = picture[around].astype(np.float32), background.mean[around]
+        pictures = frame[around].astype(np.float32), background.mean[around]
         soft = [np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px), np.float32) for picture in pictures]
         down, right = (
             at.clip(0, size - 1)

@@ -5,12 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sphereorient.movies import OnDemand
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown
+from sphereorient.pose.fitter import Disks, Fitter, Shown
 from sphereorient.pose.neighbours import hidden_places
-from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil, window_of
+from sphereorient.pose.pixels import Pixels, thinned_places, thinned_stencil
 from sphereorient.pose.start import NearStart
 
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
@@ -51,7 +50,7 @@ def _compiled(
         places = fitter.places(begin.position_lab_mm, fitter.optics.fine, stencil, middle_px, begin.moved)
         hidden = hidden_places(places, begin.among)
     done = compiled.settled(
-        _decoded(fitter, frames, middle_px, stencil),
+        fitter.decoded(frames, middle_px, stencil),
         [(view.sight, view.background) for view in fitter.views],
         middle_px,
         (thinned_stencil(stencil, FIRST_EVERY), stencil),
@@ -65,25 +64,6 @@ def _compiled(
         first=first,
     )
     return None if done is None else (FittedPoses(**done[0]), done[1])
-
-
-def _decoded(
-    fitter: Fitter, frames: Sequence[Sequence[Shown]], middle_px: Tensor, stencil: Stencil
-) -> list[list[Picture]]:
-    """Return pictures that hold at least the disks about `middle_px` (C, B, 2)."""
-    middles = middle_px.nan_to_num().tolist()
-
-    def window(b: int, c: int) -> tuple[int, int, int, int]:
-        return window_of(middles[c][b], stencil, 0.0, fitter.views[c].sight.size)
-
-    for b, row in enumerate(frames):
-        for c, frame in enumerate(row):
-            if isinstance(frame, OnDemand):  # all of them, before the first is waited for
-                frame.ask(*window(b, c))
-    return [
-        [frame.part(*window(b, c)) if isinstance(frame, OnDemand) else frame for c, frame in enumerate(row)]
-        for b, row in enumerate(frames)
-    ]
 
 
 def _settled_in_torch(
