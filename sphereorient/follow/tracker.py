@@ -31,7 +31,7 @@ from sphereorient.trajectory import Reason
 Floats = NDArray[np.float64]
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
-LONG_STEP = 3.0  # times the step before: a longer one changes the motion
+LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the one before tells little of it
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
@@ -89,8 +89,8 @@ class _Chunk:
             *_, C0, C1 = spreads
             turn, move, spread = on * self.turns[-1], on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
             astray_mm = ASTRAY_SHARE * radius_mm
-            if len(rows) == 3:
-                before = (t1 - t0) / (t0 - self.time_s[frame - 3])
+            before = (t1 - t0) / (t0 - self.time_s[frame - 3]) if len(rows) == 3 else math.inf
+            if before <= LONG_STEP:
                 # The rate changes from the middle of one step to that of the next as it did between the two before.
                 more = (t2 - t0) / (t1 - self.time_s[frame - 3])
                 turn = (1 + more) * turn - on * before * more * self.turns[0]

@@ -14,6 +14,7 @@ from sphereorient.pose.start import NearStart
 
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
+AGAIN = 3  # times that a fit whose last step is long goes on
 MORE = 2, 3  # further iterations after a long step: of some pixels, of all
 
 
@@ -23,6 +24,19 @@ def settled(
     """Fit B poses to the frames of C cameras at the finest level. `disks_px`: what the fitter's method of this name
     tells of the first positions, where that is known. Where compiled code can do it, it does.
     """
+    fit = _settled(fitter, frames, begin, disks_px)
+    for _ in range(AGAIN):
+        rows = (fit.step[:, :3].norm(dim=-1) > NEAR_RAD).nonzero()[:, 0]
+        if not len(rows):
+            break
+        there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
+        _put(fit, rows, _settled(fitter, [frames[k] for k in rows.tolist()], there, None))
+    return fit
+
+
+def _settled(
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None
+) -> FittedPoses:
     done = _compiled(fitter, frames, begin, disks_px, first=True)
     if done is None:
         return _settled_in_torch(fitter, frames, begin, disks_px)
@@ -32,9 +46,13 @@ def settled(
         there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
         again = _compiled(fitter, [frames[k] for k in rows.tolist()], there, None, first=False)
         assert again is not None  # as before
-        for name, part in again[0].parts().items():
-            getattr(fit, name)[rows] = part
+        _put(fit, rows, again[0])
     return fit
+
+
+def _put(fit: FittedPoses, rows: Tensor, other: FittedPoses) -> None:
+    for name, part in other.parts().items():
+        getattr(fit, name)[rows] = part
 
 
 def _compiled(

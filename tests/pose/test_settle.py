@@ -26,7 +26,7 @@ from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.pose.fitter import CameraView, first_fitter
-from sphereorient.pose.settle import settled
+from sphereorient.pose.settle import NEAR_RAD, settled
 from sphereorient.pose.start import NearStart
 
 RIG, COUNT = rig_of(), 6
@@ -89,6 +89,14 @@ def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
     expected = settled(fitter, frames, begin)
     assert_same(found, expected)
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, R)).max()) < 0.5
+
+
+def test_a_fit_goes_on_while_its_steps_are_long(scene):
+    fitter, pictures, X, R = scene
+    far = torch.cat([turned(R[k : k + 1], 15.0, k) for k in range(COUNT)])
+    fit = settled(fitter, [list(row) for row in pictures], replace(start(X, R), R_lab_body=far))
+    assert float(fit.step[:, :3].norm(dim=-1).max()) < NEAR_RAD
+    assert float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).max()) < 0.5
 
 
 def test_the_shutter_is_open_while_the_ball_moves(scene, monkeypatch):
