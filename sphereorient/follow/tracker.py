@@ -31,7 +31,7 @@ from sphereorient.trajectory import Reason
 Floats = NDArray[np.float64]
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
-LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the one before tells little of it
+LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the shorter one tells no rate
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
@@ -74,10 +74,14 @@ class _Chunk:
         numbers = [number for number, _ in self.past]
         if not rows or numbers[-1] != frame - 1:
             return None
-        last, on = rows[-1], math.inf
+        last, on, before = rows[-1], math.inf, math.inf  # steps over those before them: 1 for even frames
         if len(rows) > 1 and numbers[-2] == frame - 2:
             t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
-            on = (t2 - t1) / (t1 - t0)  # 1 for even frames
+            on, known = (t2 - t1) / (t1 - t0), self.turns[-1]
+        if len(rows) == 3:
+            before = (t1 - t0) / (t0 - self.time_s[frame - 3])
+            if before < 1 / LONG_STEP:  # too short to tell a rate: the last two steps together do
+                on, known, rows = (t2 - t1) / (t1 - self.time_s[frame - 3]), known + self.turns[0], [rows[0], rows[2]]
         places = [one.position_lab_mm[0].numpy() for one in rows]
         spreads = [one.covariance[0, 3:, 3:].numpy() for one in rows]
         X, spread = places[-1], spreads[-1]
@@ -87,10 +91,9 @@ class _Chunk:
         if not rough:
             *_, X0, X1 = places
             *_, C0, C1 = spreads
-            turn, move, spread = on * self.turns[-1], on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
+            turn, move, spread = on * known, on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
             astray_mm = ASTRAY_SHARE * radius_mm
-            before = (t1 - t0) / (t0 - self.time_s[frame - 3]) if len(rows) == 3 else math.inf
-            if before <= LONG_STEP:
+            if 1 / LONG_STEP <= before <= LONG_STEP:
                 # The rate changes from the middle of one step to that of the next as it did between the two before.
                 more = (t2 - t0) / (t1 - self.time_s[frame - 3])
                 turn = (1 + more) * turn - on * before * more * self.turns[0]

@@ -27,8 +27,8 @@ from sphereorient.live.shared import SharedFrames
 BEGIN_S = 120.0  # until the tracker's first line
 QUIET_S = 2.0  # without a line: the end
 FIRST = 50  # lines that do not count: caches fill
-# Columns of FicTrac's line: number, rotation since the stretch began (camera), time (ms), place in the stretch.
-NUMBER, ROTATION, TIME, SEQUENCE = 1, slice(9, 12), 22, 23
+# Columns of FicTrac's line: number, rotation since the stretch began (camera), place in the stretch.
+NUMBER, ROTATION, SEQUENCE = 1, slice(9, 12), 23
 TENTHS = 10
 EVERY = 1000  # lines from one look at the memory to the next
 # Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
@@ -119,6 +119,7 @@ def delays(
     size = sum(picture.nbytes for picture in pictures[0] if picture is not None)
     order = [*range(len(pictures)), *(() if loop else range(len(pictures) - 2, 0, -1))]
     memory: list[float] = []
+    written_s: list[float] = []
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lines:
         lines.bind((HOST, 0))
         lines.settimeout(QUIET_S)
@@ -130,7 +131,9 @@ def delays(
             first_s, number, left = time.perf_counter(), 0, FIRST + round(seconds * rate_hz)
             while left > 0 and not ended.is_set():
                 row = pictures[order[number % len(order)]]
-                ring.write(time.perf_counter(), [part for part in row if part is not None])
+                written_s.append(time.perf_counter())
+                # The time as a camera's clock tells it; this program may be late.
+                ring.write(first_s + number / rate_hz, [part for part in row if part is not None])
                 number, left = number + 1, left - begun.is_set()
                 time.sleep(max(0.0, first_s + number / rate_hz - time.perf_counter()))
 
@@ -154,10 +157,10 @@ def delays(
             said = (tracker.stderr.read() if tracker.stderr else "").strip().splitlines()
             got = said[-1] if said else f"status {tracker.returncode}"
             raise SphereOrientError(refusal("live", expected="a line a frame", got=got, do="correct that"))
-    number, delay_s, *_ = table = np.array(found).reshape(-1, 6)[FIRST:].T
+    number, came_s, *_ = table = np.array(found).reshape(-1, 6)[FIRST:].T
     return Delays(
         written=int(number[-1] - number[0]) + 1 if len(number) else 0,
-        delay_s=delay_s,
+        delay_s=came_s - np.array(written_s)[number.astype(int) - 1],
         lost=int(np.isnan(table[2]).sum()),
         error_deg=_errors_deg(np.array(found).reshape(-1, 6), order, R_cam_lab, experiment.parent / "truth.h5")[FIRST:],
         memory_mb=np.array(memory),
@@ -167,7 +170,7 @@ def delays(
 def _received(
     lines: socket.socket, tracker: "subprocess.Popen[str]", begun: Event, saw: Callable[[int], None]
 ) -> list[tuple[float, ...]]:
-    """Return of each line, until none comes: number, delay (s), rotation since the stretch began (3), rad, in the
+    """Return of each line, until none comes: number, time (s), rotation since the stretch began (3), rad, in the
     camera's axes, and place in the stretch.
     """
     found: list[tuple[float, ...]] = []
@@ -182,7 +185,7 @@ def _received(
         now = time.perf_counter()
         begun.set()
         rotation = map(float, parts[ROTATION])
-        found.append((float(parts[NUMBER]), now - float(parts[TIME]) / 1e3, *rotation, float(parts[SEQUENCE])))
+        found.append((float(parts[NUMBER]), now, *rotation, float(parts[SEQUENCE])))
         saw(len(found))
 
 
