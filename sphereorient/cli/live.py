@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sphereorient.live.outputs import Output
 
 SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
-WAITING = 32  # frames of a camera that wait at most
+WAITING = 64  # frames of a camera that wait at most
 
 
 @app.command()
