@@ -55,7 +55,7 @@ def map_(
     quiet: Quiet = False,
 ) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed. Of several
-    balls each gets one, OUT_NAME.png.
+    balls each gets one, OUT_NAME.png; those that wear one paint share it.
     """
     check_ending(out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
     from sphereorient.experiment import load_experiment
@@ -93,10 +93,12 @@ def map_(
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in files))
     for name, result in results.items():
-        if result.experiment.texture_path != outs[name]:
+        map_path = outs[result.paint_of]
+        if result.experiment.texture_path != map_path:
             place = f"the ball {name} under spheres:" if name else "sphere:"
+            why = "" if result.paint_of == name else f" (it wears the paint of {result.paint_of})"
             typer.echo(
-                f"next: write texture: {outs[name].name} in {place} of the experiment, then `sphereorient track`"
+                f"next: write texture: {map_path.name} in {place} of the experiment{why}, then `sphereorient track`"
             )
 
 

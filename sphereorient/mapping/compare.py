@@ -78,8 +78,9 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
     tables = {blur: [table.blurred(math.radians(blur)) for table in finest] for blur in blurs}
     shares = [share for _, share in maps]
     place = fibonacci_directions(PLACES)
-    R = _best_rotation(tables, shares, place) if turned else torch.eye(3, dtype=torch.float64)
-    correlation, known = _correlations(tables[BLURS_DEG[-1]], shares, place, R[None])
+    coarse = [_coarser(share) for share in shares]
+    R = _best_rotation(tables, coarse, place) if turned else torch.eye(3, dtype=torch.float64)
+    correlation, known = _correlations(tables[BLURS_DEG[-1]], coarse, place, R[None])
     score = float(correlation[0]) if float(known[0]) > 0 else math.nan
     if turned and score < ALIKE_MIN:
         do = "compare maps of one ball; a mirrored map matches no rotation"
@@ -174,6 +175,13 @@ def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
     known = torch.isfinite(texture)
     middle = texture[known].mean() if known.any() else torch.tensor(0.5)
     return torch.where(known, texture, middle).float(), known.float()
+
+
+def _coarser(share: Tensor) -> Tensor:
+    """Return the known shares (h, 2 h) of a mask (H, 2 H) in as few texels as its tables have: quick to look up."""
+    rows = min(len(share), SIDE)
+    coarse: Tensor = F.adaptive_avg_pool2d(share[None, None], (rows, 2 * rows))[0, 0]
+    return coarse
 
 
 def _best_rotation(tables: dict[float, list[TextureTable]], shares: list[Tensor], place: Tensor) -> Tensor:

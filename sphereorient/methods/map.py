@@ -1,7 +1,7 @@
 """The method of `sphereorient map`: learn the texture maps from movies in which the spheres rotate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +12,9 @@ from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
 from sphereorient.files.provenance import provenance
 from sphereorient.mapping import LearntMap, fit_map, take_crops
+from sphereorient.mapping.alike import shared_maps
 from sphereorient.mapping.balls import take_crops_of_all
 from sphereorient.mapping.compare import MapComparison
-from sphereorient.mapping.disks import Crops
 from sphereorient.mapping.old_map import corrected
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
@@ -30,9 +30,10 @@ class MapResult:
     experiment: Experiment
     learnt: LearntMap
     track: Trajectory  # the orientations of all frames
-    comparison: MapComparison | None  # with the old map, where one was given
-    kept_share: float  # of the sphere with the old map's texture, because it was never seen
     remarks: tuple[str, ...]  # on the inputs
+    comparison: MapComparison | None = None  # with the old map, where one was given
+    kept_share: float = 0.0  # of the sphere with the old map's texture, because it was never seen
+    paint_of: str = ""  # of several balls: the name of the first one that wears this paint
 
     @property
     def texture(self) -> Tensor:
@@ -58,7 +59,7 @@ def learn_map(
     """Learn the texture map and the orientations of a sphere from movies or photographs, without a known map.
 
     Of several spheres (key `spheres`) the result is a MapResult for each, by name. Nothing but size and place tells
-    them apart: names of spheres of one size are given by chance.
+    them apart: names of spheres of one size are given by chance. Those that wear one paint share one map.
 
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
@@ -81,38 +82,36 @@ def learn_map(
         opened = recording.experiment
         if len(opened.spheres) == 1:
             crops = take_crops(recording, settings.paint, settings.locate, progress)
-            return _learnt(recording, crops, settings, old, progress, kept, command)
+            learnt = fit_map(crops, settings.paint, progress, kept, old)
+            if old is None:
+                return _result(recording, learnt, settings, command)
+            learnt, comparison, kept_share = corrected(learnt, old)
+            result = _result(recording, learnt, settings, command)
+            return replace(result, comparison=comparison, kept_share=kept_share)
         if old is not None:
             got, do = f"{len(opened.spheres)}", "leave --init out"
             raise ExperimentError(refusal("init", expected="an experiment of one ball", got=got, do=do))
         each = take_crops_of_all(recording, settings.paint, settings.locate, progress)
 
-        def of(name: str) -> MapResult:
+        def of(name: str) -> LearntMap:
             own = None if kept is None else kept.with_name(f"{kept.stem}-{name}{kept.suffix}")
-            return _learnt(
-                recording.of(name), each[name], settings, None, partial(_of_ball, progress, name), own, command
-            )
+            return fit_map(each[name], settings.paint, partial(_of_ball, progress, name), own)
 
-        return {name: of(name) for name in opened.names}
+        maps = {name: of(name) for name in opened.names}
+        progress("balls of one paint", 0, 1)
+        shared = shared_maps(maps)
+        progress("balls of one paint", 1, 1)
+        return {
+            name: replace(_result(recording.of(name), one.learnt, settings, command), paint_of=one.first)
+            for name, one in shared.items()
+        }
 
 
 def _of_ball(progress: Progress, name: str, stage: str, done: int, total: int) -> None:
     progress(f"{name}: {stage}", done, total)
 
 
-def _learnt(
-    recording: Recording,
-    crops: Crops,
-    settings: Settings,
-    old: Tensor | None,
-    progress: Progress,
-    kept: Path | None,
-    command: str,
-) -> MapResult:
-    comparison, kept_share = None, 0.0
-    learnt = fit_map(crops, settings.paint, progress, kept, old)
-    if old is not None:
-        learnt, comparison, kept_share = corrected(learnt, old)
+def _result(recording: Recording, learnt: LearntMap, settings: Settings, command: str) -> MapResult:
     opened = recording.experiment
     untextured = opened.with_sphere(texture_path=None)  # the file that it names may be the one to be written
     origin = provenance(input_files(untextured, list(recording.cameras)), opened.folder, command)
@@ -120,7 +119,5 @@ def _learnt(
         experiment=opened,
         learnt=learnt,
         track=map_track(opened, recording.clock, learnt, settings_yaml(settings), origin),
-        comparison=comparison,
-        kept_share=kept_share,
         remarks=recording.remarks,
     )

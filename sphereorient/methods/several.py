@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
-from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sphereorient.assemble.identity import same_balls
@@ -158,11 +158,19 @@ def _named(names: Sequence[str], frames: dict[str, list[Poses]], job: Job, follo
 
 
 def alike(job: Job) -> list[list[str]]:
-    """Return the names of the balls, those of one paint and diameter together: no picture tells them apart."""
-    kinds: dict[tuple[Path | None, float | None], list[str]] = {}
+    """Return the names of the balls, those of one map and diameter together: no picture tells them apart."""
+    kinds: list[list[str]] = []
     for sphere in job.recording.experiment.spheres:
-        kinds.setdefault((sphere.texture_path, sphere.diameter_mm), []).append(sphere.name)
-    return list(kinds.values())
+        own = job.recording.of(sphere.name)
+        for names in kinds:
+            other = job.recording.of(names[0])
+            same = own.experiment.radius_mm == other.experiment.radius_mm
+            if same and torch.equal(own.texture.nan_to_num(), other.texture.nan_to_num()):
+                names.append(sphere.name)
+                break
+        else:
+            kinds.append([sphere.name])
+    return kinds
 
 
 def unlit(job: Job, views: Mapping[str, Sequence[CameraView]]) -> dict[str, Initialiser]:
