@@ -2,13 +2,16 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import Progress, Recording, load_map
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
@@ -16,13 +19,14 @@ from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
+from sphereorient.mapping.compare import compare_maps
 from sphereorient.methods.method import Job
 from sphereorient.methods.proposers import open_scene
 from sphereorient.methods.settings import Settings
 from sphereorient.methods.several import unlit
 from sphereorient.preflight import texture_map
 from sphereorient.preflight.cameras import BAD, GOOD, OUTLINE_PX
-from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged
+from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 
 FRAMES = 8  # spread over the movies
 SEEN = 0.8  # share of the frames in which a ball should be found
@@ -79,13 +83,29 @@ def look_at_scene(
         replace(text, title=f"{text.title} {path.name}") if len(loaded) > 1 else text
         for text, path in zip(texts, loaded, strict=True)
     ]
-    return seen, [*_counts(disks, balls), *_found(found, balls), *_sizes(found, disks, balls), *told]
+    one_paint = _one_paint({path.name: one.grey for path, one in loaded.items()}, progress)
+    return seen, [*_counts(disks, balls), *_found(found, balls), *_sizes(found, disks, balls), *told, *one_paint]
 
 
 def _no_map(name: str, path: str | None) -> Finding:
     measured = "no texture map is given" if path is None else f"no texture map: {path} is not there"
     do = f"learn it with `sphereorient map`, or correct spheres.{name}.texture"
     return judged(f"paint of ball {name}", measured, (True, FAULT, do))
+
+
+def _one_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
+    """Tell maps of two files that show one paint, in any body frames: balls that wear it look alike."""
+    pairs = list(combinations(maps, 2))
+    for k, (one, other) in enumerate(pairs):
+        progress("maps", k, len(pairs))
+        try:
+            alike = compare_maps(maps[one], maps[other]).correlation
+        except PaintError:
+            continue
+        measured = f"both show one paint (correlation {alike:.2f})"
+        do = "name one of them for all balls that wear it; else `track` may exchange these balls without a word"
+        yield warning(f"paint of {one} and {other}", measured, do)
+    progress("maps", len(pairs), len(pairs))
 
 
 def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 
+from sphereorient import so3
 from sphereorient.experiment import Sphere
+from sphereorient.experiment.recording import silent
 from sphereorient.locate.outline import Outline
+from sphereorient.mapping.compare import turned_map
 from sphereorient.preflight.finding import FAULT, OK, WARNING
-from sphereorient.preflight.scene import _counts, _found, _sizes, look_at_scene
+from sphereorient.preflight.scene import _counts, _found, _one_paint, _sizes, look_at_scene
+from sphereorient.synth.textures import random_texture
 
 PX_PER_MM = 4.0
 
@@ -101,3 +106,11 @@ def test_missing_maps_are_told_ball_by_ball(tmp_path):
     assert [one.title for one in found] == ["paint of ball a", "paint of ball b"]
     assert {one.severity for one in found} == {FAULT}
     assert "t.png is not there" in found[1].measured
+
+
+@pytest.mark.slow  # 10 s
+def test_two_maps_of_one_paint_are_told():
+    a, b = (torch.nn.functional.avg_pool2d(random_texture("patches", seed)[None], 8)[0] for seed in (3, 4))
+    turned = turned_map(a, so3.exp(torch.tensor([[0.4, -1.1, 0.7]], dtype=torch.float64))[0])
+    (finding,) = _one_paint({"a.png": a, "b.png": b, "c.png": turned}, silent)
+    assert (finding.title, finding.severity) == ("paint of a.png and c.png", WARNING)
