@@ -15,6 +15,7 @@ from sphereorient.synth.severities import DEGRADATIONS, LEVELS, degradation
 
 CLEAN, TOGETHER = "clean", "together"
 SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of an only ball's volume: small, for speed
+VELOCITY_S = 0.12  # correlation time of the velocity
 MM3_PER_LITRE = 1e6
 MIXED_SEED = 20110  # of the random combinations
 
@@ -34,6 +35,7 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
     balls: int = Field(1, ge=1, le=8, description="of each scene")
     paints: int = Field(8, ge=1, le=8, description="of several balls; fewer than balls: some look alike")
     volume_mm: float = Field(VOLUME_MM, gt=0, le=45, description="balls stay within about this distance of the origin")
+    velocity_time: float = Field(VELOCITY_S, gt=0, description="correlation time of the velocity, s; shorter: faster")
 
     @property
     def per_litre(self) -> float:
@@ -73,6 +75,7 @@ class BenchmarkScene:
     balls: int = 1
     paints: int = 8
     volume_mm: float = VOLUME_MM
+    velocity_time: float = VELOCITY_S
 
     @property
     def name(self) -> str:
@@ -90,6 +93,7 @@ class BenchmarkScene:
             paints=self.paints,
             image_size=(SIDE_PX, SIDE_PX),
             volume_mm=self.volume_mm,
+            velocity_time=self.velocity_time,
             seed=self.seed,
         )
 
@@ -108,6 +112,7 @@ def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
             balls=settings.balls,
             paints=settings.paints,
             volume_mm=settings.volume_mm,
+            velocity_time=settings.velocity_time,
         )
         for seed in settings.seeds
         for kind, level, number, mixed in _of_seed(settings, seed)
