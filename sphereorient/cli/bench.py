@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 EXIT_WORSE = 1  # a number got worse
 LARGEST_HZ = 1e5
+PASSING_S = 0.03  # correlation time of the velocity: balls pass before each other in a short movie
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -203,7 +204,8 @@ def balls_curve(
     from sphereorient.report.plots.style import write_figure
     from sphereorient.report.robustness import density_figure, write_table
 
-    plain = {"degradations": (), "seeds": tuple(range(seeds)), "frames": frames, "paints": paints, "volume_mm": volume}
+    plain = {"degradations": (), "seeds": tuple(range(seeds)), "frames": frames}
+    plain |= {"paints": paints, "volume_mm": volume, "velocity_time": PASSING_S}
     plans = {
         f"{b}-balls-{c}-cameras": read_flat(BenchSettings, None, plain | {"balls": b, "cameras": c})
         for c in _numbers_in("--cameras", cameras)

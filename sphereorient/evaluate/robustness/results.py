@@ -20,15 +20,7 @@ LEAST_RATIO = 1.1  # of the median errors; less is no change
 LEAST_FRAMES = 0.02  # of wrong or lost frames; less is no change
 BLOCK = 4  # frames: errors of neighbours are correlated
 DRAWS, SEED = 400, 2011
-SAME_PLAN = (
-    "frames",
-    "at_once",
-    "degradations",
-    "cameras",
-    "balls",
-    "paints",
-    "volume_mm",
-)  # settings that make scenes of one name equal
+MORE_OR_FEWER = {"levels", "seeds", "together"}  # settings by which scenes of one name do not differ
 Floats = NDArray[np.float64]
 Key = tuple[str, int, str]  # kind, level, method
 
@@ -227,7 +219,8 @@ class Change:
 
 def compare_runs(now: Results, baseline: Results) -> list[Change]:
     """Compare the scenes and methods that two runs have in common; raise BenchError if there are none."""
-    same = all(getattr(now.settings, key) == getattr(baseline.settings, key) for key in SAME_PLAN)
+    plans = [run.settings.model_dump(exclude=MORE_OR_FEWER) for run in (now, baseline)]
+    same = plans[0] == plans[1]
     known = {(one.scene, one.ball, one.method): one for one in baseline.outcomes if same}
     groups: dict[Key, list[tuple[SceneResult, SceneResult]]] = {}
     for one in now.outcomes:
