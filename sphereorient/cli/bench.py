@@ -390,6 +390,8 @@ def _print_balls(runs: "Sequence[Results]") -> None:
             *(f"{line.p50_mm:.4f}", f"{line.p95_mm:.4f}", f"{100 * line.given:.1f} %", str(line.exchanges)),
             *(f"{line.over_stated:.2f}", f"{line.frames_per_s:.1f}"),
         )
+        if line.refused:
+            typer.echo(f"{plan.balls} balls, {plan.cameras} cameras: {line.refused}")
     print_table(table)
 
 
