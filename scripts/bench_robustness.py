@@ -42,7 +42,7 @@ def main() -> None:
         found = run_benchmark(options.out, settings, jobs=options.jobs, progress=lambda *at: advance("scenes", *at))
     figure = robustness_figure(found)
     with writing(force=True):
-        write_table(found, options.out / "results.csv")
+        write_table([found], options.out / "results.csv")
         write_figure(figure, options.out / "robustness")
     (DOCS / "robustness.png").write_bytes((options.out / "robustness.png").read_bytes())
     save_results(found, DOCS / "robustness-baseline.json")

@@ -15,29 +15,11 @@ import numpy as np
 import torch
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, sphere_disk_px
+from sphereorient.evaluate.score import hidden_shares
 from sphereorient.experiment import load_experiment
 from sphereorient.trajectory import Flag, Tracks
 
 DOUBT = Flag.IDENTITY | Flag.CONTRADICTION | Flag.ONE_CAMERA | Flag.POSITION_INTERPOLATED
-POINTS = 41  # across a disk
-
-
-def hidden_share(places: dict[str, torch.Tensor], radii: dict[str, float], camera: Camera, name: str) -> torch.Tensor:
-    """Return the share of a ball's disk (N,) that nearer balls cover, by their outlines as circles."""
-    disks = {other: sphere_disk_px(camera, X, radii[other]) for other, X in places.items()}
-    far = {other: (X @ camera.R_cam_lab.mT + camera.T_cam_lab_mm).norm(dim=-1) for other, X in places.items()}
-    across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
-    place = torch.cartesian_prod(across, across)
-    place = place[place.square().sum(1) < 1]
-    middle, radius = disks[name]
-    at = middle[:, None] + radius[:, None, None] * place
-    covered = torch.zeros(at.shape[:2], dtype=torch.bool)
-    for other, (there, size) in disks.items():
-        if other != name:
-            inside = (at - there[:, None]).norm(dim=-1) < size[:, None]
-            covered |= inside & (far[other] < far[name])[:, None]
-    return covered.double().mean(1)
 
 
 def main() -> None:
@@ -54,14 +36,13 @@ def main() -> None:
         truth = {
             name: {key: file[f"spheres/{name}/{key}"][()] for key in ("position", "orientation")} for name in radii
         }
-    places = {name: torch.from_numpy(one["position"]) for name, one in truth.items()}
+    shares = hidden_shares(given.truth, experiment.cameras, radii)
     print("ball  hidden frames  valid, no flag  error (95 %)")
     for name, track in tracks.items():
         # Balls that look alike may have each other's names: the truth that lies nearest is meant.
         away = {one: np.linalg.norm(track.position - parts["position"], axis=1) for one, parts in truth.items()}
         own = min(away, key=lambda one, far=away: float(np.nanmedian(far[one])))
-        shares = torch.stack([hidden_share(places, radii, camera, own) for camera in experiment.cameras.values()])
-        hidden = ((shares > given.share).sum(0) >= given.cameras).numpy()
+        hidden = (shares[own] > given.share).sum(0) >= given.cameras
         sure = hidden & track.valid & ((track.flags & int(DOUBT)) == 0)
         R = [torch.from_numpy(part[sure]) for part in (track.orientation, truth[own]["orientation"])]
         error = np.degrees(so3.geodesic_distance(*R).numpy())

@@ -138,7 +138,7 @@ def film(folder: Path, number: int, frames: int) -> None:
     for index, (name, camera) in enumerate(cameras.items()):
         write_ffv1(aside / f"{name}.mkv", pictures(index, camera), settings.frame_rate)
     save_cameras(aside / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
-    write_truth(aside / "truth.h5", motion.at(times_s), cameras)
+    write_truth(aside / "truth.h5", {"": motion.at(times_s)}, cameras)
     # Without backgrounds: the mean of the movie is used, as in the paper.
     document = experiment_document(settings, cameras)
     del document["backgrounds"]

@@ -19,7 +19,7 @@ import numpy as np
 from sphereorient.cli.app import progress_bar
 from sphereorient.evaluate.robustness import BenchSettings, SceneResult
 from sphereorient.evaluate.robustness.results import WRONG_DEG
-from sphereorient.evaluate.robustness.run import KEPT, kept_result, limit_threads, run_scene, trackers_of
+from sphereorient.evaluate.robustness.run import KEPT, kept_results, limit_threads, run_scene, trackers_of
 from sphereorient.evaluate.robustness.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.severities import LEVELS
@@ -48,7 +48,7 @@ def main() -> None:
         for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
             task.result()
             advance("scenes", done, len(scenes))
-    outcomes = [kept_result(place) for place in places]
+    outcomes = [one for place in places for one in kept_results(place)]
     tell(outcomes)
 
 

@@ -515,7 +515,8 @@ def film(folder: Path, case: Case) -> Path:
         write_picture(folder / f"empty_{name}.png", np.rint(empty).astype(frames.dtype))
     save_cameras(folder / "cameras.yaml", case.reported(cameras) if case.reported else cameras, comment="of a case")
     X, R = poses(times_s)
-    write_truth(folder / "truth.h5", replace(motion.at(times_s), position_lab_mm=X, R_lab_body=R), cameras)
+    truth = replace(motion.at(times_s), position_lab_mm=X, R_lab_body=R)
+    write_truth(folder / "truth.h5", {"": truth}, cameras)
     document = experiment_document(settings, cameras, ".npy")
     if case.document:
         case.document(document)

@@ -1,6 +1,7 @@
 """Synthetic movies with exact truth: `sphereorient synth`, `score`, and `bench`, the robustness benchmark."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 EXIT_WORSE = 1  # a number got worse
 LARGEST_HZ = 1e5
+PASSING_S = 0.03  # correlation time of the velocity: balls pass before each other in a short movie
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -66,14 +68,17 @@ def score(
     truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
     sphere: SphereName = None,
     alike: Annotated[
-        str, typer.Option(help="Balls that look alike, e.g. a,c: their names may be exchanged, all over.")
-    ] = "",
+        list[str] | None,
+        typer.Option(help="Balls that look alike, e.g. a,c: their names may be exchanged, all over; again for others."),
+    ] = None,
 ) -> None:
     """Print the errors of a track against the exact truth of a synthetic experiment."""
     from sphereorient.evaluate import score_track
     from sphereorient.evaluate.score import given_to_others, named_as_true
 
-    tracks = named_as_true(tracks_in(track, None), truth, names_in(alike))
+    tracks = tracks_in(track, None)
+    for names in alike or ():
+        tracks = named_as_true(tracks, truth, names_in(names))
     given = given_to_others(tracks, truth) if len(tracks) > 1 else {}
     for name, one in tracks.picked(sphere).items():
         print_table(error_table(score_track(one, truth), name))
@@ -118,6 +123,14 @@ Full = Annotated[bool, typer.Option("--full", help="All severities, three movies
 BenchFile = Annotated[Path | None, typer.Option(help="YAML with keys of configs/robustness.yaml; options win.")]
 
 
+def _numbers_in(option: str, text: str) -> tuple[int, ...]:
+    """Return the numbers in 1,3,5; raise SettingsError for another text."""
+    if not names_in(text) or not all(part.isdecimal() for part in names_in(text)):
+        expected, got, do = "whole numbers between commas", repr(text)[:40], f"write e.g. {option} 1,3,5"
+        raise SettingsError(refusal(option, expected=expected, got=got, do=do))
+    return tuple(map(int, names_in(text)))
+
+
 def _settings(
     path: Path | None, full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
 ) -> "BenchSettings":
@@ -125,12 +138,9 @@ def _settings(
     from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
     from sphereorient.methods.settings import read_flat
 
-    if levels is not None and not all(part.strip().isdecimal() for part in levels.split(",")):
-        expected, got, do = "whole numbers between commas", repr(levels)[:40], "write e.g. --levels 1,3,5"
-        raise SettingsError(refusal("--levels", expected=expected, got=got, do=do))
     options: dict[str, Any] = {
         "degradations": None if degradations is None else tuple(names_in(degradations)),
-        "levels": None if levels is None else tuple(map(int, levels.split(","))),
+        "levels": None if levels is None else _numbers_in("--levels", levels),
         "seeds": None if seeds is None else tuple(range(seeds)),
         "frames": frames,
     }
@@ -165,13 +175,52 @@ def robustness(
     with progress_bar(quiet, unit="") as advance:
         found = run_benchmark(out, chosen, trackers, jobs=jobs, progress=lambda *at: advance("scenes", *at))
     with writing(force=True):  # its plan says that the folder is of this run
-        write_table(found, out / "results.csv")
+        write_table([found], out / "results.csv")
         write_figure(robustness_figure(found), out / "robustness")
     if not quiet:
         _print(found)
         typer.echo(f"Wrote {out}: results.json, results.csv, robustness.png, .pdf")
     if older is not None:
         _print_changes(found, older, quiet)
+
+
+@bench.command("balls")
+def balls_curve(
+    out: RunFolder,
+    balls: Annotated[str, typer.Option(help="Numbers of balls, 1 to 8, all in one volume.")] = "1,2,4,8",
+    cameras: Annotated[str, typer.Option(help="Numbers of cameras, 1 to 4: a curve each.")] = "2,3",
+    paints: Annotated[int, typer.Option(min=1, max=8, help="Fewer than balls: some look alike.")] = 2,
+    volume: Annotated[float, typer.Option(help="Balls stay within about this distance of the origin, mm.")] = 45.0,
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Movies of each point of a curve.")] = 1,
+    frames: Annotated[int, typer.Option(min=12, help="Of each movie.")] = 48,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2,
+    quiet: Quiet = False,
+) -> None:
+    """Measure errors and identity against the number density of balls that hide each other."""
+    check_writable(out, folder_made=True)
+    from sphereorient.evaluate.robustness import BenchSettings, run_benchmarks
+    from sphereorient.evaluate.robustness.run import trackers_of
+    from sphereorient.methods.settings import read_flat
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.report.robustness import density_figure, write_table
+
+    plain = {"degradations": (), "seeds": tuple(range(seeds)), "frames": frames}
+    plain |= {"paints": paints, "volume_mm": volume, "velocity_time": PASSING_S}
+    plans = {
+        f"{b}-balls-{c}-cameras": read_flat(BenchSettings, None, plain | {"balls": b, "cameras": c})
+        for c in _numbers_in("--cameras", cameras)
+        for b in _numbers_in("--balls", balls)
+    }
+    with progress_bar(quiet, unit="") as advance:
+        runs = run_benchmarks(
+            out, plans, trackers_of(["precise"]), jobs=jobs, progress=lambda *at: advance("scenes", *at)
+        )
+    with writing(force=True):  # its plans say that the folder is of this run
+        write_table(runs, out / "results.csv")
+        write_figure(density_figure(runs), out / "density")
+    if not quiet:
+        _print_balls(runs)
+        typer.echo(f"Wrote {out}: results.csv, density.png, .pdf, and a folder of each point")
 
 
 @bench.command("live")
@@ -320,6 +369,29 @@ def _print(found: "Results") -> None:
             f"{line.over_stated:.2f}",
             f"{line.frames_per_s:.1f}",
         )
+    print_table(table)
+
+
+def _print_balls(runs: "Sequence[Results]") -> None:
+    """Print one line for each number of cameras and balls."""
+    from rich.table import Table
+
+    from sphereorient.evaluate.robustness.results import summaries
+
+    table = Table(
+        *("cameras", "balls", "per litre", "hidden", "valid", "degrees, median", "95 %", "mm, median", "95 %"),
+        *("given to another", "exchanges", "over sigma", "balls x frames/s"),
+    )
+    for run in runs:
+        line, plan = summaries(run)[0], run.settings
+        table.add_row(
+            *(str(plan.cameras), str(plan.balls), f"{plan.per_litre:.1f}", f"{100 * line.hidden:.0f} %"),
+            *(f"{100 * (1 - line.lost):.1f} %", f"{line.p50_deg:.3f}", f"{line.p95_deg:.3f}"),
+            *(f"{line.p50_mm:.4f}", f"{line.p95_mm:.4f}", f"{100 * line.given:.1f} %", str(line.exchanges)),
+            *(f"{line.over_stated:.2f}", f"{line.frames_per_s:.1f}"),
+        )
+        if line.refused:
+            typer.echo(f"{plan.balls} balls, {plan.cameras} cameras: {line.refused}")
     print_table(table)
 
 

@@ -1,17 +1,18 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from pathlib import Path
 
 import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from sphereorient import so3
+from sphereorient.cameras import Camera, centre_lab_mm, sphere_disk_px
 from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -23,6 +24,7 @@ AXES = 3
 ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
 FICTRAC_FRAME, FICTRAC_ROTATION = 0, slice(8, 11)  # columns: frame counter, absolute rotation vector (camera axes)
 FICTRAC_COLUMNS = 23  # at least; newer versions have more
+POINTS = 41  # across a disk, of which some are hidden
 DO = "pass the truth.h5 of this synthetic experiment"
 
 
@@ -95,37 +97,65 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
 
 
 def named_as_true(tracks: Tracks, truth_path: str | Path, alike: Sequence[str]) -> Tracks:
-    """Return the tracks with the names of spheres that look alike exchanged, all over, as they fit the truth best.
-    Raise TrackError for a name without a track.
+    """Return the tracks with the names of spheres that look alike exchanged, all over, as they fit the truth best: with
+    the least sum of the median errors of position. Raise TrackError for a name without a track.
     """
     for name in alike:
         tracks.picked(name)
-    orders = [dict(zip(alike, order, strict=True)) for order in permutations(alike)]
-    exchanged = [Tracks({order.get(name, name): track for name, track in tracks.items()}) for order in orders]
-    off_mm = [np.median(np.concatenate([o for o, _ in _places(one, truth_path).values()])) for one in exchanged]
-    return exchanged[int(np.argmin(off_mm))]
+    names, away_mm = list(tracks), _distances(tracks, truth_path)
+    cost = np.zeros((len(alike), len(alike)))
+    for k, name in enumerate(alike):
+        if len(away_mm[name]):
+            cost[k] = np.median(away_mm[name], axis=0)[[names.index(other) for other in alike]]
+    rows, columns = (index.tolist() for index in linear_sum_assignment(cost))
+    of_true = {alike[j]: alike[k] for k, j in zip(rows, columns, strict=True)}
+    return Tracks({name: tracks[of_true.get(name, name)] for name in names})
 
 
 def given_to_others(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[int, int]]:
     """Return for each sphere in how many valid frames its position is nearer to the true one of another than to its
     own, and how often the nearest one changes.
     """
-    return {
-        name: (int((nearest != name).sum()), int((nearest[1:] != nearest[:-1]).sum()))
-        for name, (_, nearest) in _places(tracks, truth_path).items()
-    }
+    found = {}
+    for k, (name, away_mm) in enumerate(_distances(tracks, truth_path).items()):
+        nearest = away_mm.argmin(axis=1)
+        found[name] = int((nearest != k).sum()), int((nearest[1:] != nearest[:-1]).sum())
+    return found
 
 
-def _places(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[Floats, NDArray[np.str_]]]:
-    """Return of each sphere's valid frames the error of position, mm, and the name of the sphere truly nearest."""
+def _distances(tracks: Tracks, truth_path: str | Path) -> dict[str, Floats]:
+    """Return the distances (V, K) of each sphere's positions in its valid frames to the true ones of all K, mm."""
     truths = {name: _read_truth(truth_path, "position", sphere=name) for name in tracks}
-    names, found = np.array(list(tracks)), {}
+    found = {}
     for name, track in tracks.items():
         some = track.valid & np.isfinite(track.position).all(1)
         at = _rows(truths[name]["time"], track.time[some], truth_path)
-        apart = [np.linalg.norm(truths[other]["position"][at] - track.position[some], axis=1) for other in names]
-        found[name] = apart[list(tracks).index(name)], names[np.argmin(apart, axis=0)]
+        away = [np.linalg.norm(truth["position"][at] - track.position[some], axis=1) for truth in truths.values()]
+        found[name] = np.stack(away, axis=1)
     return found
+
+
+def hidden_shares(
+    truth_path: str | Path, cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
+) -> dict[str, Floats]:
+    """Return for each sphere of a truth the share of its disk that nearer ones cover, (C, N), all as circles."""
+    truths = {name: _read_truth(truth_path, "position", sphere=name)["position"] for name in radii_mm}
+    places = {name: torch.from_numpy(X) for name, X in truths.items()}
+    across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
+    grid = torch.cartesian_prod(across, across)
+    grid = grid[grid.square().sum(1) < 1]
+    shares: dict[str, list[Floats]] = {name: [] for name in radii_mm}
+    for camera in cameras.values():
+        disks = {name: sphere_disk_px(camera, X, radii_mm[name]) for name, X in places.items()}
+        far_mm = {name: (X - centre_lab_mm(camera)).norm(dim=-1) for name, X in places.items()}
+        for name, (middle, radius) in disks.items():
+            at = middle[:, None] + radius[:, None, None] * grid
+            covered = torch.zeros(at.shape[:2], dtype=torch.bool)
+            for other, (there, size) in disks.items():
+                inside = (at - there[:, None]).norm(dim=-1) < size[:, None]
+                covered |= inside & (far_mm[other] < far_mm[name])[:, None]
+            shares[name].append(covered.double().mean(1).numpy())
+    return {name: np.stack(each) for name, each in shares.items()}
 
 
 def mahalanobis(error: Floats, covariance: Floats) -> Floats:
@@ -157,7 +187,7 @@ def _read_truth(path: str | Path, *names: str, sphere: str = "", also: Sequence[
     try:
         with h5py.File(path) as file:
             schema = str(file.attrs.get("schema", ""))  # old truths have none
-            if "spheres" in file and not sphere and not schema:
+            if "spheres" in file and not sphere and not schema.startswith("sphereorient-track"):
                 got, do = f"that of {', '.join(file['spheres'])}"[:200], "score the track of all of them"
                 raise TrackError(refusal(f"truth {path}", expected="the truth of one ball", got=got, do=do))
             there = file[f"spheres/{sphere}"] if sphere else file

@@ -14,7 +14,7 @@ from sphereorient.evaluate.robustness.results import Results, ResultSummary, sum
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.files.whole_file import put_aside
 from sphereorient.report.columns import plain_cell
-from sphereorient.report.plots.style import new_figure
+from sphereorient.report.plots.style import new_figure, plain_logarithms
 from sphereorient.synth.severities import DEGRADATIONS
 
 COLUMNS = 5
@@ -74,6 +74,43 @@ def _panel(part: Any, kind: str, lines: Sequence[ResultSummary], methods: Sequen
         axes.grid(alpha=0.3)
 
 
+def density_figure(runs: Sequence[Results]) -> Figure:
+    """Draw errors and shares of frames against the number density of balls, a curve for each number of cameras."""
+    figure = new_figure(3 * PANEL[0] + 1.0, PANEL[1] + 0.9)
+    turn, place, shares = figure.subplots(1, 3)
+    for k, cameras in enumerate(sorted({run.settings.cameras for run in runs})):
+        own = sorted((run for run in runs if run.settings.cameras == cameras), key=lambda run: run.settings.per_litre)
+        lines, x = [summaries(run)[0] for run in own], [run.settings.per_litre for run in own]
+        colour, style, marker = LOOKS[k]
+        drawn: dict[str, Any] = {"color": colour, "linestyle": style}
+        for axes, unit in ((turn, "deg"), (place, "mm")):
+            p50, p95 = ([getattr(line, f"{part}_{unit}") for line in lines] for part in ("p50", "p95"))
+            axes.plot(x, p50, marker=marker, ms=4, label=f"{cameras} cameras, median", **drawn)
+            axes.plot(x, p95, lw=0.8, label=f"{cameras} cameras, 95 %", **drawn)
+        shares.plot(x, [100 * line.lost for line in lines], marker=marker, ms=4, label="lost", **drawn)
+        shares.plot(x, [100 * line.given for line in lines], marker="x", lw=0.8, label="given to another", **drawn)
+        shares.plot(x, [100 * line.hidden for line in lines], lw=0.8, alpha=0.5, label="more than half hidden", **drawn)
+    for axes, what in ((turn, "orientation error (degrees)"), (place, "position error (mm)")):
+        axes.set_yscale("log")
+        plain_logarithms(axes.yaxis)
+        axes.set_ylabel(what, fontsize=8)
+    shares.set_ylabel("share of the frames (%)", fontsize=8)
+    shares.set_ylim(0, max(5.0, shares.get_ylim()[1]))
+    balls = sorted({(run.settings.per_litre, run.settings.balls) for run in runs})
+    for axes in (turn, place, shares):
+        axes.set_xlabel("balls per litre", fontsize=8)
+        above = axes.secondary_xaxis("top")
+        above.set_xticks([density for density, _ in balls], [str(count) for _, count in balls], fontsize=7)
+        above.set_xlabel("balls", fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+    handles, names = turn.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
+    handles = shares.get_legend_handles_labels()[0][:3]
+    shares.legend(handles=handles, fontsize=7)
+    return figure
+
+
 def level_labels(kind: str, levels: Sequence[int]) -> list[str]:
     """Return the values of a degradation at some levels as text."""
     if kind == TOGETHER:
@@ -86,9 +123,14 @@ def unit_of(kind: str) -> str:
     return "severity of each" if kind == TOGETHER else DEGRADATIONS[kind].unit
 
 
-def write_table(results: Results, path: Path) -> None:
-    """Write the summaries as CSV, whole or not at all."""
-    rows = [asdict(line) for line in summaries(results)]
+def write_table(runs: Sequence[Results], path: Path) -> None:
+    """Write the summaries of runs as CSV, whole or not at all."""
+    rows = [
+        {"cameras": run.settings.cameras, "balls": run.settings.balls, "per_litre": run.settings.per_litre}
+        | asdict(line)
+        for run in runs
+        for line in summaries(run)
+    ]
     for row in rows:
         row |= {f"recall_{first}": share for first, share in row.pop("recall").items()}
     with put_aside(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:

@@ -221,6 +221,8 @@ OPERATIONS: Mapping[str, Operation] = MappingProxyType(
     }
 )
 
+OF_ONE_BALL = ("uneven_light", "highlights", "occlusion", "bubbles")  # lie on the disk of a ball
+
 
 def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
     """Draw the lost frames, (..., N) bool, for a tensor (..., N): round(share N) per row, one at least."""

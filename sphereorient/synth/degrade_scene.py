@@ -113,13 +113,13 @@ class Filming:
         self.cameras = cameras
         self.gains = {name: self._gain(name) for name in cameras} if "saturation" in values else {}
 
-    def paint(self, texture: Tensor) -> Tensor:
-        """Return the map of the filmed sphere, (H, 2 H), worn."""
-        return worn(texture, self.values.get("paint_wear", 0.0), self._generator("paint_wear"))
+    def paint(self, texture: Tensor, number: int = 0) -> Tensor:
+        """Return the map of a filmed paint, (H, 2 H), worn."""
+        return worn(texture, self.values.get("paint_wear", 0.0), self._of_paint("paint_wear", number))
 
-    def reported_texture(self, texture: Tensor) -> Tensor:
-        """Return the map to write, (H, 2 H), with exchanged patches."""
-        return misdrawn(texture, self.values.get("texture_error", 0.0), self._generator("texture_error"))
+    def reported_texture(self, texture: Tensor, number: int = 0) -> Tensor:
+        """Return the map of a paint to write, (H, 2 H), with exchanged patches."""
+        return misdrawn(texture, self.values.get("texture_error", 0.0), self._of_paint("texture_error", number))
 
     def disk(self, name: str, position_lab_mm: Tensor, cover: NDArray[np.float32]) -> Disk:
         """Return the place of the sphere at (3,) in a camera's picture; `cover` (H, W): coverage of each pixel."""
@@ -157,6 +157,9 @@ class Filming:
         light = self._through(before, torch.from_numpy(picture), self.disk(name, origin[0], cover), name, None)
         white = torch.from_numpy(cover) > 0.99
         return float(gain_to_clip(light.flatten(), white.flatten(), self.values["saturation"]))
+
+    def _of_paint(self, what: str, number: int) -> torch.Generator:
+        return self._generator(what, *([number] if number else []))
 
     def _generator(self, *what: str | int) -> torch.Generator:
         # By name: another degradation does not change the random numbers of the rest.

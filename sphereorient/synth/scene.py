@@ -43,52 +43,45 @@ def render_frame(
 def expose(
     scene: RenderedScene, camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return one exposure without noise, and the coverage, (H, W) float32 each, blurred by the optics.
-
-    `position_lab_mm` (E, 3) and `R_lab_body` (E, 3, 3) are the poses at E instants of the exposure; no instants: empty.
-
-    Raises:
-        CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
-    """
-    settings = scene.settings
-    width, height = camera.image_size
-    picture = np.full((height, width), settings.background, np.float32)
-    cover = np.zeros((height, width), np.float32)
-    share = 1.0 / max(1, len(position_lab_mm))
-    for position, R in zip(position_lab_mm, R_lab_body, strict=True):
-        left, right, top, bottom = box = _box(camera, position, settings.diameter_mm / 2)
-        if left < right and top < bottom:
-            grey, hit = _window(scene, camera, box, position, R)
-            picture[top:bottom, left:right] += share * (grey - hit * settings.background)
-            cover[top:bottom, left:right] += share * hit
-    if settings.blur_px > 0:
-        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), settings.blur_px))
-        cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), settings.blur_px))
-    return picture, cover
+    """Return one exposure of one ball at poses (E, 3) and (E, 3, 3), as `expose_several` does."""
+    return expose_several([scene], camera, position_lab_mm[None], R_lab_body[None])
 
 
 def expose_several(
     scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
-) -> NDArray[np.float32]:
-    """Return one exposure of K balls without noise, (H, W), blurred by the optics; nearer ones cover those behind them.
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return one exposure of K balls without noise, and what they cover, (H, W) float32 each, blurred by the optics.
 
-    `position_lab_mm` (K, E, 3) and `R_lab_body` (K, E, 3, 3) are the poses at E instants; raises as `expose`.
+    `position_lab_mm` (K, E, 3) and `R_lab_body` (K, E, 3, 3) are the poses at E instants of the exposure; no instants:
+    empty. Nearer balls cover those behind them; balls cast no shadows.
+
+    Raises:
+        CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     settings = scenes[0].settings
     width, height = camera.image_size
-    mean = np.zeros((height, width), np.float32)
+    picture = np.full((height, width), settings.background, np.float32)
+    cover = np.zeros((height, width), np.float32)
+    share = 1.0 / max(1, position_lab_mm.shape[1])
     for places, rotations in zip(position_lab_mm.unbind(1), R_lab_body.unbind(1), strict=True):
-        picture = np.full((height, width), settings.background, np.float32)
-        for k in (places - centre_lab_mm(camera)).norm(dim=-1).argsort(descending=True).tolist():
-            left, right, top, bottom = box = _box(camera, places[k], scenes[k].settings.diameter_mm / 2)
-            if left < right and top < bottom:
-                grey, hit = _window(scenes[k], camera, box, places[k], rotations[k])
-                window = picture[top:bottom, left:right]
-                window[...] = (1 - hit) * window + grey
-        mean += picture / position_lab_mm.shape[1]
+        boxes = [_box(camera, X, one.settings.diameter_mm / 2) for X, one in zip(places, scenes, strict=True)]
+        seen = [k for k, (left, right, top, bottom) in enumerate(boxes) if left < right and top < bottom]
+        if not seen:
+            continue
+        first, last = np.min([boxes[k] for k in seen], axis=0), np.max([boxes[k] for k in seen], axis=0)
+        left, right, top, bottom = (int(x) for x in (first[0], last[1], first[2], last[3]))
+        grey, hit = both = np.zeros((2, bottom - top, right - left), np.float32)
+        away = (places - centre_lab_mm(camera)).norm(dim=-1)
+        for k in sorted(seen, key=lambda k: -float(away[k])):
+            one = _window(scenes[k], camera, boxes[k], places[k], rotations[k])
+            window = both[:, boxes[k][2] - top : boxes[k][3] - top, boxes[k][0] - left : boxes[k][1] - left]
+            window[...] = (1 - one[1]) * window + one
+        picture[top:bottom, left:right] += share * (grey - hit * settings.background)
+        cover[top:bottom, left:right] += share * hit
     if settings.blur_px > 0:
-        mean = np.asarray(cv2.GaussianBlur(mean, (0, 0), settings.blur_px))
-    return mean
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), settings.blur_px))
+        cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), settings.blur_px))
+    return picture, cover
 
 
 def _box(camera: Camera, position: Tensor, radius_mm: float) -> tuple[int, int, int, int]:

@@ -13,6 +13,8 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     frame_rate: float = Field(600.0, gt=0, description="Hz")
     exposure: float = Field(0.0004, ge=0, description="s; the picture is the mean over it")
     exposure_samples: int = Field(2, ge=1, description="instants within the exposure that are averaged")
+    balls: int = Field(1, ge=1, le=8, description="number of balls; of several the names are a, b, ...")
+    paints: int = Field(8, ge=1, le=8, description="different paints; fewer than balls: some look alike")
     diameter_mm: float = Field(18.0, gt=0, description="of the sphere")
     texture: Literal["blobs", "patches", "dots"] = Field("blobs", description="kind of the random paint")
     velocity_rms: float = Field(0.25, ge=0, description="m/s per component")
@@ -33,6 +35,12 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     shot_noise: float = Field(0.3, ge=0, description="grey levels per root of grey level")
     blur_px: float = Field(0.55, ge=0, description="Gaussian blur of the optics, px")
     seed: int = Field(0, ge=0, description="same seed, same bytes")
+
+    @property
+    def worn(self) -> dict[str, int]:
+        """Number of the paint that each ball wears, by its name; the name of an only ball is empty."""
+        names = "abcdefgh"[: self.balls] if self.balls > 1 else ("",)
+        return {name: k % self.paints for k, name in enumerate(names)}
 
     @model_validator(mode="after")
     def _exposed_within_a_frame(self) -> Self:

@@ -1,6 +1,6 @@
 """Write synthetic experiments in the format that `sphereorient track` reads."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -14,18 +14,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
+from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
+from sphereorient.synth.degrade import OF_ONE_BALL
 from sphereorient.synth.degrade_scene import Filming, degraded_settings, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion, without_seam
-from sphereorient.synth.scene import RenderedScene, digitise, expose, make_scene
+from sphereorient.synth.scene import RenderedScene, digitise, expose_several, make_scene
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import degradation, severity
 from sphereorient.synth.textures import random_texture
 
 PIXEL_PITCH_MM = 0.02
+DRAWS = 500  # motions tried for each ball
+NEXT_SEED = 1_000_003  # from one ball or draw to the next: no two scenes share one
 
 
 def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
@@ -74,35 +78,47 @@ def write_synthetic_experiment(
 ) -> Path:
     """Render an experiment with exact truth in `folder` and return the path of experiment.yaml.
 
-    The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5; old files are replaced.
-    `progress` receives the number of frames rendered since the last call. `values` maps degradations to physical
-    values: reported cameras, texture map and diameter may be wrong; truth.h5 describes the filmed cameras and sphere.
+    The folder also receives movies, backgrounds, texture.png (of several balls texture_0.png, ... of each paint),
+    cameras.yaml and truth.h5; old files are replaced. `progress` receives the number of frames rendered since the last
+    call. `values` maps degradations to physical values: reported cameras, texture map and diameter may be wrong;
+    truth.h5 describes the filmed cameras and sphere.
 
     Raises:
-        SettingsError: unknown degradation, or impossible value or scene.
+        SettingsError: unknown degradation, one of a single ball for several, or impossible value or scene.
         OutputError: folder not writable.
     """
     for name, value in values.items():
         degradation(name).check(value)
+        if settings.balls > 1 and name in OF_ONE_BALL:
+            do = "leave it out, or set balls to 1"
+            raise SettingsError(refusal(f"degradation {name}", expected="one ball", got=str(settings.balls), do=do))
     settings = degraded_settings(settings, values)
+    motions = motions_of(settings)
     make_folder(folder, f"folder {folder}")
     cameras = default_cameras(settings)
     filming = Filming(settings, values, cameras)
     # Rounded to grey levels, as in the file.
-    texture = torch.from_numpy(_as_file(random_texture(settings.texture, settings.seed)) / np.float32(255))
-    scene = make_scene(filming.paint(texture), settings)
+    textures = [
+        torch.from_numpy(_as_file(random_texture(settings.texture, settings.seed + k * NEXT_SEED)) / np.float32(255))
+        for k in range(min(settings.balls, settings.paints))
+    ]
+    scenes = [make_scene(filming.paint(texture, k), settings) for k, texture in enumerate(textures)]
+    instants_s = _instants_s(settings).reshape(-1)
+    filmed = [(scenes[settings.worn[name]], motion.at(instants_s)) for name, motion in motions.items()]
     for index, name in enumerate(cameras):
-        frames = _frames(scene, filming, name, np.random.default_rng([settings.seed, index]), progress)
+        frames = _frames(filmed, filming, name, np.random.default_rng([settings.seed, index]), progress)
         write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
         size = cameras[name].image_size[::-1]
         disk = filming.disk(name, torch.zeros(3, dtype=torch.float64), np.zeros(size, np.float32))
         empty = filming.picture(np.full(size, settings.background, np.float32), disk, name, None)
         write_picture(folder / f"empty_{name}.png", np.clip(np.rint(empty), 0, 255).astype(np.uint8))
-    write_picture(folder / "texture.png", _as_file(filming.reported_texture(texture)))
+    for k, texture in enumerate(textures):
+        write_picture(folder / _texture_file(settings, k), _as_file(filming.reported_texture(texture, k)))
     reported = wrong_cameras(cameras, values, settings.seed)
     exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
     save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
-    write_truth(folder / "truth.h5", motion_of(settings).at(frame_times_s(settings)), cameras)
+    times_s = frame_times_s(settings)
+    write_truth(folder / "truth.h5", {name: motion.at(times_s) for name, motion in motions.items()}, cameras)
     path = folder / "experiment.yaml"
     write_text(path, yaml.safe_dump(_experiment(filming), sort_keys=False))
     return path
@@ -113,8 +129,38 @@ def frame_times_s(settings: SynthSettings) -> Tensor:
     return torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
 
 
+def _instants_s(settings: SynthSettings) -> Tensor:
+    """Return the instants of each exposure, (N, E) float64, s."""
+    count = settings.exposure_samples
+    within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
+    return frame_times_s(settings)[:, None] + within
+
+
+def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
+    """Draw the motion of each ball, by its name; one that meets an earlier ball at a filmed instant is drawn again.
+
+    Raises:
+        SettingsError: no room for a ball.
+    """
+    times_s, motions, paths = _instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
+    for k, name in enumerate(settings.worn):
+        for draw in range(DRAWS):
+            seed = settings.seed + NEXT_SEED * (k + 8 * draw)
+            motion = motion_of(settings.model_copy(update={"seed": seed}))
+            path = motion.path(times_s, -1)
+            if all(bool(((path - other).norm(dim=-1) >= settings.diameter_mm).all()) for other in paths):
+                break
+        else:
+            expected = f"room for {settings.balls} of {settings.diameter_mm:g} mm in all {settings.frames} frames"
+            got, do = f"none for ball {name}", "raise volume_mm, or lower balls, frames or diameter_mm"
+            raise SettingsError(refusal("balls", expected=expected, got=got, do=do))
+        motions[name] = motion
+        paths.append(path)
+    return motions
+
+
 def motion_of(settings: SynthSettings) -> RandomMotion:
-    """Draw the motion of a synthetic experiment."""
+    """Draw the motion of the first ball of a synthetic experiment."""
     motion = random_motion(
         settings.velocity_rms,
         settings.velocity_time,
@@ -126,31 +172,46 @@ def motion_of(settings: SynthSettings) -> RandomMotion:
     return without_seam(motion, settings.frames / settings.frame_rate) if settings.periodic else motion
 
 
+def _texture_file(settings: SynthSettings, paint: int) -> str:
+    return "texture.png" if settings.balls == 1 else f"texture_{paint}.png"
+
+
 def _as_file(texture: Tensor) -> NDArray[np.uint8]:
     grey: NDArray[np.uint8] = np.rint(texture.numpy() * 255).astype(np.uint8)
     return grey
 
 
 def _frames(
-    scene: RenderedScene, filming: Filming, name: str, rng: np.random.Generator, progress: Callable[[int], None]
+    filmed: Sequence[tuple[RenderedScene, Motion6D]],
+    filming: Filming,
+    name: str,
+    rng: np.random.Generator,
+    progress: Callable[[int], None],
 ) -> Iterator[NDArray[np.uint8]]:
-    settings = scene.settings
-    count = settings.exposure_samples
-    within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
-    now = motion_of(settings).at((frame_times_s(settings)[:, None] + within).reshape(-1))
+    settings, count = filming.settings, filming.settings.exposure_samples
+    scenes = [scene for scene, _ in filmed]
+    position = torch.stack([poses.position_lab_mm for _, poses in filmed])
+    R_lab_body = torch.stack([poses.R_lab_body for _, poses in filmed])
     lost = filming.lost(name, settings.frames)
     for k in range(settings.frames):
-        position, R_lab_body = (x[k * count : (k + 1) * count] for x in (now.position_lab_mm, now.R_lab_body))
-        picture, cover = expose(scene, filming.cameras[name], position, R_lab_body)
-        # Lost frames draw noise too: the other frames do not depend on losses.
-        disk = filming.disk(name, position.mean(0), cover)
+        X, R = (x[:, k * count : (k + 1) * count] for x in (position, R_lab_body))
+        picture, cover = expose_several(scenes, filming.cameras[name], X, R)
+        # Lost frames draw noise too: the other frames do not depend on losses. Of several balls only the cover counts.
+        disk = filming.disk(name, X[0].mean(0), cover)
         frame = digitise(filming.picture(picture, disk, name, k), settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
         progress(1)
 
 
-def write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
-    """Write truth.h5 (docs/data-format.md)."""
+def write_truth(path: Path, truths: Mapping[str, Motion6D], cameras: Mapping[str, Camera]) -> None:
+    """Write truth.h5 (docs/data-format.md) of balls by name; the name of an only one is empty."""
+    with whole_hdf5(path) as file:
+        for name, truth in truths.items():
+            for key, value in _true_values(truth, cameras).items():
+                file.create_dataset(f"spheres/{name}/{key}" if name else key, data=value.numpy())
+
+
+def _true_values(truth: Motion6D, cameras: Mapping[str, Camera]) -> dict[str, Tensor]:
     body = truth.R_lab_body.mT
     data = {
         "time": truth.time_s,
@@ -163,17 +224,15 @@ def write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> N
         "omega_body": (body @ truth.omega_lab_rad_s[..., None])[..., 0],
         "alpha_body": (body @ truth.alpha_lab_rad_s2[..., None])[..., 0],
     }
-    data |= {f"{name}/centre_px": camera.project(truth.position_lab_mm) for name, camera in cameras.items()}
-    with whole_hdf5(path) as file:
-        for key, value in data.items():
-            file.create_dataset(key, data=value.numpy())
+    return data | {f"{name}/centre_px": camera.project(truth.position_lab_mm) for name, camera in cameras.items()}
 
 
 def _experiment(filming: Filming) -> dict[str, Any]:
     settings = filming.settings
     too_large = filming.values.get("radius_error", 0.0) / (settings.diameter_px / 2)  # share, at the rim of the picture
     document = experiment_document(settings, filming.cameras)
-    document["sphere"]["diameter"] *= 1 + too_large
+    for sphere in document.get("spheres", {"": document.get("sphere")}).values():
+        sphere["diameter"] *= 1 + too_large
     return document
 
 
@@ -182,12 +241,16 @@ def experiment_document(settings: SynthSettings, cameras: Iterable[str], suffix:
     # exposure 0 is left out: the key must be above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     names = list(cameras)
+    spheres = {
+        name: {"diameter": settings.diameter_mm, "texture": _texture_file(settings, k)}
+        for name, k in settings.worn.items()
+    }
     return {
         "schema": "sphereorient-experiment/1",
         "name": settings.name,
         "frame_rate": settings.frame_rate,
         **exposure,
-        "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
+        **({"sphere": spheres[""]} if "" in spheres else {"spheres": spheres}),
         "cameras": "cameras.yaml",
         "backgrounds": {name: f"empty_{name}.png" for name in names},
         "movies": {name: f"{name}{suffix}" for name in names},

@@ -218,7 +218,7 @@ def never(experiment: Path) -> Trajectory:
 
 def test_what_a_method_refuses_is_an_outcome(tmp_path):
     (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), frames=12, together=0))
-    found = track_scene(tmp_path / "experiment.yaml", scene, "never", never)
+    (found,) = track_scene(tmp_path / "experiment.yaml", scene, "never", never)
     assert found.refused.startswith("movies: expected a ball")
     assert found.lost == 12
 
@@ -362,5 +362,5 @@ def test_the_figure_shows_the_hardest_first_and_all_methods(tmp_path):
     assert "wrong" in below.get_ylabel()
     page = markdown(whole)
     assert "| defocus | 0.7 px of sigma | 0.02, 0.02; 0, 0 | 1.5, 1.5; 0, 0 |" in page
-    write_table(whole, tmp_path / "results.csv")
+    write_table([whole], tmp_path / "results.csv")
     assert (tmp_path / "results.csv").read_text().count("\n") == 5

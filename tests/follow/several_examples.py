@@ -67,7 +67,7 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several
                     camera,
                     torch.stack([place[ball][k : k + 1] for ball in balls]),
                     torch.stack([R[ball][k : k + 1] for ball in balls]),
-                ),
+                )[0],
                 settings,
                 rng,
             )

@@ -20,14 +20,14 @@ LEAST_RATIO = 1.1  # of the median errors; less is no change
 LEAST_FRAMES = 0.02  # of wrong or lost frames; less is no change
 BLOCK = 4  # frames: errors of neighbours are correlated
 DRAWS, SEED = 400, 2011
-SAME_PLAN = ("frames", "at_once", "degradations")  # settings that make scenes of one name equal
+MORE_OR_FEWER = {"levels", "seeds", "together"}  # settings by which scenes of one name do not differ
 Floats = NDArray[np.float64]
 Key = tuple[str, int, str]  # kind, level, method
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneResult:
-    """One method on one scene; made by `track_scene`, kept as JSON. None: not measured."""
+    """One method on one ball of a scene; made by `track_scene`, kept as JSON. None: not measured."""
 
     scene: str
     kind: str
@@ -47,6 +47,10 @@ class SceneResult:
     inside: int  # of these, with the truth inside the 95 % region
     seconds: float
     over_stated: float | None = None  # rms of these frames' errors over their stated sigmas; None: of an older version
+    ball: str = ""  # its name; empty: the only one
+    given: int = 0  # frames in which its position is that of another ball
+    exchanges: int = 0  # how often the ball changes whose position it is
+    hidden: float = 0.0  # share of its pictures that nearer balls hide by more than half
 
     @property
     def key(self) -> Key:
@@ -96,6 +100,7 @@ class ResultSummary:
     p95_deg: float
     largest_deg: float
     p50_mm: float
+    p95_mm: float
     wrong_before: float  # share of the looks without a best candidate within 10 degrees of the truth
     wrong_after: float  # share of the frames
     lost: float  # share of the frames without an orientation
@@ -104,6 +109,9 @@ class ResultSummary:
     over_stated: float  # rms of the errors over the stated sigmas; NaN: not measured
     frames_per_s: float
     refused: str  # message of the first scene that the method refused
+    given: float = 0.0  # share of the frames given to another ball
+    exchanges: int = 0
+    hidden: float = 0.0  # share of the pictures of balls hidden by more than half
 
 
 def summaries(results: Results) -> list[ResultSummary]:
@@ -123,17 +131,19 @@ def summarised(group: Sequence[SceneResult]) -> ResultSummary:
     told = [(one.stated, one.over_stated) for one in group if one.over_stated is not None]
     squares = sum(count * over**2 for count, over in told)
     p50, p95, largest = np.percentile(seen, (50, 95, 100)) if len(seen) else (np.nan,) * 3
+    p50_mm, p95_mm = np.percentile(distances_mm, (50, 95)) if len(distances_mm) else (np.nan,) * 2
     kind, level, method = group[0].key
     return ResultSummary(
         kind=kind,
         level=level,
         method=method,
-        scenes=len(group),
+        scenes=len({one.scene for one in group}),
         frames=frames,
         p50_deg=float(p50),
         p95_deg=float(p95),
         largest_deg=float(largest),
-        p50_mm=float(np.median(distances_mm)) if len(distances_mm) else float("nan"),
+        p50_mm=float(p50_mm),
+        p95_mm=float(p95_mm),
         wrong_before=sum(one.looks_wrong for one in group) / max(looks, 1),
         wrong_after=sum(one.wrong for one in group) / max(frames, 1),
         lost=sum(one.lost for one in group) / max(frames, 1),
@@ -142,6 +152,9 @@ def summarised(group: Sequence[SceneResult]) -> ResultSummary:
         over_stated=math.sqrt(squares / sum(count for count, _ in told)) if told else float("nan"),
         frames_per_s=frames / max(sum(one.seconds for one in group), 1e-9),
         refused=next((one.refused for one in group if one.refused), ""),
+        given=sum(one.given for one in group) / max(frames, 1),
+        exchanges=sum(one.exchanges for one in group),
+        hidden=sum(one.hidden for one in group) / len(group),
     )
 
 
@@ -206,11 +219,12 @@ class Change:
 
 def compare_runs(now: Results, baseline: Results) -> list[Change]:
     """Compare the scenes and methods that two runs have in common; raise BenchError if there are none."""
-    same = all(getattr(now.settings, key) == getattr(baseline.settings, key) for key in SAME_PLAN)
-    known = {(one.scene, one.method): one for one in baseline.outcomes if same}
+    plans = [run.settings.model_dump(exclude=MORE_OR_FEWER) for run in (now, baseline)]
+    same = plans[0] == plans[1]
+    known = {(one.scene, one.ball, one.method): one for one in baseline.outcomes if same}
     groups: dict[Key, list[tuple[SceneResult, SceneResult]]] = {}
     for one in now.outcomes:
-        if (before := known.get((one.scene, one.method))) is not None and before.frames == one.frames:
+        if (before := known.get((one.scene, one.ball, one.method))) is not None and before.frames == one.frames:
             groups.setdefault(one.key, []).append((before, one))
     if not groups:
         do = "run the benchmark with the baseline's settings"

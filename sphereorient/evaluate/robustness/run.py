@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +20,28 @@ from pydantic import TypeAdapter
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
-from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
+from sphereorient.evaluate.score import (
+    distance_deg,
+    given_to_others,
+    hidden_shares,
+    named_as_true,
+    score_track,
+    true_orientations,
+)
+from sphereorient.experiment import load_experiment
 from sphereorient.files.cache import WITHOUT
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
 from sphereorient.run.stages import track_movies
-from sphereorient.trajectory import CameraTrack, Tracks, Trajectory, one_track
+from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
 Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]
 PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
 DIGITS = 5
+MOSTLY = 0.5  # share of a disk from which it counts as hidden
 Floats = NDArray[np.float64]
 TRACKERS: dict[str, Tracker] = {
     "precise": partial(track_movies, method="precise", settings=Settings()),
@@ -79,10 +89,30 @@ def run_benchmark(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    outcomes = [kept_result(_path(folder, scene, name)) for scene in scenes for name in chosen]
+    outcomes = [one for scene in scenes for name in chosen for one in kept_results(_path(folder, scene, name))]
     results = Results(settings=settings, versions=versions(), outcomes=outcomes)
     save_results(results, folder / RESULTS)
     return results
+
+
+def run_benchmarks(
+    folder: Path,
+    plans: Mapping[str, BenchSettings],
+    trackers: Mapping[str, Tracker],
+    *,
+    jobs: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> list[Results]:
+    """Run plans one after the other, each in a folder of its name; `progress` gets the scenes of all."""
+    counts = [len(scenes_of(plan)) for plan in plans.values()]
+    found = []
+    for before, (name, plan) in zip(accumulate(counts, initial=0), plans.items(), strict=False):
+
+        def of_all(done: int, _: int, before: int = before) -> None:
+            progress(before + done, sum(counts))
+
+        found.append(run_benchmark(folder / name, plan, trackers, jobs=jobs, progress=of_all))
+    return found
 
 
 def limit_threads() -> None:
@@ -114,10 +144,10 @@ def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker
     return {name: tracker for name, tracker in trackers.items() if not _path(folder, scene, name).exists()}
 
 
-def kept_result(path: Path) -> SceneResult:
-    """Read the result of a scene; raise BenchError if the file is damaged."""
+def kept_results(path: Path) -> list[SceneResult]:
+    """Read the results of a scene; raise BenchError if the file is damaged."""
     try:
-        return TypeAdapter(SceneResult).validate_json(path.read_bytes())
+        return TypeAdapter(list[SceneResult]).validate_json(path.read_bytes())
     except (OSError, ValueError):
         do = "delete the file and run again"
         raise BenchError(refusal(str(path), expected="the result of a scene", got="something else", do=do)) from None
@@ -128,37 +158,52 @@ def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracke
     with tempfile.TemporaryDirectory(prefix="scene") as rendered:
         experiment = write_scene(Path(rendered), scene)
         for name, tracker in trackers.items():
-            result = track_scene(experiment, scene, name, tracker)
-            write_text(_path(folder, scene, name), json.dumps(asdict(result), separators=(",", ":")))
+            found = [asdict(one) for one in track_scene(experiment, scene, name, tracker)]
+            write_text(_path(folder, scene, name), json.dumps(found, separators=(",", ":")))
 
 
-def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: Tracker) -> SceneResult:
-    """Track a scene and measure the track; a refusal of the method is a result too."""
+def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: Tracker) -> list[SceneResult]:
+    """Track a scene and measure the track of each ball; a refusal of the method is a result too."""
     begin = time.perf_counter()
+    balls, truth_path = scene.base.worn, experiment.parent / "truth.h5"
     try:
-        track = one_track(tracker(experiment))
+        tracks = Tracks.of(tracker(experiment))
     except SphereOrientError as error:
-        measured = no_track(scene.frames, " ".join(str(error).split()))
         seconds = time.perf_counter() - begin
+        measured = dict.fromkeys(balls, no_track(scene.frames, " ".join(str(error).split())))
     else:
         seconds = time.perf_counter() - begin
-        measured = measure(track, experiment.parent / "truth.h5")
-    return SceneResult(
-        scene=scene.name,
-        kind=scene.kind,
-        level=scene.level,
-        seed=scene.seed,
-        degradations=dict(scene.degradations),
-        method=method,
-        seconds=round(seconds, 2),
-        **measured,
-    )
+        for paint in set(balls.values()) if len(balls) > 1 else ():
+            tracks = named_as_true(tracks, truth_path, [name for name in balls if balls[name] == paint])
+        measured = {name: measure(tracks[name], truth_path) for name in balls}
+        if len(balls) > 1:
+            for name, (given, exchanges) in given_to_others(tracks, truth_path).items():
+                measured[name] |= {"given": given, "exchanges": exchanges}
+    hidden = dict.fromkeys(balls, np.zeros(1))
+    if len(balls) > 1:
+        radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)
+        hidden = hidden_shares(truth_path, load_experiment(experiment).cameras, radii_mm)
+    return [
+        SceneResult(
+            scene=scene.name,
+            kind=scene.kind,
+            level=scene.level,
+            seed=scene.seed,
+            degradations=dict(scene.degradations),
+            method=method,
+            seconds=round(seconds / len(balls), 2),
+            ball=name,
+            hidden=round(float((hidden[name] > MOSTLY).mean()), DIGITS),
+            **measured[name],
+        )
+        for name in balls
+    ]
 
 
 def measure(track: Trajectory, truth_path: Path) -> dict[str, Any]:
     """Return the measured fields of `SceneResult`."""
     score = score_track(track, truth_path)
-    R_true = true_orientations(truth_path, track.time)
+    R_true = true_orientations(truth_path, track.time, track.sphere)
     ranks = np.concatenate([_ranks(seen, R_true) for seen in track.cameras.values()] or [np.zeros(0)])
     inside, stated = score.inside()
     orientation, position, confidence = (

@@ -1,3 +1,4 @@
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,11 +9,14 @@ from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.synth import write_degraded
+from sphereorient.synth.degrade import OF_ONE_BALL
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, LEVELS, degradation
 
 CLEAN, TOGETHER = "clean", "together"
-SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of the ball's volume: small, for speed
+SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of an only ball's volume: small, for speed
+VELOCITY_S = 0.12  # correlation time of the velocity
+MM3_PER_LITRE = 1e6
 MIXED_SEED = 20110  # of the random combinations
 
 
@@ -28,6 +32,15 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
     at_once: int = Field(3, ge=2, description="number of these degradations, drawn by the seed")
     frames: int = Field(24, ge=12, description="of each movie")
     cameras: int = Field(2, ge=1, le=4, description="of each scene")
+    balls: int = Field(1, ge=1, le=8, description="of each scene")
+    paints: int = Field(8, ge=1, le=8, description="of several balls; fewer than balls: some look alike")
+    volume_mm: float = Field(VOLUME_MM, gt=0, le=45, description="balls stay within about this distance of the origin")
+    velocity_time: float = Field(VELOCITY_S, gt=0, description="correlation time of the velocity, s; shorter: faster")
+
+    @property
+    def per_litre(self) -> float:
+        """Number density of the balls in the sphere of radius `volume_mm`."""
+        return self.balls / (4 / 3 * math.pi * self.volume_mm**3) * MM3_PER_LITRE
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -37,6 +50,9 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
             if level not in LEVELS:
                 expected, do = f"levels {LEVELS[0]} .. {LEVELS[-1]}", "choose among these"
                 raise SettingsError(refusal("levels", expected=expected, got=str(level), do=do))
+        if self.balls > 1 and (wrong := [name for name in self.degradations if name in OF_ONE_BALL]):
+            expected, do = "those that several balls can have", "leave these out"
+            raise SettingsError(refusal("degradations", expected=expected, got=", ".join(wrong), do=do))
         if not self.levels or not self.seeds:
             raise SettingsError(refusal("levels and seeds", expected="one at least", got="none", do="name some"))
         return self
@@ -56,11 +72,30 @@ class BenchmarkScene:
     degradations: Mapping[str, int]  # level by name
     frames: int
     cameras: int = 2
+    balls: int = 1
+    paints: int = 8
+    volume_mm: float = VOLUME_MM
+    velocity_time: float = VELOCITY_S
 
     @property
     def name(self) -> str:
         """Name of the scene's folder."""
         return f"{self.kind}-{self.level}-{self.seed}-{self.number}"
+
+    @property
+    def base(self) -> SynthSettings:
+        """Settings of the movie, before the degradations."""
+        return SynthSettings(
+            name=self.name,
+            frames=self.frames,
+            cameras=self.cameras,
+            balls=self.balls,
+            paints=self.paints,
+            image_size=(SIDE_PX, SIDE_PX),
+            volume_mm=self.volume_mm,
+            velocity_time=self.velocity_time,
+            seed=self.seed,
+        )
 
 
 def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
@@ -74,6 +109,10 @@ def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
             degradations=mixed,
             frames=settings.frames,
             cameras=settings.cameras,
+            balls=settings.balls,
+            paints=settings.paints,
+            volume_mm=settings.volume_mm,
+            velocity_time=settings.velocity_time,
         )
         for seed in settings.seeds
         for kind, level, number, mixed in _of_seed(settings, seed)
@@ -95,12 +134,4 @@ def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int
 
 def write_scene(folder: Path, scene: BenchmarkScene) -> Path:
     """Render a scene into a folder, with truth.h5 (docs/data-format.md); return the path of experiment.yaml."""
-    base = SynthSettings(
-        name=scene.name,
-        frames=scene.frames,
-        cameras=scene.cameras,
-        image_size=(SIDE_PX, SIDE_PX),
-        volume_mm=VOLUME_MM,
-        seed=scene.seed,
-    )
-    return write_degraded(folder, base, scene.degradations)
+    return write_degraded(folder, scene.base, scene.degradations)
