@@ -21,6 +21,7 @@ MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
 FREE = 4  # least frames in which no sphere covers a pixel, to measure it
 LOUD = 5.0  # times the typical noise: a sphere passes
+CHANGING = 0.3  # share of loud pixels about one that belongs to a sphere that turns
 EVEN_DIAMETERS, EVEN_DIAMETER_PX = 2.2, 12.5  # side of the square of `even_scene`; diameter to which it is reduced
 FEW = 10  # frames; with fewer, all pixels get the same noise
 LIT_NOISES = 10.0  # a lit background pixel is this many noise sigmas above black
@@ -100,9 +101,10 @@ def even_scene(background: Background, diameter_px: float) -> Background:
     return replace(background, mean=even * np.float32((high - low) / 255) + np.float32(low), noise=noise)
 
 
-def filled(background: Background, even: Background, covered: NDArray[np.bool_]) -> Background:
+def filled(background: Background, even: Background, covered: NDArray[np.bool_], diameter_px: float) -> Background:
     """Return a background with the even scene where spheres that turn cover pixels in nearly all frames (n, H, W)."""
-    changes = background.noise > LOUD * background.typical_noise  # what stands still belongs to the scene
+    loud = (background.noise > LOUD * background.typical_noise).astype(np.float32)
+    changes = cv2.blur(loud, (int(diameter_px / 2) | 1,) * 2) > CHANGING  # what stands still belongs to the scene
     never = (len(covered) - covered.sum(0) < FREE) & changes
     mean, noise = (
         np.where(never, getattr(even, part), getattr(background, part)).astype(np.float32) for part in ("mean", "noise")

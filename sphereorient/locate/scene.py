@@ -122,7 +122,7 @@ def learn_background(
     if len(sizes) > 1:  # where spheres dwell, they are the mean, and the noise that hides them
         even = even_scene(first, max(sizes))
         covered, _ = _covered(pictures, even, sizes, settings)
-        first = filled(first, even, covered)
+        first = filled(first, even, covered, max(sizes))
         background = without_ball(first, pictures, covered)
     for _ in range(ROUNDS):
         covered, found = _covered(pictures, background, sizes, settings)
