@@ -94,7 +94,7 @@ def even_scene(background: Background, diameter_px: float) -> Background:
     size = (max(1, round(mean.shape[1] / shrink)), max(1, round(mean.shape[0] / shrink)))
     small = cv2.resize((mean - low) * (255 / (high - low)), size, interpolation=cv2.INTER_AREA)
     side = int(EVEN_DIAMETERS * diameter_px / shrink) | 1
-    wide = cv2.copyMakeBorder(np.rint(small).astype(np.uint8), *[side // 2] * 4, cv2.BORDER_REFLECT)
+    wide = np.pad(np.rint(small).astype(np.uint8), side // 2, mode="symmetric")
     middle = cv2.medianBlur(wide, side)[side // 2 :, side // 2 :][: size[1], : size[0]]
     even = cv2.resize(middle.astype(np.float32), mean.shape[::-1], interpolation=cv2.INTER_LINEAR)
     noise = np.full_like(background.noise, background.typical_noise)
