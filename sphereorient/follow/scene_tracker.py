@@ -2,16 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.files.threads import side_by_side
-from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.follow.scene_start import SceneStart
-from sphereorient.follow.tracker import ChunkTracker, _Chunk, _Expected
+from sphereorient.follow.scene_start import Ahead, SceneStart
+from sphereorient.follow.tracker import MOVE_SHARE, ChunkTracker, Floats, _Chunk, _Expected, supported
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.trajectory import Reason
@@ -58,7 +60,62 @@ class SceneTracker:
                 for chunk, one, turn in zip(own, poses, tracker.turns(own, poses), strict=True):
                     chunk.saw(chunk.first + k, one, turn)
             found |= {firsts[n] + k: row for n, row in zip(now, here, strict=True)}
+        self._follow_back(shots, [range(k, k + length) for k, length in zip(firsts, batch, strict=True)], time_s, found)
         yield from (found[k] for k in range(sum(batch)))
+
+    def _follow_back(
+        self,
+        shots: Sequence[Sequence[Frame]],
+        spans: Sequence[range],
+        time_s: Sequence[float],
+        found: dict[int, dict[str, Poses]],
+    ) -> None:
+        """Follow each ball of a chunk that was lost and found again back from there, and put its poses into `found`.
+        Where it does not arrive at the pose from which it was lost, two balls may have been taken for one: then a frame
+        between them stays without a pose.
+        """
+        spans = [span for span in spans if any(_regained(name, span, found) for name in self.balls)]
+        mirrored = {-k: -time for k, time in enumerate(time_s)}  # the same motion, from the last frame to the first
+        chunks = {name: [_Chunk(1 - span.stop, 1 - span.start, mirrored) for span in spans] for name in self.balls}
+        lost: dict[tuple[str, int], Poses] = {}  # what was found at first, where that has changed
+        for k in range(max(map(len, spans), default=0)):
+            now = [n for n, span in enumerate(spans) if k < len(span)]
+            numbers = [spans[n].stop - 1 - k for n in now]
+            ahead = {
+                name: [tracker.ahead(chunks[name][n], -number) for n, number in zip(now, numbers, strict=True)]
+                for name, tracker in self.balls.items()
+            }
+            places = [
+                {
+                    name: place
+                    for name, poses in found[number].items()
+                    if (place := _place(poses, ahead[name][row])) is not None
+                }
+                for row, number in enumerate(numbers)
+            ]
+            wanted = {
+                name: [
+                    one if not supported(found[number][name]) or (name, number + 1) in lost else None
+                    for one, number in zip(of_ball, numbers, strict=True)
+                ]
+                for name, of_ball in ahead.items()
+            }
+            frames = [[movie[number] for movie in shots] for number in numbers]
+            followed = self._followed(wanted, places, frames, [True] * len(now))
+            for name, tracker in self.balls.items():
+                for n, number, row in zip(now, numbers, followed, strict=True):
+                    poses, was, chunk = row[name], found[number][name], chunks[name][n]
+                    if supported(was):
+                        if (name, number + 1) in lost and not (poses is not None and _same(poses, was, tracker)):
+                            found[number + 1] |= {name: lost[name, number + 1]}
+                            chunk.forget()
+                    elif poses is not None:
+                        lost[name, number] = was
+                        found[number] |= {name: tracker.stated(poses)}
+                own = [chunks[name][n] for n in now]
+                here = [found[number][name] for number in numbers]
+                for chunk, number, one, turn in zip(own, numbers, here, tracker.turns(own, here), strict=True):
+                    chunk.saw(-number, one, turn)
 
     def _step(
         self, chunks: Mapping[str, Sequence[_Chunk]], k: int, frames: Sequence[Sequence[Frame]]
@@ -83,7 +140,15 @@ class SceneTracker:
             ]
             again = self._followed(ahead, at, frames, rough)
             found = [again[n] if unsure else row for n, (unsure, row) in enumerate(zip(rough, found, strict=True))]
-        rows = list(zip(found, known, frames, strict=True))
+        past = [
+            {
+                name: before
+                for name, poses in row.items()
+                if poses is None and (before := _extrapolated(chunks[name][n], chunks[name][n].first + k)) is not None
+            }
+            for n, row in enumerate(found)
+        ]
+        rows = list(zip(found, known, frames, past, strict=True))
         whole = all(poses is not None for row in found for poses in row.values())
         return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
 
@@ -104,16 +169,17 @@ class SceneTracker:
         return found
 
     def _completed(
-        self, frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame]]
+        self,
+        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead]],
     ) -> dict[str, Poses]:
         """Return the poses of all balls of a frame: those followed, and those that a search finds."""
-        followed, known, shots = frame
+        followed, known, shots, past = frame
         done = {name: poses for name, poses in followed.items() if poses is not None}
         lost = [name for name in self.balls if name not in done]
         if not lost:
             return {name: self.balls[name].stated(poses) for name, poses in done.items()}
         places = {name: _found_place(poses, known.get(name)) for name, poses in done.items()}
-        there = self.start(shots, lost, {name: place.position_lab_mm for name, place in places.items()})
+        there = self.start(shots, lost, {name: place.position_lab_mm for name, place in places.items()}, past)
         places |= {name: _found_place(poses, None) for name, poses in there.items() if len(poses)}
         for name in lost:
             poses = there.get(name)
@@ -152,6 +218,58 @@ def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, _Place]) ->
         radius_mm=torch.tensor([list(radius_mm.values())], dtype=torch.float64),
         move_mm=torch.stack([one.move_mm for one in there])[None],
     )
+
+
+def _extrapolated(chunk: _Chunk, frame: int) -> Ahead | None:
+    """Return what the last poses of a chunk say of a later frame: a motion of one order less, that of the last two of
+    three poses, is within the error. None of a single pose.
+    """
+    if len(chunk.past) < 2:
+        return None
+    time_s = np.array([chunk.time_s[number] for number, _ in chunk.past])
+    poses = [one for _, one in chunk.past]
+    weight, lower = (_weights(time_s[k:], chunk.time_s[frame]) for k in (0, 1))
+    last = poses[-1].R_lab_body[0]
+    X = torch.stack([one.position_lab_mm[0] for one in poses])
+    turn = so3.log(torch.stack([one.R_lab_body[0] for one in poses]) @ last.mT)
+    path = torch.cat([turn, X], 1)
+    ahead = weight @ path
+    other = lower @ path[1:] - ahead
+    spread = sum(w * w * one.covariance[0] for w, one in zip(weight.tolist(), poses, strict=True))
+    apart = torch.stack([other[:3].square().sum(), other[3:].square().sum()]).repeat_interleave(3)
+    return Ahead(
+        position_lab_mm=ahead[3:],
+        R_lab_body=so3.exp(ahead[:3]) @ last,
+        covariance=spread + torch.diag(apart),
+    )
+
+
+def _weights(time_s: Floats, at_s: float) -> Tensor:
+    """Return the weights by which the polynomial through values at some times has its value at another one."""
+    apart = time_s[:, None] - time_s
+    np.fill_diagonal(apart, 1.0)
+    share = (at_s - time_s[None]) / apart
+    np.fill_diagonal(share, 1.0)
+    return torch.from_numpy(share.prod(1))
+
+
+def _regained(name: str, span: range, found: Mapping[int, Mapping[str, Poses]]) -> bool:
+    """Return whether a ball is found in a frame of a chunk after one in which it is not."""
+    seen = [supported(found[k][name]) for k in span]
+    return any(now and not before for before, now in pairwise(seen))
+
+
+def _same(one: Poses, other: Poses, tracker: ChunkTracker) -> bool:
+    """Return whether the best poses of a frame are the same, but for their errors."""
+    turn = so3.geodesic_distance(one.R_lab_body[0], other.R_lab_body[0])
+    move = (one.position_lab_mm[0] - other.position_lab_mm[0]).norm()
+    return bool(turn < DISTINCT_RAD) and bool(move < MOVE_SHARE * tracker.fitter.radius_mm)
+
+
+def _place(poses: Poses, expected: _Expected | None) -> _Place | None:
+    """Return where a ball is in a frame, or is expected."""
+    before = None if expected is None else _expected_place(expected)
+    return _found_place(poses, before) if supported(poses) else before
 
 
 def _expected_place(one: _Expected) -> _Place:

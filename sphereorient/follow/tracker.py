@@ -123,6 +123,11 @@ class _Chunk:
                 self.turns.append(turn)
             self.past.append((frame, poses))
 
+    def forget(self) -> None:
+        """Forget all poses: what comes is another motion."""
+        self.past.clear()
+        self.turns.clear()
+
 
 def supported(poses: Poses) -> bool:
     """Return whether a picture supports the best pose of a frame."""
@@ -499,7 +504,7 @@ class OnlineTracker:
         or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
         """
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
-            self._forget()
+            self._chunk.forget()
         self._time_s[self._number] = time_s
         tracker, ahead = self._tracker, self._tracker.ahead(self._chunk, self._number)
         (followed,) = [None] if ahead is None else tracker.follow([ahead], [shots])
@@ -515,13 +520,9 @@ class OnlineTracker:
         if followed is not None:
             return followed, False
         poses = self._tracker.stated(self._tracker._search(shots))
-        self._forget()  # what was before says nothing of the motion from here
+        self._chunk.forget()  # what was before says nothing of the motion from here
         self._saw(poses)
         return poses, True
-
-    def _forget(self) -> None:
-        self._chunk.past.clear()
-        self._chunk.turns.clear()
 
     def _saw(self, poses: Poses) -> None:
         self._chunk.saw(self._number, poses, self._tracker.turns([self._chunk], [poses])[0])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,10 @@ Picture = NDArray[Any]
 # than 1 - share, the sphere in fewer. Given scene: a tenth of the frames shows it where the sphere stays long.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
+FREE = 4  # least frames in which no sphere covers a pixel, to measure it
+LOUD = 5.0  # times the typical noise: a sphere passes
+CHANGING = 0.3  # share of loud pixels about one that belongs to a sphere that turns
+EVEN_DIAMETERS, EVEN_DIAMETER_PX = 2.2, 12.5  # side of the square of `even_scene`; diameter to which it is reduced
 FEW = 10  # frames; with fewer, all pixels get the same noise
 LIT_NOISES = 10.0  # a lit background pixel is this many noise sigmas above black
 LIT_SHARE = 0.1  # least share of lit pixels; in a darker scene a failed lamp is invisible
@@ -79,10 +84,38 @@ def _full_scale(pictures: NDArray[Any]) -> float:
     return float(next(2**bits - 1 for bits in (10, 12, 14, 16) if brightest < 2**bits))
 
 
+def even_scene(background: Background, diameter_px: float) -> Background:
+    """Return a background in which no sphere shows, even one that never leaves its pixels, but no detail either: the
+    median about each pixel, over a few diameters.
+    """
+    mean = background.mean
+    low, high = float(mean.min()), max(float(mean.max()), float(mean.min()) + 1.0)
+    shrink = max(1.0, diameter_px / EVEN_DIAMETER_PX)
+    size = (max(1, round(mean.shape[1] / shrink)), max(1, round(mean.shape[0] / shrink)))
+    small = cv2.resize((mean - low) * (255 / (high - low)), size, interpolation=cv2.INTER_AREA)
+    side = int(EVEN_DIAMETERS * diameter_px / shrink) | 1
+    wide = np.pad(np.rint(small).astype(np.uint8), side // 2, mode="symmetric")
+    middle = cv2.medianBlur(wide, side)[side // 2 :, side // 2 :][: size[1], : size[0]]
+    even = cv2.resize(middle.astype(np.float32), mean.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    noise = np.full_like(background.noise, background.typical_noise)
+    return replace(background, mean=even * np.float32((high - low) / 255) + np.float32(low), noise=noise)
+
+
+def filled(background: Background, even: Background, covered: NDArray[np.bool_], diameter_px: float) -> Background:
+    """Return a background with the even scene where spheres that turn cover pixels in nearly all frames (n, H, W)."""
+    loud = (background.noise > LOUD * background.typical_noise).astype(np.float32)
+    changes = cv2.blur(loud, (int(diameter_px / 2) | 1,) * 2) > CHANGING  # what stands still belongs to the scene
+    never = (len(covered) - covered.sum(0) < FREE) & changes
+    mean, noise = (
+        np.where(never, getattr(even, part), getattr(background, part)).astype(np.float32) for part in ("mean", "noise")
+    )
+    return replace(background, mean=mean, noise=noise)
+
+
 def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:
-    """Measure the pixels `covered` (n, H, W) again from the other frames; with under four they keep their values."""
+    """Measure the pixels `covered` (n, H, W) again from the other frames; with under `FREE` they keep their values."""
     free = len(pictures) - covered.sum(axis=0)
-    again = (free < len(pictures)) & (free >= 4)
+    again = (free < len(pictures)) & (free >= FREE)
     values = pictures[:, again].astype(np.float32)
     values[covered[:, again]] = np.nan
     mean, noise = background.mean.copy(), background.noise.copy()

@@ -11,7 +11,7 @@ from sphereorient.cameras import Camera, nearest_point
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
-from sphereorient.locate.background import Background, measure_background, without_ball
+from sphereorient.locate.background import LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
@@ -19,8 +19,7 @@ from sphereorient.locate.sightings import find_ball
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
-LOUD, LOUD_SHARE = 5.0, 0.1  # times the typical noise; share of such pixels in the disk that triggers `_quieter`
-NOISIEST = 4.0  # times the typical noise
+LOUD_SHARE = 0.1  # share of loud pixels in the disk that triggers `_quieter`
 CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in sigmas
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
@@ -120,9 +119,11 @@ def learn_background(
     if empty is not None:
         return _quieter(background, pictures, sizes, settings)
     first, before = background, 0
-    if len(sizes) > 1:  # where spheres dwell, they are the noise that hides them
-        quiet = replace(first, noise=np.minimum(first.noise, NOISIEST * first.typical_noise))
-        background = without_ball(first, pictures, _covered(pictures, quiet, sizes, settings)[0])
+    if len(sizes) > 1:  # where spheres dwell, they are the mean, and the noise that hides them
+        even = even_scene(first, max(sizes))
+        covered, _ = _covered(pictures, even, sizes, settings)
+        first = filled(first, even, covered, max(sizes))
+        background = without_ball(first, pictures, covered)
     for _ in range(ROUNDS):
         covered, found = _covered(pictures, background, sizes, settings)
         background = without_ball(first, pictures, covered)

@@ -13,7 +13,7 @@ from sphereorient import so3
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.locate import screened_frames
-from sphereorient.methods import precise
+from sphereorient.methods import precise, several
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import load_settings
 from sphereorient.run.stages import run
@@ -92,6 +92,68 @@ def test_a_cut_run_goes_on_to_the_same_tracks(tracks, movie, tmp_path):
         assert found[name].orientation.tobytes() == track.orientation.tobytes()
 
 
+class Astray:
+    """A ball's tracker that cannot follow it into one frame."""
+
+    def __init__(self, tracker, frame):
+        self.tracker, self.frame = tracker, frame
+
+    def __getattr__(self, name):
+        return getattr(self.tracker, name)
+
+    def ahead(self, chunk, frame):
+        return None if frame == self.frame else self.tracker.ahead(chunk, frame)
+
+
+def followed_where(movie, again, exchanged=False):
+    """Poses in a chunk of 20 frames in which no motion leads from frame 7 to 8, and a search finds `a` and `c` again in
+    frame `again`.
+    """
+    learnt = load_learnt(movie.experiment.with_name("learnt.h5"))
+    with open_recording(movie.experiment) as recording, one_thread():
+        job = Job(recording=recording, settings=load_settings(None, (CHUNK,)), device=torch.device("cpu"))
+        follower = several.resume(job, learnt)
+        scene, views = follower.tracker, next(iter(follower.appearances.values())).fitter.views
+        shots = [list(screened_frames(s, v.background, 0, 20)) for s, v in zip(recording.streams, views, strict=True)]
+        number = {id(shot): k for k, shot in enumerate(shots[0])}
+
+        def start(frame, names, known, past):
+            if 0 < number[id(frame[0])] < again:
+                return {}
+            found = scene.start(frame, names, known, past)
+            return found | {"a": found["c"], "c": found["a"]} if exchanged and number[id(frame[0])] == again else found
+
+        balls = {name: tracker if name == "b" else Astray(tracker, 8) for name, tracker in scene.balls.items()}
+        return list(SceneTracker(balls, start).track(shots, [20], recording.clock.tolist()))
+
+
+def names_of(found, movie):
+    """The ball, of those alike, at the place of each pose of `a`; "" without a pose."""
+
+    def name(poses):
+        return min("ac", key=lambda ball: np.linalg.norm(poses[0] - movie.position_mm[ball][poses[1]]))
+
+    rows = [(found[k]["a"].position_lab_mm[0].numpy(), k) if len(found[k]["a"]) else None for k in range(len(found))]
+    return "".join("-" if row is None else name(row) for row in rows)
+
+
+def test_a_ball_that_is_found_late_is_followed_back_to_where_it_was_lost(tracks, movie):
+    found = followed_where(movie, again=13)
+    (first, *_) = names_of(found, movie)
+    assert names_of(found, movie) == first * 20
+    poses = [row["a"] for row in found[8:13]]
+    X = np.stack([one.position_lab_mm[0].numpy() for one in poses])
+    assert np.linalg.norm(X - movie.position_mm[first][8:13], axis=1).max() < 0.05
+    assert all(one.use.any() for one in poses)
+
+
+def test_another_ball_found_in_its_place_is_not_joined_to_it(tracks, movie):
+    names = names_of(followed_where(movie, again=13, exchanged=True), movie)
+    first, other = names[0], names[-1]
+    assert first != other
+    assert names == first * 8 + "-" + other * 11
+
+
 def test_one_ball_followed_as_a_scene_is_followed_as_ever(tmp_path):
     movie = write_several(tmp_path, "b", cameras=2)
     with open_recording(movie.experiment) as recording, one_thread():
@@ -103,7 +165,7 @@ def test_one_ball_followed_as_a_scene_is_followed_as_ever(tmp_path):
             pairs = zip(recording.streams, views, strict=True)
             return [list(screened_frames(stream, view.background)) for stream, view in pairs]
 
-        scene = SceneTracker({"": tracker}, lambda frame, names, known: {"": tracker._search(frame)})
+        scene = SceneTracker({"": tracker}, lambda frame, names, known, past: {"": tracker._search(frame)})
         times, batch = recording.clock.tolist(), [12, 12, 6]
         alone, together = list(tracker.track(shots(), batch, times)), list(scene.track(shots(), batch, times))
     for one, of_scene in zip(alone, together, strict=True):

@@ -114,6 +114,31 @@ def test_the_background_behind_two_balls_is_learnt_where_one_of_them_dwells():
     assert np.abs(one.mean - BACK).max() > 10 or one.noise.max() > 10 * NOISE
 
 
+def turning(k):
+    return lambda x, y: checker(x + 0.31 * k, y)
+
+
+def test_the_background_behind_a_ball_that_never_leaves_its_place_is_that_around_it():
+    frames = [
+        scene((turning(k), 120.0, 50.0, 16.0), (blobs, 20.0 + 4 * k, 40.0, 16.0), shape=SMALL, seed=k)
+        for k in range(15)
+    ]
+    learnt = learn_background(np.stack(frames), (32.0, 32.0), SETTINGS)
+    assert np.abs(learnt.mean - BACK).max() < 2.5
+    assert learnt.noise.max() < 3 * NOISE
+
+
+def test_a_disk_that_stands_still_stays_in_the_background():
+    still = scene((white, 120.0, 50.0, 16.0), shape=SMALL)
+    frames = [
+        scene((white, 120.0, 50.0, 16.0), (checker, 20.0 + 5 * k, 40.0, 16.0), shape=SMALL, seed=k) for k in range(15)
+    ]
+    learnt = learn_background(np.stack(frames), (32.0, 32.0), SETTINGS)
+    row, column = np.ogrid[: SMALL[0], : SMALL[1]]
+    inside = np.hypot(row - 50.0, column - 120.0) < 14
+    assert np.abs(learnt.mean - still.astype(float))[inside].mean() < 3 * NOISE
+
+
 def test_of_one_diameter_in_a_list_the_background_is_that_of_one_ball():
     frames = np.stack([scene((checker, 30.0 + 15 * k, 45.0, 16.0), shape=SMALL, seed=k) for k in range(9)])
     one, listed = (learn_background(frames, size, SETTINGS) for size in (32.0, (32.0,)))
