@@ -77,3 +77,8 @@ def pose_table(batches: Iterable[Sequence[Poses]], cameras: int) -> PoseTable:
         whole[mask] = torch.cat(flat[name])
     parts["nll"] = parts["nll"] - parts["nll"][:, :1]
     return PoseTable(mask=mask, **parts, use=torch.cat(use), reason=tuple(reason))
+
+
+def supported(poses: Poses) -> bool:
+    """Return whether a picture supports the best pose of a frame."""
+    return len(poses) > 0 and bool(poses.use.any())

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
+from sphereorient.follow.chunk import MOVE_SHARE, Chunk, Expected, Floats
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
-from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import Ahead, SceneStart
-from sphereorient.follow.tracker import MOVE_SHARE, ChunkTracker, Floats, _Chunk, _Expected, supported
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.trajectory import Reason
@@ -46,7 +47,7 @@ class SceneTracker:
         """Yield the poses of each ball in a batch's frames; see `ChunkTracker.track`."""
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = {
-            name: [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
+            name: [Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
             for name in self.balls
         }
         found: dict[int, dict[str, Poses]] = {}
@@ -76,7 +77,7 @@ class SceneTracker:
         """
         spans = [span for span in spans if any(_regained(name, span, found) for name in self.balls)]
         mirrored = {-k: -time for k, time in enumerate(time_s)}  # the same motion, from the last frame to the first
-        chunks = {name: [_Chunk(1 - span.stop, 1 - span.start, mirrored) for span in spans] for name in self.balls}
+        chunks = {name: [Chunk(1 - span.stop, 1 - span.start, mirrored) for span in spans] for name in self.balls}
         lost: dict[tuple[str, int], Poses] = {}  # what was found at first, where that has changed
         for k in range(max(map(len, spans), default=0)):
             now = [n for n, span in enumerate(spans) if k < len(span)]
@@ -118,7 +119,7 @@ class SceneTracker:
                     chunk.saw(-number, one, turn)
 
     def _step(
-        self, chunks: Mapping[str, Sequence[_Chunk]], k: int, frames: Sequence[Sequence[Frame]]
+        self, chunks: Mapping[str, Sequence[Chunk]], k: int, frames: Sequence[Sequence[Frame]]
     ) -> list[dict[str, Poses]]:
         """Measure one frame of each chunk."""
         ahead = {
@@ -154,7 +155,7 @@ class SceneTracker:
 
     def _followed(
         self,
-        ahead: Mapping[str, Sequence[_Expected | None]],
+        ahead: Mapping[str, Sequence[Expected | None]],
         places: Sequence[Mapping[str, _Place]],
         frames: Sequence[Sequence[Frame]],
         wanted: Sequence[bool],
@@ -220,7 +221,7 @@ def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, _Place]) ->
     )
 
 
-def _extrapolated(chunk: _Chunk, frame: int) -> Ahead | None:
+def _extrapolated(chunk: Chunk, frame: int) -> Ahead | None:
     """Return what the last poses of a chunk say of a later frame: a motion of one order less, that of the last two of
     three poses, is within the error. None of a single pose.
     """
@@ -266,13 +267,13 @@ def _same(one: Poses, other: Poses, tracker: ChunkTracker) -> bool:
     return bool(turn < DISTINCT_RAD) and bool(move < MOVE_SHARE * tracker.fitter.radius_mm)
 
 
-def _place(poses: Poses, expected: _Expected | None) -> _Place | None:
+def _place(poses: Poses, expected: Expected | None) -> _Place | None:
     """Return where a ball is in a frame, or is expected."""
     before = None if expected is None else _expected_place(expected)
     return _found_place(poses, before) if supported(poses) else before
 
 
-def _expected_place(one: _Expected) -> _Place:
+def _expected_place(one: Expected) -> _Place:
     return _Place(torch.from_numpy(one.position_lab_mm), torch.from_numpy(one.moved[3:]))
 
 

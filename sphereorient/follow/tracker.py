@@ -1,9 +1,7 @@
 """Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
 
-import math
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import accumulate, combinations, pairwise
 
@@ -15,9 +13,10 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.chunk import Chunk, Expected
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
-from sphereorient.follow.poses import Poses, poses_of
+from sphereorient.follow.poses import Poses, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
@@ -31,107 +30,14 @@ from sphereorient.trajectory import Reason
 Floats = NDArray[np.float64]
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
-LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the shorter one tells no rate
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
 HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk that others hide
 SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
-MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
-ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
 # What a camera alone gives, beside rotation and move from the pose.
 OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Expected:
-    position_lab_mm: Floats  # (3,)
-    R_before: Floats  # (3, 3), rotation from lab to body in the frame before
-    turn: Floats  # (3,), rad, lab, since then
-    use: Tensor  # (C,) bool, cameras that saw the sphere
-    reason: tuple[Reason, ...]  # C, why the others did not
-    place_spread: Floats  # (3, 3), mm^2
-    rough: bool  # from one predecessor alone: the motion is unknown
-    moved: Floats  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
-    open_share: float  # of the time from the frame before to this one, in which the shutter is open
-    among: Neighbours | None = None  # of this one pose; None: no other sphere is in view
-
-
-@dataclass(eq=False)
-class _Chunk:
-    """One chunk in progress, with its last poses."""
-
-    first: int
-    last: int  # + 1
-    time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
-    past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
-    turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
-
-    def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> _Expected | None:
-        """Extrapolate position and rotation, to second order where three frames are known."""
-        rows = [poses for number, poses in self.past if number >= frame - len(self.past)]
-        numbers = [number for number, _ in self.past]
-        if not rows or numbers[-1] != frame - 1:
-            return None
-        last, on, before = rows[-1], math.inf, math.inf  # steps over those before them: 1 for even frames
-        if len(rows) > 1 and numbers[-2] == frame - 2:
-            t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
-            on, known = (t2 - t1) / (t1 - t0), self.turns[-1]
-        if len(rows) == 3:
-            before = (t1 - t0) / (t0 - self.time_s[frame - 3])
-            if before < 1 / LONG_STEP:  # too short to tell a rate: the last two steps together do
-                on, known, rows = (t2 - t1) / (t1 - self.time_s[frame - 3]), known + self.turns[0], [rows[0], rows[2]]
-        places = [one.position_lab_mm[0].numpy() for one in rows]
-        spreads = [one.covariance[0, 3:, 3:].numpy() for one in rows]
-        X, spread = places[-1], spreads[-1]
-        rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
-        open_share = exposure_s / (self.time_s[frame] - self.time_s[frame - 1])
-        turn, moved = np.zeros(3), np.zeros(6)
-        if not rough:
-            *_, X0, X1 = places
-            *_, C0, C1 = spreads
-            turn, move, spread = on * known, on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
-            astray_mm = ASTRAY_SHARE * radius_mm
-            if 1 / LONG_STEP <= before <= LONG_STEP:
-                # The rate changes from the middle of one step to that of the next as it did between the two before.
-                more = (t2 - t0) / (t1 - self.time_s[frame - 3])
-                turn = (1 + more) * turn - on * before * more * self.turns[0]
-                a, b = on * (1 + more), on * before * more
-                further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * spreads[0]
-                # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
-                if float(further.trace()) < astray_mm**2:
-                    move, spread = (1 + more) * move - b * (X0 - places[0]), further
-            X = X1 + move
-            moved = open_share * np.concatenate([turn, move])
-        return _Expected(
-            position_lab_mm=X,
-            R_before=last.R_lab_body[0].numpy(),
-            turn=turn,
-            use=last.use,
-            reason=last.reason,
-            place_spread=spread + astray_mm**2 * np.eye(3),
-            rough=rough,
-            moved=moved,
-            open_share=open_share,
-        )
-
-    def saw(self, frame: int, poses: Poses, turn: Floats) -> None:
-        """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
-        if supported(poses):
-            if self.past:
-                self.turns.append(turn)
-            self.past.append((frame, poses))
-
-    def forget(self) -> None:
-        """Forget all poses: what comes is another motion."""
-        self.past.clear()
-        self.turns.clear()
-
-
-def supported(poses: Poses) -> bool:
-    """Return whether a picture supports the best pose of a frame."""
-    return len(poses) > 0 and bool(poses.use.any())
 
 
 class ChunkTracker:
@@ -166,7 +72,7 @@ class ChunkTracker:
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Yield the poses of a batch's frames: shots of each view, lengths of the chunks, times of all frames."""
         firsts = list(accumulate([0, *batch[:-1]]))
-        chunks = [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
+        chunks = [Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
         found: dict[int, Poses] = {}
         for k in range(max(batch)):
             now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
@@ -177,7 +83,7 @@ class ChunkTracker:
                 found[chunk.first + k] = poses
         yield from (found[k] for k in range(sum(batch)))
 
-    def turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Floats:
+    def turns(self, chunks: Sequence[Chunk], found: Sequence[Poses]) -> Floats:
         """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
         turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
         for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
@@ -201,19 +107,19 @@ class ChunkTracker:
         """Return the size of batches: always the same, since the last bits depend on it."""
         return max(count, self.settings.chunks)
 
-    def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
+    def _step(self, chunks: Sequence[Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
         expected = {chunk.first: self.ahead(chunk, chunk.first + k) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
         followed = dict(zip(ahead, self.follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         if lost := [chunk.first for chunk in chunks if followed.get(chunk.first) is None]:
-            followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
+            followed |= zip(lost, side_by_side(self.searched, [frames[n] for n in lost]), strict=True)
         for chunk in chunks:
             poses = followed[chunk.first]
             assert poses is not None  # a search returns one that may be empty
             yield self.stated(poses)
 
-    def ahead(self, chunk: _Chunk, frame: int) -> _Expected | None:
+    def ahead(self, chunk: Chunk, frame: int) -> Expected | None:
         """Return what the frames before say of a frame of a chunk."""
         pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
         if pose is None or self.centre is None:
@@ -225,7 +131,7 @@ class ChunkTracker:
         """Return poses with the errors of a fixed centre."""
         return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
-    def follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
+    def follow(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
@@ -386,7 +292,7 @@ class ChunkTracker:
             wrong = wrong | (use[:, k] & use[:, m] & far & (away > limit * CONTRADICTS_SIGMAS))
         return wrong
 
-    def _search(self, shots: Sequence[Frame]) -> Poses:
+    def searched(self, shots: Sequence[Frame]) -> Poses:
         """Find the poses of a frame without history, with those cameras whose pictures support them."""
         poses = self.search.poses(shots)
         if not len(poses):
@@ -477,57 +383,6 @@ class ChunkTracker:
             return poses
         reason = [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
         return poses_of(fit, order, usable, reason)
-
-
-class OnlineTracker:
-    """Follows frames one after the other, none ahead: each from those before it, else from a search without history.
-    `tracker` has one chunk at a time (setting `refine.chunks`). Memory does not grow.
-    """
-
-    number = 1  # of the map in use; 0: none yet
-
-    def __init__(self, tracker: ChunkTracker, appearance: Appearance) -> None:
-        self.appearance = appearance
-        self._tracker = tracker
-        self._time_s: dict[int, float] = {}  # of the last frames
-        self._chunk = _Chunk(0, 0, self._time_s)
-        self._number = 0
-
-    def resume(self, seen: Sequence[tuple[float, Poses]]) -> None:
-        """Take the poses of the last frames, with their times, s, from who followed the ball before."""
-        for time_s, poses in seen:
-            self._time_s[self._number] = time_s
-            self._saw(poses)
-
-    def followed(self, time_s: float, shots: Sequence[Frame]) -> Poses | None:
-        """Return the poses of the frame of a time as the frames before predict them; None where they say nothing of it,
-        or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
-        """
-        if not time_s > self._time_s.get(self._number - 1, -math.inf):
-            self._chunk.forget()
-        self._time_s[self._number] = time_s
-        tracker, ahead = self._tracker, self._tracker.ahead(self._chunk, self._number)
-        (followed,) = [None] if ahead is None else tracker.follow([ahead], [shots])
-        if followed is None:
-            return None
-        poses = tracker.stated(followed)
-        self._saw(poses)
-        return poses
-
-    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
-        """Return the poses of the frame of a time, and whether they were searched for; see `followed`."""
-        followed = self.followed(time_s, shots)
-        if followed is not None:
-            return followed, False
-        poses = self._tracker.stated(self._tracker._search(shots))
-        self._chunk.forget()  # what was before says nothing of the motion from here
-        self._saw(poses)
-        return poses, True
-
-    def _saw(self, poses: Poses) -> None:
-        self._chunk.saw(self._number, poses, self._tracker.turns([self._chunk], [poses])[0])
-        self._number += 1
-        self._time_s.pop(self._number - 4, None)
 
 
 def _usable(shots: Sequence[Frame]) -> Tensor:

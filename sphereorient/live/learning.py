@@ -22,8 +22,9 @@ from sphereorient.errors import PaintError, refusal
 from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import ChunkTracker, OnlineTracker, supported
+from sphereorient.follow.online import OnlineTracker
+from sphereorient.follow.poses import Poses, supported
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.live.growing_map import GrowingMap, LiveMap
 from sphereorient.live.relative import RelativeTracker
 from sphereorient.locate import Frame

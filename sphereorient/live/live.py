@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.follow import Appearance
-from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import supported
+from sphereorient.follow.poses import Poses, supported
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
 from sphereorient.pose import CameraView

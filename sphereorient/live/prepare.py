@@ -11,7 +11,8 @@ from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.files.whole_file import writing
-from sphereorient.follow.tracker import ChunkTracker, OnlineTracker
+from sphereorient.follow.online import OnlineTracker
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.live.live import LiveTracker
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread

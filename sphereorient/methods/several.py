@@ -15,10 +15,10 @@ from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Among, Appearance, Following, estimate_appearance
 from sphereorient.follow.follower import Follower, frames_at, sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
+from sphereorient.follow.poses import Poses, supported
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.follow.scene_tracker import SceneTracker, among_found
-from sphereorient.follow.tracker import ChunkTracker, supported
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.locate import Frame
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method

@@ -165,7 +165,7 @@ def test_one_ball_followed_as_a_scene_is_followed_as_ever(tmp_path):
             pairs = zip(recording.streams, views, strict=True)
             return [list(screened_frames(stream, view.background)) for stream, view in pairs]
 
-        scene = SceneTracker({"": tracker}, lambda frame, names, known, past: {"": tracker._search(frame)})
+        scene = SceneTracker({"": tracker}, lambda frame, names, known, past: {"": tracker.searched(frame)})
         times, batch = recording.clock.tolist(), [12, 12, 6]
         alone, together = list(tracker.track(shots(), batch, times)), list(scene.track(shots(), batch, times))
     for one, of_scene in zip(alone, together, strict=True):

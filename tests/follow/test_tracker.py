@@ -12,10 +12,11 @@ from refine_examples import f64
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.follow.chunk import Chunk
 from sphereorient.follow.follower import cameras_disagree
 from sphereorient.follow.initialise import by_decreasing_size
 from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.follow.tracker import ChunkTracker, _Chunk
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.trajectory import Reason
 
 TIMES = [0.0, 1.0, 2.5, 3.2]
@@ -50,8 +51,8 @@ def seen(time: float, change: float) -> Poses:
     )
 
 
-def lane(frames: list[int], change: float, times: list[float] = TIMES) -> _Chunk:
-    found = _Chunk(0, len(times), times)
+def lane(frames: list[int], change: float, times: list[float] = TIMES) -> Chunk:
+    found = Chunk(0, len(times), times)
     for frame in frames:
         now = seen(times[frame], change)
         before = found.past[-1][1].R_lab_body[0] if found.past else now.R_lab_body[0]
@@ -91,7 +92,7 @@ def test_without_a_known_motion_the_ball_is_near_where_it_was():
 def test_a_late_time_stamp_does_not_bend_the_motion(late):
     stamps = [0.0, 1.0, 2.0, 3.0]
     stamps[late] = late + 0.99
-    told_late = _Chunk(0, 4, stamps)
+    told_late = Chunk(0, 4, stamps)
     for frame in range(3):
         told_late.saw(frame, seen(frame, 0.0), 0.04 * AXIS.numpy())
     expected = told_late.expected(3, RADIUS_MM)

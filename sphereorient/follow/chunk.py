@@ -1,0 +1,107 @@
+"""The last frames of a chunk, and what they say of the next one."""
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.follow.poses import Poses, supported
+from sphereorient.pose.neighbours import Neighbours
+from sphereorient.trajectory import Reason
+
+Floats = NDArray[np.float64]
+
+LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the shorter one tells no rate
+MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
+ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Expected:
+    """What the frames before say of a frame."""
+
+    position_lab_mm: Floats  # (3,)
+    R_before: Floats  # (3, 3), rotation from lab to body in the frame before
+    turn: Floats  # (3,), rad, lab, since then
+    use: Tensor  # (C,) bool, cameras that saw the sphere
+    reason: tuple[Reason, ...]  # C, why the others did not
+    place_spread: Floats  # (3, 3), mm^2
+    rough: bool  # from one predecessor alone: the motion is unknown
+    moved: Floats  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
+    open_share: float  # of the time from the frame before to this one, in which the shutter is open
+    among: Neighbours | None = None  # of this one pose; None: no other sphere is in view
+
+
+@dataclass(eq=False)
+class Chunk:
+    """One chunk in progress, with its last poses."""
+
+    first: int
+    last: int  # + 1
+    time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
+    past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
+    turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
+
+    def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> Expected | None:
+        """Extrapolate position and rotation, to second order where three frames are known."""
+        rows = [poses for number, poses in self.past if number >= frame - len(self.past)]
+        numbers = [number for number, _ in self.past]
+        if not rows or numbers[-1] != frame - 1:
+            return None
+        last, on, before = rows[-1], math.inf, math.inf  # steps over those before them: 1 for even frames
+        if len(rows) > 1 and numbers[-2] == frame - 2:
+            t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
+            on, known = (t2 - t1) / (t1 - t0), self.turns[-1]
+        if len(rows) == 3:
+            before = (t1 - t0) / (t0 - self.time_s[frame - 3])
+            if before < 1 / LONG_STEP:  # too short to tell a rate: the last two steps together do
+                on, known, rows = (t2 - t1) / (t1 - self.time_s[frame - 3]), known + self.turns[0], [rows[0], rows[2]]
+        places = [one.position_lab_mm[0].numpy() for one in rows]
+        spreads = [one.covariance[0, 3:, 3:].numpy() for one in rows]
+        X, spread = places[-1], spreads[-1]
+        rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
+        open_share = exposure_s / (self.time_s[frame] - self.time_s[frame - 1])
+        turn, moved = np.zeros(3), np.zeros(6)
+        if not rough:
+            *_, X0, X1 = places
+            *_, C0, C1 = spreads
+            turn, move, spread = on * known, on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
+            astray_mm = ASTRAY_SHARE * radius_mm
+            if 1 / LONG_STEP <= before <= LONG_STEP:
+                # The rate changes from the middle of one step to that of the next as it did between the two before.
+                more = (t2 - t0) / (t1 - self.time_s[frame - 3])
+                turn = (1 + more) * turn - on * before * more * self.turns[0]
+                a, b = on * (1 + more), on * before * more
+                further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * spreads[0]
+                # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
+                if float(further.trace()) < astray_mm**2:
+                    move, spread = (1 + more) * move - b * (X0 - places[0]), further
+            X = X1 + move
+            moved = open_share * np.concatenate([turn, move])
+        return Expected(
+            position_lab_mm=X,
+            R_before=last.R_lab_body[0].numpy(),
+            turn=turn,
+            use=last.use,
+            reason=last.reason,
+            place_spread=spread + astray_mm**2 * np.eye(3),
+            rough=rough,
+            moved=moved,
+            open_share=open_share,
+        )
+
+    def saw(self, frame: int, poses: Poses, turn: Floats) -> None:
+        """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
+        if supported(poses):
+            if self.past:
+                self.turns.append(turn)
+            self.past.append((frame, poses))
+
+    def forget(self) -> None:
+        """Forget all poses: what comes is another motion."""
+        self.past.clear()
+        self.turns.clear()
