@@ -29,6 +29,9 @@ HEAD = 5  # words of 8 bytes
 WORD = 8
 REPLACED_S = 0.5  # between looks for another ring
 NEXT_S = 0.0002  # between looks for a new frame
+# No look before this share of the usual interval has passed: each holds up the thread that computes, for milliseconds
+# where other programs are busy. From one frame to the next that interval changes by these factors at most.
+NO_LOOK, SHRINKS, GROWS = 0.7, 0.5, 1.2
 MOST_SLOTS = 1 << 16
 
 
@@ -110,6 +113,7 @@ def _read(memory: mmap.mmap, path: Path, file_number: int, layout: FrameBytes) -
         do = "write the pictures of all cameras, of the size and type of the experiment's movies"
         raise MovieError(refusal(str(path), expected=f"a ring of {layout.size} bytes a frame", got=got, do=do))
     number, look_s = max(0, word(WRITTEN) - 1), time.perf_counter()
+    arrived_s, usual_s = look_s, NEXT_S
     while True:
         written = word(WRITTEN)
         if number >= written:
@@ -121,10 +125,11 @@ def _read(memory: mmap.mmap, path: Path, file_number: int, layout: FrameBytes) -
                     if path.stat().st_ino != file_number and path.stat().st_size:
                         yield None
                         return
-            time.sleep(NEXT_S)
+            time.sleep(max(NEXT_S, arrived_s + NO_LOOK * usual_s - time.perf_counter()))
             continue
         number = max(number, written - slots + 1)
-        slot, arrived_s = number % slots, time.perf_counter()
+        slot, before_s, arrived_s = number % slots, arrived_s, time.perf_counter()
+        usual_s = min(max(arrived_s - before_s, SHRINKS * usual_s), GROWS * usual_s)
         content = memory[first + slot * size : first + (slot + 1) * size]
         (time_s,) = struct.unpack_from("<d", memory, WORD * (HEAD + slot))
         if word(WRITTEN) - number >= slots:  # written over meanwhile

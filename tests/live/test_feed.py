@@ -7,8 +7,9 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from threading import Event, Semaphore
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from live_examples import EXCERPT, LIMIT_S, arrivals, until
 
 from sphereorient.errors import MovieError
 from sphereorient.experiment.recording import open_recording
+from sphereorient.live import shared
 from sphereorient.live.feed import Arrival, Feed, camera_pictures, device_frames, movie_frames, raw_frames
 from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
 
@@ -101,6 +103,28 @@ def test_a_ring_in_memory_gives_each_frame_once(recording, tmp_path):
         assert next(frames).number == 26 - 8 + 1  # 26 were written; the oldest slot may be written at any time
         frames.close()
     assert not (tmp_path / "ring").exists()
+
+
+@pytest.mark.parametrize("step_s", [0.002, 0.01])
+def test_a_ring_is_not_looked_at_while_no_frame_is_due(recording, tmp_path, monkeypatch, step_s):
+    pictures, now, looks, written_s = next(movie_frames(recording, paced=False)).pictures, [0.0], [], []
+
+    def sleep(seconds: float) -> None:
+        looks.append(now[0])
+        now[0] += seconds
+        while (due := step_s * (len(written_s) + 1)) <= now[0]:
+            ring.write(due, pictures)
+            written_s.append(due)
+
+    monkeypatch.setattr(shared, "time", SimpleNamespace(perf_counter=lambda: now[0], sleep=sleep))
+    with SharedFrames(tmp_path / "ring", sum(picture.nbytes for picture in pictures)) as ring:
+        ring.write(0.0, pictures)
+        frames = shared_frames(tmp_path / "ring", recording.streams)
+        late_s = np.array([one.arrived_s - one.time_s for one in islice(frames, 80)])
+    assert late_s.max() < 0.0003, "a look each 0.2 ms when it is due"
+    since = np.array([min(look - due for due in [0.0, *written_s] if due <= look + 1e-9) for look in looks[-20:]])
+    assert ((since < 0.0003) | (since > 0.6 * step_s)).all()
+    assert sum(look > written_s[39] for look in looks) < 0.4 * 40 * step_s / 0.0002
 
 
 def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):
