@@ -29,8 +29,8 @@ HEAD = 5  # words of 8 bytes
 WORD = 8
 REPLACED_S = 0.5  # between looks for another ring
 NEXT_S = 0.0002  # between looks for a new frame
-# No look before this share of the usual interval has passed: each holds up the thread that computes, for milliseconds
-# where other programs are busy. From one frame to the next that interval changes by these factors at most.
+# No look before this share of the usual interval has passed: each holds up the thread that computes. From one frame to
+# the next that interval changes by these factors at most.
 NO_LOOK, SHRINKS, GROWS = 0.7, 0.5, 1.2
 MOST_SLOTS = 1 << 16
 
