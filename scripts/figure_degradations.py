@@ -48,7 +48,8 @@ experiment with exact truth and any number of them at once; `synth.degrade` appl
 Level 1 is a good lab on a bad day, level 5 is where failure is expected. They are applied in the order of the table,
 which is that of the light: scene, paint, light, what is behind and before the ball, liquid, lens, sensor, memory; last
 comes what the method is given. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)).
-Table and figure are made by `scripts/figure_degradations.py`.
+Movies of several balls (`balls`) take all but `uneven_light`, `highlights`, `occlusion` and `bubbles`, which lie on the
+disk of one ball. Table and figure are made by `scripts/figure_degradations.py`.
 
 ![each degradation without, and at levels 1, 3 and 5](degradations.png)
 
