@@ -76,7 +76,8 @@ class SceneTracker:
         between them stays without a pose.
         """
         spans = [span for span in spans if any(_regained(name, span, found) for name in self.balls)]
-        mirrored = {-k: -time for k, time in enumerate(time_s)}  # the same motion, from the last frame to the first
+        # The same motion, from the last frame to the first.
+        mirrored = {-k: -time_s[k] for span in spans for k in span}
         chunks = {name: [Chunk(1 - span.stop, 1 - span.start, mirrored) for span in spans] for name in self.balls}
         lost: dict[tuple[str, int], Poses] = {}  # what was found at first, where that has changed
         for k in range(max(map(len, spans), default=0)):
