@@ -21,9 +21,8 @@ from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown, Steps
-from sphereorient.pose.neighbours import Neighbours, joined, visible_shares
-from sphereorient.pose.pixels import thinned_stencil
-from sphereorient.pose.settle import FIRST_EVERY, settled
+from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.settle import settled
 from sphereorient.pose.start import NearStart
 from sphereorient.trajectory import Reason
 
@@ -95,8 +94,8 @@ class ChunkTracker:
         """Return the fitter's disks of positions (n, 3); those of a fixed centre do not change."""
         if self.centre is None:
             return self.fitter.disks_px(position_lab_mm)
-        middles, radius = self._disks_of_centre
-        return middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm))
+        middles, radius, _ = self._disks_of_centre
+        return Disks(middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm)))
 
     @cached_property
     def _disks_of_centre(self) -> Disks:
@@ -152,7 +151,9 @@ class ChunkTracker:
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         disks_px = self._disks_px(X)
-        visible = None if among is None else self._visible(X, disks_px, among)
+        if among is not None:
+            disks_px = disks_px._replace(spoilt=self.fitter.spoilt(X, disks_px, moved, among))
+        visible = None if disks_px.spoilt is None else disks_px.spoilt.left
         sees = torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE
         usable, use = usable & sees, use & sees
         start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
@@ -170,7 +171,7 @@ class ChunkTracker:
                 fit = fitted(X, R, use, disks_px).where(changed, fit)
                 good = torch.where(changed, supported(fit, use), good)
         first = good
-        within = disks_px[1] <= self.fitter.widest_px  # others are searched for, frame by frame
+        within = disks_px.largest_px <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: dict[int, FittedPoses] = {}
         for some in by_decreasing_size(range(use.shape[1])):
@@ -255,12 +256,6 @@ class ChunkTracker:
         begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
         return settled(self.fitter, frames, begin, disks_px)
 
-    def _visible(self, X: Tensor, disks_px: Disks, among: Neighbours) -> Tensor:
-        """Return the share of the disks of B poses that the others leave to each camera, (B, C)."""
-        fine = self.fitter.optics.fine
-        stencil = thinned_stencil(self.fitter.stencil(fine, self.fitter.widest_px), FIRST_EVERY)
-        return visible_shares(self.fitter.places(X, fine, stencil, disks_px[0]), among)
-
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
@@ -324,7 +319,7 @@ class ChunkTracker:
         """
         fitter, count = self.search.fitter, len(poses)
         frames, X = [shot.picture for shot in shots], poses.position_lab_mm[:1]
-        visible = self._visible(X, fitter.disks_px(X), among)[0]
+        visible = self.fitter.spoilt(X, fitter.disks_px(X), None, among).left[0]
         use, every = poses.use & (visible > LEAST_VISIBLE), among.of([0] * count)
         if not bool(use.any()):
             return replace(poses, use=use)

@@ -25,7 +25,7 @@ from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, finest_table, open_scene
 from sphereorient.pose import CameraView
 from sphereorient.pose.fitter import FIRST_BLUR_PX, Fitter, first_fitter, widest_px
-from sphereorient.pose.neighbours import visible_shares
+from sphereorient.pose.neighbours import spoilt
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Flag
 
@@ -215,9 +215,9 @@ def _mostly_seen(
             poses = there[name]
             fitter, fine = paint.first.fitter, paint.first.fitter.optics.fine
             X = poses.position_lab_mm[:1]
-            middle_px, radius_px = fitter.disks_px(X)
+            middle_px, radius_px, _ = fitter.disks_px(X)
             places = fitter.places(X, fine, fitter.stencil(fine, float(radius_px)), middle_px)
-            share = visible_shares(places, among_found([(name, there)], first))[0]
+            share = spoilt(places, among_found([(name, there)], first)).left[0]
             if bool((share[poses.use] > MOSTLY_SEEN).all()):
                 rows.append((k, name))
     return rows

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
-from sphereorient.pose.neighbours import DiskPlaces, Neighbours, hidden_places
+from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
 from sphereorient.pose.occluders import MOST_HIDDEN, unoccluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.pose.residuals import KNOWN
@@ -32,7 +32,6 @@ from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, text
 
 Picture = NDArray[np.generic]
 Shown = Picture | OnDemand  # of which fits cut out disks
-Disks = tuple[Tensor, Tensor]  # see `Fitter.disks_px`
 Record = TypeVar("Record", Pixels, PoseStart, FittedPoses)
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
@@ -49,6 +48,14 @@ MORE_EXPLAINED = 0.05  # share of the variance by which it must leave less
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
+
+
+class Disks(NamedTuple):
+    """Where a sphere's disks lie in the pictures; made by `Fitter.disks_px`."""
+
+    middle_px: Tensor  # (C, B, 2)
+    largest_px: Tensor  # (B,), the largest radius
+    spoilt: Spoilt | None = None  # by other spheres, see `Fitter.spoilt`; None: not known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -245,14 +252,14 @@ class Fitter:
         return replace(self, views=[self.views[k] for k in cameras], light=self.light.of(*cameras), limb_px=limb_px)
 
     def disks_px(self, position_lab_mm: Tensor) -> Disks:
-        """Return middles (C, B, 2) of the disks that a sphere at (B, 3), mm, shows, and the largest radius (B,), px."""
+        """Return where the disks lie that a sphere at (B, 3), mm, shows."""
         disks = [sphere_disk_px(view.camera, position_lab_mm, self.radius_mm) for view in self.views]
         middles, radii = (torch.stack(parts) for parts in zip(*disks, strict=True))
-        return middles, radii.nan_to_num().amax(0)
+        return Disks(middles, radii.nan_to_num().amax(0))
 
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
         """Return the radius (B,), px, of the largest disk that a sphere at positions (B, 3) shows in any picture."""
-        return self.disks_px(position_lab_mm)[1]
+        return self.disks_px(position_lab_mm).largest_px
 
     def shows_unknown(self, camera: int, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
         """Return which poses (B, 3), mm, (B, 3, 3) turn hardly any known paint to a camera, (B,) bool."""
@@ -299,9 +306,9 @@ class Fitter:
         Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. `moved` (B, 6): the
         sphere's turn (rad) and move (mm) while the shutter is open; None: unknown, as if at rest. `disks_px`: what
         the method of this name tells of these positions, where that is known. Places that `neighbours` spoil are not
-        inside, see `hidden_places`.
+        inside, see `spoilt`.
         """
-        middle_px, largest_px = disks_px or self.disks_px(position_lab_mm)
+        middle_px, largest_px, _ = disks_px or self.disks_px(position_lab_mm)
         middles = middle_px.nan_to_num().tolist()
         if radius_px is None:
             radius_px = max(1.0, float(largest_px.max()))
@@ -315,8 +322,7 @@ class Fitter:
         pixels = self.exposed(stacked(disks), moved)
         if neighbours is None:
             return pixels
-        places = self.places(position_lab_mm, level, stencil, middle_px, moved)
-        hidden = hidden_places(places, neighbours)
+        hidden = spoilt(self.places(position_lab_mm, level, stencil, middle_px, moved), neighbours).hidden
         return pixels if hidden is None else replace(pixels, inside=pixels.inside & ~hidden)
 
     def places(
@@ -327,7 +333,7 @@ class Fitter:
         middle_px: Tensor,
         moved: Tensor | None = None,
     ) -> DiskPlaces:
-        """Return where the disks of B poses lie, for `hidden_places`; arguments as of `pixels`."""
+        """Return where the disks of B poses lie, for `spoilt`; arguments as of `pixels`."""
         return DiskPlaces(
             sights=[view.sight for view in self.views],
             stencil=stencil,
@@ -337,6 +343,12 @@ class Fitter:
             blur_px=level.blur_px,
             move_mm=None if moved is None or self.instants == 1 else moved[:, 3:],
         )
+
+    def spoilt(self, position_lab_mm: Tensor, disks_px: Disks, moved: Tensor | None, neighbours: Neighbours) -> Spoilt:
+        """Return where neighbours spoil the disks of B poses, for fits of `settled`; arguments as of `pixels`."""
+        fine = self.optics.fine
+        stencil = self.stencil(fine, self.widest_px)
+        return spoilt(self.places(position_lab_mm, fine, stencil, disks_px.middle_px, moved), neighbours)
 
     def exposed(self, pixels: Pixels, moved: Tensor | None) -> Pixels:
         """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""

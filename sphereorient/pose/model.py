@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.pixels import Pixels, Sights
+from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.sphere.view import nearest_approach
@@ -276,32 +276,6 @@ def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereVi
     )
 
 
-@dataclass(frozen=True, eq=False)
-class FromLimb:
-    """Where lines of sight pass L spheres."""
-
-    outward: Tensor  # (L, 3, P), unit, from the centre to the line of sight
-    nearest: Tensor  # (L, P), distance of the line from the centre, mm
-    blur: Tensor  # (L, 1), standard deviation of the aperture, radii
-    edge: Tensor  # (L, P), how far within the limb, standard deviations of the aperture
-
-
-def from_limb(pixels: Sights, position_lab_mm: Tensor, radius_mm: float | Tensor, blur_px: float) -> FromLimb:
-    """Return where the pixels' lines of sight pass spheres at position_lab_mm (L, 3), of one radius or of their own
-    (L, 1), through a Gaussian aperture; one disk's lines of sight may stand for all.
-    """
-    d = pixels.direction
-    # In double precision, once: half a metre less half a metre.
-    to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
-    aside = nearest_approach(to_centre, d, 1)
-    nearest = torch.maximum((aside * aside).sum(1).sqrt(), torch.as_tensor(1e-6 * radius_mm))
-    outward = aside / nearest[:, None]
-    distance = to_centre[..., 0].norm(dim=1, keepdim=True)
-    blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
-    # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
-    return FromLimb(outward, nearest, blur, (1.0 - 0.5 * blur * blur - nearest / radius_mm) / blur)
-
-
 def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
     """Render the sphere at rest, as `sphere_view`.
     Two look-ups per pixel, four near the limb, reproduce mean and width of the Gaussian cut off at the limb, as the
@@ -309,11 +283,19 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
     Source: docs/errata.md A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
     Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
     """
-    radius_mm, d = model.radius_mm, pixels.direction
+    radius_mm, blur_px = model.radius_mm, model.blur_px
+    d = pixels.direction
     R = R_lab_body.to(d.dtype)
-    limb = from_limb(pixels, position_lab_mm, radius_mm, model.blur_px)
-    outward, nearest, blur, edge = limb.outward, limb.nearest, limb.blur, limb.edge
+    # In double precision, once: half a metre less half a metre.
+    to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
+    aside = nearest_approach(to_centre, d, 1)
+    nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
+    outward = aside / nearest[:, None]  # unit, from the centre to the line of sight
     q0 = nearest / radius_mm
+    distance = to_centre[..., 0].norm(dim=1, keepdim=True)
+    blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
+    # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+    edge = (1.0 - 0.5 * blur * blur - q0) / blur
     coverage, density, pull, variance = limb_shape(edge)
     q = (q0 - blur * pull).clamp(0.0, 1.0)
     inner = pixels.inner

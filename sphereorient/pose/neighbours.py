@@ -1,18 +1,20 @@
 """Other spheres beside the one that is fitted: where they cover its pixels, and which part of its disk is left."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.pose.model import from_limb
-from sphereorient.pose.pixels import LinesOfSight, Sights, Stencil
+from sphereorient.pose.pixels import LinesOfSight, Stencil
 
 # Standard deviations of the blur: beyond a limb by this much a sphere covers .004 of a pixel, within it all but .004.
 CLEAR = 2.65
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,68 +50,86 @@ class DiskPlaces:
     position_lab_mm: Tensor  # (B, 3)
     radius_mm: float
     blur_px: float  # standard deviation of the pictures' blur
-    move_mm: Tensor | None = None  # (B, 3), while the shutter is open; None: at rest
+    move_mm: Tensor | None = None  # (B, 3), while the shutter is open; None: all spheres are as if at rest
 
 
-def hidden_places(disks: DiskPlaces, neighbours: Neighbours) -> Tensor | None:
-    """Return where other spheres spoil disks, (B * C, P) bool; None: nowhere.
-    A nearer one covers the disk; one behind shows beside the limb, where the model expects the empty scene.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spoilt:
+    """Where other spheres spoil the disks of B poses before C cameras. A nearer one covers the disk; one behind shows
+    beside the limb, where the model expects the empty scene.
     """
-    hidden: Tensor | None = None
-    for row, places, _ in _spoilt(disks, neighbours):
-        if hidden is None:
-            hidden = torch.zeros(disks.middle_px.shape[0] * disks.middle_px.shape[1], len(places), dtype=torch.bool)
-        hidden[row] = places
-    return hidden
+
+    hidden: Tensor | None  # (B * C, P) bool, places that do not count; None: all count
+    left: Tensor  # (B, C) float64, the share of each disk that no other sphere covers
 
 
-def visible_shares(disks: DiskPlaces, neighbours: Neighbours) -> Tensor:
-    """Return the share of each disk that no other sphere covers, (B, C) float64."""
+def spoilt(disks: DiskPlaces, neighbours: Neighbours) -> Spoilt:
+    """Return where other spheres spoil disks."""
     cameras, poses = disks.middle_px.shape[:2]
-    share = torch.ones(poses * cameras, dtype=torch.float64)
-    for row, places, edges in _spoilt(disks, neighbours):
-        own = edges.mean(0) > 0
-        share[row] = 1.0 - float((places & own).sum()) / max(1.0, float(own.sum()))
-    return share.reshape(poses, cameras)
+    hidden, left = None, np.ones((poses, cameras))
+    for c in range(cameras):
+        found = _spoilt_before(disks, neighbours, c)
+        if found is None or not found[1].any():
+            continue
+        rows, places, own = found
+        if hidden is None:
+            hidden = np.zeros((poses, cameras, places.shape[1]), bool)
+        hidden[rows, c] = places
+        left[rows, c] = 1.0 - (places & own).sum(1) / own.sum(1).clip(1)
+    places_ = None if hidden is None else torch.from_numpy(hidden).flatten(0, 1)
+    return Spoilt(hidden=places_, left=torch.from_numpy(left))
 
 
-def _spoilt(disks: DiskPlaces, neighbours: Neighbours) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Yield the disks near another one: row b * C + c, its spoilt places (P,) bool, its own `_edges`."""
-    middle_px = disks.middle_px.nan_to_num().numpy()
-    X, radii = neighbours.position_lab_mm.numpy(), neighbours.radius_mm.numpy()
-    for c, sight in enumerate(disks.sights):
-        direction, origin, pitch_rad, pitch_mm = sight.about(middle_px[c])
-        to_centre = X - origin[:, None]
-        along = (to_centre * direction[:, None]).sum(-1)
-        # Another sphere's middle lies within its own radius and that of the stencil of this one's line of sight.
-        reach = (disks.stencil.reach + 1) * (pitch_rad[:, None] * along.clip(0.0) + pitch_mm[:, None])
-        aside = to_centre - along[..., None] * direction[:, None]
-        near = np.sqrt((aside * aside).sum(-1)) < radii + reach
-        depth = ((disks.position_lab_mm.numpy() - origin) * direction).sum(-1)
-        nearer = along < depth[:, None]
-        for b in np.flatnonzero(near.any(1)).tolist():
-            there = sight.of((float(middle_px[c, b, 0]), float(middle_px[c, b, 1])), disks.stencil)
-            some = np.flatnonzero(near[b])
-            own, *others = _edges(there, disks, neighbours, b, some.tolist())
-            covered = [one.amax(0) > -CLEAR for one in others]
-            spoilt = torch.zeros(own.shape[1], dtype=torch.bool)
-            for before, one in zip(nearer[b, some].tolist(), covered, strict=True):
-                spoilt |= one if before else one & (own.amin(0) < CLEAR)
-            if bool(spoilt.any()):
-                yield b * len(disks.sights) + c, spoilt, own
-
-
-def _edges(
-    there: Sights, disks: DiskPlaces, neighbours: Neighbours, pose: int, some: Sequence[int]
-) -> Sequence[Tensor]:
-    """Return how far within the limb places look, standard deviations of the blur, (2, P), as the shutter opens and as
-    it closes: of the sphere of a pose, and of some of its neighbours.
+def _spoilt_before(disks: DiskPlaces, neighbours: Neighbours, camera: int) -> tuple[NDArray[Any], ...] | None:
+    """Return the n poses whose disks others are near before a camera, by index, which places of these are spoilt, and
+    which are their own, (n, P) bool; None without any.
     """
-    still = torch.zeros(1, 3, dtype=torch.float64)
-    X = torch.cat([disks.position_lab_mm[pose : pose + 1], neighbours.position_lab_mm[pose, some]])
-    own = still if disks.move_mm is None else disks.move_mm[pose : pose + 1]
-    move = torch.cat([own, neighbours.move_mm[pose, some]])
-    ends = (X[:, None] + torch.tensor([[[-0.5], [0.5]]], dtype=torch.float64) * move[:, None]).flatten(0, 1)
-    radius = torch.cat([torch.tensor([disks.radius_mm], dtype=torch.float64), neighbours.radius_mm[pose, some]])
-    radius = radius.repeat_interleave(2)[:, None].to(there.direction.dtype)
-    return list(from_limb(there, ends, radius, disks.blur_px).edge.reshape(len(X), 2, -1))
+    sight, middle_px = disks.sights[camera], disks.middle_px[camera].nan_to_num().numpy()
+    # The sphere itself is the first of all.
+    X = torch.cat([disks.position_lab_mm[:, None], neighbours.position_lab_mm], dim=1).numpy()
+    radius_mm = np.pad(neighbours.radius_mm.numpy(), ((0, 0), (1, 0)), constant_values=disks.radius_mm)
+    direction, origin, pitch_rad, pitch_mm = (part[:, None] for part in sight.about(middle_px))
+    along = ((X - origin) * direction).sum(-1)
+    aside = np.linalg.norm(X - origin - along[..., None] * direction, axis=-1)
+    pitch = pitch_rad * along.clip(0.0) + pitch_mm
+    # Another sphere's middle lies within its own radius and that of the stencil of this one's line of sight.
+    near = aside < radius_mm + (disks.stencil.reach + 1) * pitch
+    rows = np.flatnonzero(near[:, 1:].any(1))
+    if not len(rows):
+        return None
+    near[:, 0] = True
+    at, which = np.nonzero(near[rows])
+    of = rows[at]
+    lines = [part[at] if len(part) > 1 else part for part in sight.of(middle_px[rows], disks.stencil)]
+    away2 = [_away_mm2(lines, end[of, which]) for end in _ends(disks, neighbours, X)]
+    least, most = (away2[0], away2[0]) if len(away2) == 1 else (np.minimum(*away2), np.maximum(*away2))
+    blur = disks.blur_px * pitch[of, which] / radius_mm[of, which]
+
+    def limit_mm2(edge: float) -> Floats:
+        # Half of a blur on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+        limit: Floats = (radius_mm[of, which] * (1.0 - 0.5 * blur**2 - edge * blur).clip(0.0))[:, None] ** 2
+        return limit
+
+    own = which == 0
+    beside = (most > limit_mm2(CLEAR))[own]
+    # A nearer one covers places; one behind shows where the sphere does not cover it.
+    spoilt_ = (least < limit_mm2(-CLEAR)) & (beside[at] | (along[of, which] < along[of, 0])[:, None])
+    spoilt_[own] = False
+    return rows, np.maximum.reduceat(spoilt_, np.flatnonzero(own)), (least < limit_mm2(0.0))[own]
+
+
+def _ends(disks: DiskPlaces, neighbours: Neighbours, X: Floats) -> list[Floats]:
+    """Return positions (B, 1 + K, 3) as the shutter opens and as it closes; as they are where all are at rest."""
+    if disks.move_mm is None:
+        return [X]
+    move = torch.cat([disks.move_mm[:, None], neighbours.move_mm], dim=1).numpy()
+    return [X - 0.5 * move, X + 0.5 * move]
+
+
+def _away_mm2(lines: Sequence[NDArray[np.float32]], X: Floats) -> Floats:
+    """Return how far from points (n, 3) lines of sight (n, 3, P) pass, squared, (n, P)."""
+    direction, origin = lines
+    to_point = X[:, :, None] - origin
+    along = np.einsum("ncp,ncp->np", to_point, direction)
+    away2: Floats = (to_point * to_point).sum(1) - along * along
+    return away2

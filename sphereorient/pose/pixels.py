@@ -23,26 +23,20 @@ INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sights:
-    """Lines of sight of L disks with P places each. float32: right to 3e-5 mm half a metre away."""
-
-    direction: Tensor  # (L, 3, P), unit lines of sight, lab
-    origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
-    pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
-    pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pixels(Sights):
+class Pixels:
     """Pixels of L disks (one camera's view of one frame each) with P places each.
-    Grey levels are float32.
+    Grey levels and geometry are float32: a line of sight is right to 3e-5 mm half a metre away.
     """
 
     grey: Tensor  # (L, P), grey levels
     behind: Tensor  # (L, P), grey levels of the scene without the sphere
     inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
     clipped: Tensor  # (L, P) bool, saturated: the true grey level is this one or a higher one
+    direction: Tensor  # (L, 3, P), unit lines of sight, lab
+    origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
+    pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
+    pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
     moved: Tensor  # (L, 6) float64, turn (rad) and move (mm, lab) of the sphere while the shutter is open
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
     place: Tensor  # (2, P) int64, px to the right of and below the middle pixel
@@ -118,18 +112,16 @@ class LinesOfSight:
         shapes = (len(u), 3), (len(u), 3), (len(u),), (len(u),)
         return tuple(np.broadcast_to(part, shape).astype(np.float64) for part, shape in zip(found, shapes, strict=True))
 
-    def of(self, middle_px: tuple[float, float], stencil: "Stencil") -> Sights:
-        """Return the lines of sight of one disk's places, those of `cut_pixels`."""
-        (width, height), (u, v) = self.size, (round(at) for at in middle_px)
+    def of(self, middle_px: NDArray[np.float64], stencil: "Stencil") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the lines of sight of the places of B disks about (B, 2), px, those of `cut_pixels`: direction
+        (B, 3, P), and origin (B or 1, 3, P or 1).
+        """
+        (width, height), (u, v) = self.size, np.rint(middle_px).astype(np.int64).T[..., None]
         columns, rows = (u + stencil.right).clip(0, width - 1), (v + stencil.down).clip(0, height - 1)
-        at = torch.from_numpy(rows * width + columns)
-        pitch_rad, pitch_mm = self.pitch(min(max(u, 0), width - 2), min(max(v, 0), height - 2))
-        return Sights(
-            direction=self.direction.reshape(3, -1).index_select(1, at)[None],
-            origin=(self.origin.reshape(3, 1) if self.one_origin else self.origin.reshape(3, -1)[:, at])[None],
-            pitch_rad=pitch_rad,
-            pitch_mm=pitch_mm,
-        )
+        direction, origin = (part.numpy().reshape(3, -1) for part in (self.direction, self.origin))
+        at = rows * width + columns
+        starts = origin[:, None] if self.one_origin else origin.take(at, axis=1)
+        return direction.take(at, axis=1).swapaxes(0, 1), starts.swapaxes(0, 1)
 
 
 def _to_next_pixel(field: Tensor, sight: Tensor | None = None) -> Tensor:

@@ -8,7 +8,6 @@ from torch import Tensor
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Disks, Fitter, Shown
-from sphereorient.pose.neighbours import hidden_places
 from sphereorient.pose.pixels import Pixels, thinned_places, thinned_stencil
 from sphereorient.pose.start import NearStart
 
@@ -61,16 +60,16 @@ def _compiled(
     """Return fits, and for which poses the disks are to be cut out anew, (B,) bool."""
     if fitter.device.type != "cpu" or compiled.library() is None:
         return None
-    middle_px, _ = disks_px or fitter.disks_px(begin.position_lab_mm)
+    disks_px = disks_px or fitter.disks_px(begin.position_lab_mm)
     stencil = fitter.stencil(fitter.optics.fine, fitter.widest_px)
     hidden = None
     if begin.among is not None:
-        places = fitter.places(begin.position_lab_mm, fitter.optics.fine, stencil, middle_px, begin.moved)
-        hidden = hidden_places(places, begin.among)
+        known = disks_px.spoilt
+        hidden = (known or fitter.spoilt(begin.position_lab_mm, disks_px, begin.moved, begin.among)).hidden
     done = compiled.settled(
-        fitter.decoded(frames, middle_px, stencil),
+        fitter.decoded(frames, disks_px.middle_px, stencil),
         [(view.sight, view.background) for view in fitter.views],
-        middle_px,
+        disks_px.middle_px,
         (thinned_stencil(stencil, FIRST_EVERY), stencil),
         None if hidden is None else (hidden[:, thinned_places(hidden.shape[1], FIRST_EVERY)], hidden),
         begin,

@@ -26,7 +26,7 @@ from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
 from sphereorient.pose.fitter import CameraView, first_fitter
 from sphereorient.pose.model import sphere_view
-from sphereorient.pose.neighbours import Neighbours, visible_shares
+from sphereorient.pose.neighbours import Neighbours, spoilt
 from sphereorient.pose.settle import settled
 from sphereorient.pose.start import NearStart
 
@@ -82,10 +82,10 @@ def test_places_do_not_count_where_the_rendered_other_ball_covers_them_or_shows_
 
 def test_the_share_that_is_left_is_that_of_the_two_circles(scene):
     fitter, _, X, _, others = scene
-    middle_px, _ = fitter.disks_px(X)
+    middle_px, *_ = fitter.disks_px(X)
     level = fitter.optics.fine
     places = fitter.places(X, level, fitter.stencil(level, fitter.widest_px), middle_px)
-    share = visible_shares(places, others)
+    share = spoilt(places, others).left
     assert 0.3 < float(share[0, 0]) < 0.8
     assert share[-1].tolist() == [1.0, 1.0]
 
