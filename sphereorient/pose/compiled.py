@@ -283,7 +283,8 @@ class _Addresses:
         """Return where the numbers of a tensor lie, in their order; None of None."""
         if part is None:
             return None
-        self._alive.append(part.to(dtype or part.dtype).contiguous())
+        part = part if dtype is None or part.dtype == dtype else part.to(dtype)
+        self._alive.append(part if part.is_contiguous() else part.contiguous())
         return self._alive[-1].data_ptr()
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,9 +26,10 @@ def settled(
     """
     fit = _settled(fitter, frames, begin, disks_px)
     for _ in range(AGAIN):
-        rows = (fit.step[:, :3].norm(dim=-1) > NEAR_RAD).nonzero()[:, 0]
-        if not len(rows):
+        long = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) > NEAR_RAD
+        if not any(long.tolist()):
             break
+        rows = torch.from_numpy(np.flatnonzero(long))
         there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
         _put(fit, rows, _settled(fitter, [frames[k] for k in rows.tolist()], there, None))
     return fit
@@ -40,7 +42,7 @@ def _settled(
     if done is None:
         return _settled_in_torch(fitter, frames, begin, disks_px)
     fit, far = done
-    if bool(far.any()):
+    if any(far.tolist()):
         rows = far.nonzero()[:, 0]
         there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
         again = _compiled(fitter, [frames[k] for k in rows.tolist()], there, None, first=False)
