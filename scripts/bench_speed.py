@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,9 +39,10 @@ from sphereorient.follow import Appearance, ChunkTracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
+from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods import precise
+from sphereorient.methods import several as several_balls
 from sphereorient.methods.method import Job
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
@@ -57,6 +58,7 @@ from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 TURNS, SMOOTHED = 5, 3000  # measurements in turn; frames of the smoother's
 FOLLOWED = 48  # frames over which one prediction after the other is timed
+MANY = 128  # the same of several balls
 TOLD = """
 import json, sys, time
 begun = time.perf_counter()
@@ -95,6 +97,7 @@ def main() -> None:
     literal(bench, mean_s)
     smoother()
     sizes()
+    several()
     if arguments.fixed:
         live(arguments.fixed)
     with tempfile.TemporaryDirectory() as folder:
@@ -234,20 +237,27 @@ def stages(bench: Bench) -> float:
 def steps(bench: Bench, lanes: int) -> tuple[float, float]:
     """CPU seconds a camera of a block's first two frames, and of a predicted one, as many blocks side by side."""
     tracker = ChunkTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
+    short, each = steps_of(tracker, bench.shots, bench.times, lanes)
+    return short / lanes / len(bench.eyes), each / lanes / len(bench.eyes)
+
+
+def steps_of(
+    tracker: ChunkTracker | SceneTracker, shots: list[list[Frame]], times: list[float], lanes: int
+) -> tuple[float, float]:
+    """CPU seconds of the first two frames of all blocks side by side, and of a predicted one."""
     at: list[float] = []
     real = tracker._step
 
-    def step(*given: Any) -> Iterator[Poses]:
+    def step(*given: Any) -> Any:
         at.append(time.process_time())
         return real(*given)
 
-    length = FOLLOWED // lanes
+    length = len(times) // lanes
     with mock.patch.object(tracker, "_step", step):
-        list(tracker.track([movie[: lanes * length] for movie in bench.shots], [length] * lanes, bench.times))
+        list(tracker.track([movie[: lanes * length] for movie in shots], [length] * lanes, times))
     at.append(time.process_time())
-    pictures = lanes * len(bench.eyes)
     # First frames are searched for, second ones approached.
-    return (at[2] - at[0]) / pictures, (at[-1] - at[2]) / pictures / (length - 2)
+    return at[2] - at[0], (at[-1] - at[2]) / (length - 2)
 
 
 def predicted(bench: Bench) -> float:
@@ -268,6 +278,32 @@ def sizes() -> None:
                 spent = [predicted(bench) for _ in range(TURNS)]
                 what = f"predicted frame of {diameter_px} px, {len(bench.eyes)} camera(s), CPU ms a camera"
                 say(what, told(spent, 1e3))
+
+
+def several() -> None:
+    """Time predicted frames of three balls that pass before each other, and of one of them."""
+    lanes, spent = Settings().refine.chunks, {}
+    with tempfile.TemporaryDirectory() as name:
+        for balls in (1, 3):
+            folder = Path(name) / str(balls)
+            settings = SynthSettings(
+                frames=MANY, balls=balls, cameras=3, diameter_mm=14.0, diameter_px=61.0, volume_mm=40.0
+            )
+            write_synthetic_experiment(folder, settings)
+            with open_recording(folder / "experiment.yaml") as recording:
+                job = Job(recording=recording, settings=Settings(), device=torch.device("cpu"))
+                follower = (precise if balls == 1 else several_balls).learn(job, silent)
+                views = next(iter(follower.appearances.values())).fitter.views
+                shots = [
+                    list(screened_frames(reel, view.background, 0, MANY))
+                    for reel, view in zip(recording.streams, views, strict=True)
+                ]
+                times = recording.timeline.time_s[:MANY].tolist()
+            spent[balls] = follower.tracker, shots, times
+        turns = [{n: steps_of(*of, lanes)[1] / (n * lanes * 3) for n, of in spent.items()} for _ in range(TURNS)]
+    for balls in spent:
+        say(f"predicted frame, {balls} ball(s), CPU ms a ball and camera", told([one[balls] for one in turns], 1e3))
+    say("three balls over one; bar 1.2", told([one[3] / one[1] for one in turns]))
 
 
 def live(experiment: Path) -> None:
