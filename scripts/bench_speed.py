@@ -244,7 +244,7 @@ def steps(bench: Bench, lanes: int) -> tuple[float, float]:
 def steps_of(
     tracker: ChunkTracker | SceneTracker, shots: list[list[Frame]], times: list[float], lanes: int
 ) -> tuple[float, float]:
-    """CPU seconds of the first two frames of all blocks side by side, and of a predicted one."""
+    """CPU seconds of the first two frames of all blocks side by side, and of a predicted one, median."""
     at: list[float] = []
     real = tracker._step
 
@@ -257,7 +257,7 @@ def steps_of(
         list(tracker.track([movie[: lanes * length] for movie in shots], [length] * lanes, times))
     at.append(time.process_time())
     # First frames are searched for, second ones approached.
-    return at[2] - at[0], (at[-1] - at[2]) / (length - 2)
+    return at[2] - at[0], statistics.median(np.diff(at[2:]).tolist())
 
 
 def predicted(bench: Bench) -> float:
