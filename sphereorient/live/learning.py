@@ -161,6 +161,11 @@ class LearningTracker:
         self._tried = 0
         self._past: deque[tuple[float, Poses]] = deque(maxlen=LAST)  # in the body frame
 
+    def between(self) -> None:
+        """Do what can wait until the last frame was told."""
+        if self._online is not None:
+            self._online.between()
+
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of a frame, in the body frame, and whether they were searched for; see `OnlineTracker`."""
         poses, searched = self._measured(time_s, shots)

@@ -56,6 +56,9 @@ class LiveTracker(Protocol):
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of the frame of a time, and whether they were searched for."""
 
+    def between(self) -> None:
+        """Do what can wait until the last frame was told."""
+
 
 def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
     """Yield the pose of each frame; frames of one source, in order."""
@@ -68,6 +71,7 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
         ]
         poses, searched = tracker.next(arrival.time_s, shots)
         yield _told(arrival, poses, searched, arrival.number - number - 1, tracker.number)
+        tracker.between()
         before, number = shots, arrival.number
 
 

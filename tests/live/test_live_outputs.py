@@ -37,13 +37,22 @@ def test_a_tcp_reader_gets_lines_and_one_that_went_away_holds_nothing_up():
 def test_a_slow_reader_loses_lines_and_takes_no_time():
     output = TcpOutput("127.0.0.1", 0)
     try:
-        with socket.create_connection(("127.0.0.1", output.port)):
+        with socket.create_connection(("127.0.0.1", output.port)) as reader:
             until(lambda: output._readers)
             begun = time.monotonic()
-            for _ in range(20_000):
-                output.send("x" * 1000)
+            for k in range(20_000):
+                output.send(f"{k}, {'x' * 1000}")
             assert time.monotonic() - begun < LIMIT_S
             assert len(output._readers[0][1]._waiting) <= MOST_LINES
+            numbers = []
+            for line in reader.makefile():
+                number, rest = line.split(", ")
+                assert rest == "x" * 1000 + "\n", "lines are whole, also where the reader took a part of one"
+                numbers.append(int(number))
+                if numbers[-1] == 19_999:
+                    break
+            assert numbers == sorted(set(numbers))
+            assert len(numbers) < 20_000
     finally:
         output.close()
 
