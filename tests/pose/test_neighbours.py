@@ -90,6 +90,21 @@ def test_the_share_that_is_left_is_that_of_the_two_circles(scene):
     assert share[-1].tolist() == [1.0, 1.0]
 
 
+def test_a_nearer_ball_that_moves_covers_what_it_covers_at_both_ends_of_the_exposure(scene):
+    fitter, _, X, _, others = scene
+    middle_px, *_ = fitter.disks_px(X)
+    level, still = fitter.optics.fine, torch.zeros(len(X), 3, dtype=torch.float64)
+    at_rest = fitter.places(X, level, fitter.stencil(level, fitter.widest_px), middle_px)
+    move = torch.tensor([0.4, -0.3, 0.2], dtype=torch.float64) * RADIUS_MM
+    ends = [
+        spoilt(at_rest, replace(others, position_lab_mm=others.position_lab_mm + half * move)).hidden
+        for half in (-0.5, 0.5)
+    ]
+    moving = replace(others, move_mm=move.expand_as(others.position_lab_mm))
+    other = spoilt(replace(at_rest, move_mm=still), moving).hidden != (ends[0] | ends[1])
+    assert int(other.sum()) < 0.02 * int((ends[0] != ends[1]).sum())  # the blur is that of the middle
+
+
 def test_fits_look_past_the_other_ball_compiled_or_not_and_without_one_keep_their_bytes(scene, monkeypatch):
     fitter, frames, X, R, others = scene
     begin = NearStart(

@@ -61,6 +61,16 @@ def test_origins_are_kept_once_where_all_lines_begin_in_one_point(model, origins
     assert pixels.origin.shape == (1, 3, origins)
 
 
+@pytest.mark.parametrize("model", ["pinhole", "telecentric"])
+def test_lines_of_sight_of_many_disks_are_those_of_each_ones_pixels(model):
+    middles, stencil = np.array([(30.2, 20.7), (2.0, 46.5), (58.5, 1.0)]), disk_stencil(9.0)
+    direction, origin = LinesOfSight(camera(model)).of(middles, stencil)
+    for k, middle in enumerate(middles):
+        one = disk(model, middle=tuple(middle))
+        assert np.array_equal(direction[k], one.direction[0].numpy())
+        assert np.array_equal(origin[k if len(origin) > 1 else 0], one.origin[0].numpy())
+
+
 def test_axes_are_the_pictures_right_and_down_in_the_lab():
     # The camera looks along lab +y with lab z up: right is lab +x, down is lab -z.
     assert disk().axes.tolist() == [[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]]
