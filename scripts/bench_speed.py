@@ -41,8 +41,7 @@ from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.locate import Frame, screened_frames
-from sphereorient.methods import precise
-from sphereorient.methods import several as several_balls
+from sphereorient.methods import precise, several
 from sphereorient.methods.method import Job
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
@@ -97,7 +96,7 @@ def main() -> None:
     literal(bench, mean_s)
     smoother()
     sizes()
-    several()
+    three_balls()
     if arguments.fixed:
         live(arguments.fixed)
     with tempfile.TemporaryDirectory() as folder:
@@ -280,7 +279,7 @@ def sizes() -> None:
                 say(what, told(spent, 1e3))
 
 
-def several() -> None:
+def three_balls() -> None:
     """Time predicted frames of three balls that pass before each other, and of one of them."""
     lanes, spent = Settings().refine.chunks, {}
     with tempfile.TemporaryDirectory() as name:
@@ -292,7 +291,7 @@ def several() -> None:
             write_synthetic_experiment(folder, settings)
             with open_recording(folder / "experiment.yaml") as recording:
                 job = Job(recording=recording, settings=Settings(), device=torch.device("cpu"))
-                follower = (precise if balls == 1 else several_balls).learn(job, silent)
+                follower = several.learn(job, silent)
                 views = next(iter(follower.appearances.values())).fitter.views
                 shots = [
                     list(screened_frames(reel, view.background, 0, MANY))

@@ -20,7 +20,7 @@ from sphereorient.follow.poses import Poses, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Disks, Fitter, Picture, Shown, Steps
+from sphereorient.pose.fitter import DisksPx, Fitter, Picture, Shown, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.settle import settled
 from sphereorient.pose.start import NearStart
@@ -90,15 +90,15 @@ class ChunkTracker:
                 turns[row] = poses.R_lab_body[0].numpy() @ chunk.past[-1][1].R_lab_body[0].numpy().T
         return so3.log(torch.from_numpy(turns))[: len(chunks)].numpy()
 
-    def _disks_px(self, position_lab_mm: Tensor) -> Disks:
+    def _disks_px(self, position_lab_mm: Tensor) -> DisksPx:
         """Return the fitter's disks of positions (n, 3); those of a fixed centre do not change."""
         if self.centre is None:
             return self.fitter.disks_px(position_lab_mm)
         middles, radius, _ = self._disks_of_centre
-        return Disks(middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm)))
+        return DisksPx(middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm)))
 
     @cached_property
-    def _disks_of_centre(self) -> Disks:
+    def _disks_of_centre(self) -> DisksPx:
         assert self.centre is not None
         return self.fitter.disks_px(self.centre.position_lab_mm[None])
 
@@ -250,7 +250,7 @@ class ChunkTracker:
         X: Tensor,
         R: Tensor,
         use: Tensor,
-        disks_px: Disks | None = None,
+        disks_px: DisksPx | None = None,
     ) -> FittedPoses:
         """Fit poses that are nearly right; `start` knows the rest of where they begin."""
         begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)

@@ -16,7 +16,6 @@ HOST = "127.0.0.1"
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
 MOST_ROWS = 100_000  # likewise, for a disk: minutes
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
-AT_ONCE = getattr(socket, "MSG_DONTWAIT", 0)  # 0: this system cannot
 
 
 class Output(Protocol):
@@ -32,7 +31,6 @@ class Output(Protocol):
 class Spool:
     """Hands things to `write` in a thread of its own; of more than `most` that wait the oldest is lost.
     After an OSError, which `faulty` gets, nothing more is written. `pause_s`: from one write to the next, at least.
-    `at_once` gets a thing where nothing else waits; what it returns, unless empty, is left for the thread.
     """
 
     def __init__(
@@ -41,14 +39,11 @@ class Spool:
         faulty: Callable[[OSError], object] = lambda error: None,
         most: int = MOST_LINES,
         pause_s: float = 0.0,
-        at_once: Callable[[Any], Any] | None = None,
     ) -> None:
         self.gone = False
         self.lost = 0
-        self._write, self._faulty, self._pause_s, self._at_once = write, faulty, pause_s, at_once
+        self._write, self._faulty, self._pause_s = write, faulty, pause_s
         self._waiting: deque[Any] = deque(maxlen=most)
-        self._begun: list[Any] = []  # what `at_once` left; never lost
-        self._writes = False
         self._changed = Condition()
         self._ends = False
         self._thread = Thread(target=self._run, name="spool", daemon=True)
@@ -57,14 +52,8 @@ class Spool:
     def send(self, thing: object) -> None:
         """Take a thing, and return at once."""
         with self._changed:
-            if self._at_once is not None and not (self._begun or self._waiting or self._writes or self.gone):
-                left = self._at_once(thing)
-                if not left:
-                    return
-                self._begun.append(left)
-            else:
-                self.lost += len(self._waiting) == self._waiting.maxlen
-                self._waiting.append(thing)
+            self.lost += len(self._waiting) == self._waiting.maxlen
+            self._waiting.append(thing)
             self._changed.notify()
 
     def close(self, limit_s: float = SOON_S) -> None:
@@ -77,13 +66,11 @@ class Spool:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._begun or self._waiting or self._ends)
-                things = [*self._begun, *self._waiting]
-                if not things:
+                self._changed.wait_for(lambda: self._waiting or self._ends)
+                if not self._waiting:
                     return
-                self._begun.clear()
+                things = list(self._waiting)
                 self._waiting.clear()
-                self._writes = True
             try:
                 self._write(things)
             except OSError as error:
@@ -91,7 +78,6 @@ class Spool:
                 self._faulty(error)
                 return
             with self._changed:
-                self._writes = False
                 self._changed.wait_for(lambda: self._ends, self._pause_s)
 
 
@@ -184,15 +170,13 @@ class TcpOutput:
                 connection, _ = self._server.accept()
             except OSError:  # closed
                 return
-            at_once = partial(_sent_at_once, connection) if AT_ONCE else None
-            spool = Spool(partial(_send_all, connection), at_once=at_once)
+            spool = Spool(partial(_send_all, connection))
             self._readers = [*(reader for reader in self._readers if not reader[1].gone), (connection, spool)]
 
     def send(self, line: str) -> None:
         """Hand a line to all readers."""
-        content = f"{line}\n".encode()
         for _, spool in self._readers:
-            spool.send(content)
+            spool.send(line)
 
     def close(self) -> None:
         """End all connections."""
@@ -204,16 +188,8 @@ class TcpOutput:
             connection.close()
 
 
-def _send_all(connection: socket.socket, lines: list[bytes]) -> None:
-    connection.sendall(b"".join(lines))
-
-
-def _sent_at_once(connection: socket.socket, content: bytes) -> bytes:
-    """Return what a connection did not take at once; a fault shows when the rest is written."""
-    try:
-        return content[connection.send(content, AT_ONCE) :]
-    except OSError:
-        return content
+def _send_all(connection: socket.socket, lines: list[str]) -> None:
+    connection.sendall("".join(f"{line}\n" for line in lines).encode())
 
 
 class FileOutput:

@@ -50,7 +50,7 @@ DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
 
 
-class Disks(NamedTuple):
+class DisksPx(NamedTuple):
     """Where a sphere's disks lie in the pictures; made by `Fitter.disks_px`."""
 
     middle_px: Tensor  # (C, B, 2)
@@ -251,11 +251,11 @@ class Fitter:
         limb_px = self.limb_px if self.limb_px is None else self.limb_px[list(cameras)]
         return replace(self, views=[self.views[k] for k in cameras], light=self.light.of(*cameras), limb_px=limb_px)
 
-    def disks_px(self, position_lab_mm: Tensor) -> Disks:
+    def disks_px(self, position_lab_mm: Tensor) -> DisksPx:
         """Return where the disks lie that a sphere at (B, 3), mm, shows."""
         disks = [sphere_disk_px(view.camera, position_lab_mm, self.radius_mm) for view in self.views]
         middles, radii = (torch.stack(parts) for parts in zip(*disks, strict=True))
-        return Disks(middles, radii.nan_to_num().amax(0))
+        return DisksPx(middles, radii.nan_to_num().amax(0))
 
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
         """Return the radius (B,), px, of the largest disk that a sphere at positions (B, 3) shows in any picture."""
@@ -299,7 +299,7 @@ class Fitter:
         level: PyramidLevel,
         radius_px: float | None = None,
         moved: Tensor | None = None,
-        disks_px: Disks | None = None,
+        disks_px: DisksPx | None = None,
         neighbours: Neighbours | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
@@ -344,7 +344,9 @@ class Fitter:
             move_mm=None if moved is None or self.instants == 1 else moved[:, 3:],
         )
 
-    def spoilt(self, position_lab_mm: Tensor, disks_px: Disks, moved: Tensor | None, neighbours: Neighbours) -> Spoilt:
+    def spoilt(
+        self, position_lab_mm: Tensor, disks_px: DisksPx, moved: Tensor | None, neighbours: Neighbours
+    ) -> Spoilt:
         """Return where neighbours spoil the disks of B poses, for fits of `settled`; arguments as of `pixels`."""
         fine = self.optics.fine
         stencil = self.stencil(fine, self.widest_px)

@@ -87,7 +87,7 @@ def _spoilt_before(disks: DiskPlaces, neighbours: Neighbours, camera: int) -> tu
     sight, middle_px = disks.sights[camera], disks.middle_px[camera].nan_to_num().numpy()
     # The sphere itself is the first of all.
     X = torch.cat([disks.position_lab_mm[:, None], neighbours.position_lab_mm], dim=1).numpy()
-    radius_mm = np.pad(neighbours.radius_mm.numpy(), ((0, 0), (1, 0)), constant_values=disks.radius_mm)
+    radius_mm = np.insert(neighbours.radius_mm.numpy(), 0, disks.radius_mm, axis=1)
     direction, origin, pitch_rad, pitch_mm = (part[:, None] for part in sight.about(middle_px))
     along = ((X - origin) * direction).sum(-1)
     aside = np.linalg.norm(X - origin - along[..., None] * direction, axis=-1)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Disks, Fitter, Shown
+from sphereorient.pose.fitter import DisksPx, Fitter, Shown
 from sphereorient.pose.pixels import Pixels, thinned_places, thinned_stencil
 from sphereorient.pose.start import NearStart
 
@@ -19,45 +19,44 @@ MORE = 2, 3  # further iterations after a long step: of some pixels, of all
 
 
 def settled(
-    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None = None
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: DisksPx | None = None
 ) -> FittedPoses:
     """Fit B poses to the frames of C cameras at the finest level. `disks_px`: what the fitter's method of this name
     tells of the first positions, where that is known. Where compiled code can do it, it does.
     """
     fit = _settled(fitter, frames, begin, disks_px)
     for _ in range(AGAIN):
-        long = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) > NEAR_RAD
-        if not any(long.tolist()):
+        turn_rad = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1).tolist()
+        rows = [k for k, one in enumerate(turn_rad) if one > NEAR_RAD]
+        if not rows:
             break
-        rows = torch.from_numpy(np.flatnonzero(long))
-        there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
-        _put(fit, rows, _settled(fitter, [frames[k] for k in rows.tolist()], there, None))
+        there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(torch.tensor(rows))
+        _put(fit, rows, _settled(fitter, [frames[k] for k in rows], there, None))
     return fit
 
 
 def _settled(
-    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: DisksPx | None
 ) -> FittedPoses:
     done = _compiled(fitter, frames, begin, disks_px, first=True)
     if done is None:
         return _settled_in_torch(fitter, frames, begin, disks_px)
     fit, far = done
-    if any(far.tolist()):
-        rows = far.nonzero()[:, 0]
-        there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(rows)
-        again = _compiled(fitter, [frames[k] for k in rows.tolist()], there, None, first=False)
+    if rows := [k for k, one in enumerate(far.tolist()) if one]:
+        there = begin.after(fit.position_lab_mm, fit.R_lab_body).of(torch.tensor(rows))
+        again = _compiled(fitter, [frames[k] for k in rows], there, None, first=False)
         assert again is not None  # as before
         _put(fit, rows, again[0])
     return fit
 
 
-def _put(fit: FittedPoses, rows: Tensor, other: FittedPoses) -> None:
+def _put(fit: FittedPoses, rows: Sequence[int], other: FittedPoses) -> None:
     for name, part in other.parts().items():
         getattr(fit, name)[rows] = part
 
 
 def _compiled(
-    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None, *, first: bool
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: DisksPx | None, *, first: bool
 ) -> tuple[FittedPoses, Tensor] | None:
     """Return fits, and for which poses the disks are to be cut out anew, (B,) bool."""
     if fitter.device.type != "cpu" or compiled.library() is None:
@@ -86,7 +85,7 @@ def _compiled(
 
 
 def _settled_in_torch(
-    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: Disks | None
+    fitter: Fitter, frames: Sequence[Sequence[Shown]], begin: NearStart, disks_px: DisksPx | None
 ) -> FittedPoses:
     fine, moved = fitter.optics.fine, begin.moved
     others = begin.among
