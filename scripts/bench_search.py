@@ -29,6 +29,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.search import GreySearch, GreySearchSettings, crop_disk
 from sphereorient.sphere import orthographic_view
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
+from sphereorient.synth.scene import seeded
 from sphereorient.synth.write import default_cameras
 
 LIGHTS = {"even": 1.0, "lamps": 0.5, "one side dark": 0.05}  # share that comes evenly from everywhere
@@ -138,12 +139,12 @@ def frames(paint: str, ambient: float, count: int) -> list[Sample]:
 def _frames(paint: str, settings: SynthSettings, count: int) -> Iterator[Sample]:
     scene = make_scene(random_texture(paint, PATTERNS[paint]), settings)
     camera = default_cameras(settings)["cam1"]
-    rng, generator = np.random.default_rng(7), torch.Generator().manual_seed(7)
+    rng, noise, generator = np.random.default_rng(7), seeded(7), torch.Generator().manual_seed(7)
     position = torch.zeros(1, 3, dtype=torch.float64)
     u, v = camera.project(position[0]).tolist()
     limb_px = 0.5 * settings.diameter_px / math.sqrt(1 - (0.5 * settings.diameter_mm / settings.distance_mm) ** 2)
     for R_lab_body in so3.random_rotations(count, generator=generator):
-        picture = render_frame(scene, camera, position, R_lab_body[None], rng)
+        picture = render_frame(scene, camera, position, R_lab_body[None], noise)
         angle = rng.uniform(0, 2 * math.pi)
         radius = limb_px * (1 + RADIUS_SHARE * rng.uniform(-1, 1))
         place = (u + CENTRE_PX * math.cos(angle), v + CENTRE_PX * math.sin(angle))

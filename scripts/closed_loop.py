@@ -24,7 +24,7 @@ from sphereorient.experiment import load_experiment
 from sphereorient.live.shared import SharedFrames
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
-from sphereorient.synth.scene import digitise, expose, make_scene
+from sphereorient.synth.scene import digitise, expose, make_scene, seeded
 
 STILL = {"velocity_rms": 0.0, "volume_mm": 1e-3, "omega_rms": 4.0, "omega_time": 0.2, "exposure": 0.001}
 SETTINGS = SynthSettings(frames=60, frame_rate=100.0, image_size=(240, 200), diameter_px=90.0, **STILL)
@@ -35,7 +35,7 @@ HEADING = 17  # place in the line, "FT" first
 def main(rate_hz: float = 50.0, seconds: float = 10.0) -> None:
     with TemporaryDirectory() as place, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lines:
         experiment, pictures = set_up(Path(place))
-        rng, turned_deg, delay_s, heading_deg = np.random.default_rng(1), 0.0, [], []
+        rng, turned_deg, delay_s, heading_deg = seeded(1), 0.0, [], []
         lines.bind(("127.0.0.1", 0))
         lines.settimeout(120)  # the set-up is studied first
         command = [sys.executable, "-m", "sphereorient.cli", "live", experiment, "--cameras", "cam1"]
@@ -68,7 +68,9 @@ def set_up(folder: Path) -> tuple[str, list[np.ndarray]]:
     scene, camera = make_scene(load_texture(loaded.texture_path), SETTINGS), loaded.cameras["cam1"]
     turn = torch.outer(torch.deg2rad(torch.arange(360.0).double()), torch.tensor([0.0, 0.0, -1.0]).double())
     centre = torch.zeros(1, 3, dtype=torch.float64)
-    return str(path), [expose(scene, camera, centre, R[None])[0] for R in so3.exp(turn)]
+    return str(path), [
+        expose([scene], camera, centre[None], R[None, None]).before(SETTINGS.background) for R in so3.exp(turn)
+    ]
 
 
 if __name__ == "__main__":

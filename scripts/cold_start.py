@@ -32,6 +32,7 @@ from sphereorient.pose import CameraView, LinesOfSight, base_table
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter
 from sphereorient.search import GreySearch
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
+from sphereorient.synth.scene import seeded
 from sphereorient.synth.write import default_cameras
 
 RIGHT_DEG = 1.0
@@ -89,7 +90,7 @@ def rendered(paint: str, seed: int, count: int, light: str, ambient: float) -> N
     camera = next(iter(default_cameras(settings).values()))
     texture = random_texture(paint, seed)
     scene = make_scene(texture, settings)
-    rng = np.random.default_rng(seed)
+    rng = seeded(seed)
     generator = torch.Generator().manual_seed(seed)
     R_lab_body = so3.random_rotations((count,), generator=generator, dtype=torch.float64)
     place = 10.0 * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)

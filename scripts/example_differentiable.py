@@ -30,7 +30,7 @@ from sphereorient.pose.implicit import ImplicitPose, implicit_pose
 from sphereorient.sphere.renderer import PaintedBall, expected_grey
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
-from sphereorient.synth.scene import LAMPS, make_scene, render_frame
+from sphereorient.synth.scene import LAMPS, make_scene, render_frame, seeded
 from sphereorient.synth.settings import SynthSettings
 
 mpl.use("Agg")
@@ -72,7 +72,7 @@ class Movie:
 
 def film() -> Movie:
     """Render the movie."""
-    rng, noise = torch.Generator().manual_seed(4), np.random.default_rng(4)
+    rng, noise = torch.Generator().manual_seed(4), seeded(4)
     focal = SCENE.diameter_px / SCENE.diameter_mm * SCENE.distance_mm
     middle = [0.5 * (side - 1) for side in SCENE.image_size]
     cameras = tuple(

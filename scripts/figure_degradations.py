@@ -161,12 +161,13 @@ def outline(
 ) -> None:
     """Draw the circle and the three body axes that a camera shows of a ball of some radius, mm."""
     (camera, radius_mm), (position, R_lab_body) = seen_by, pose
-    centre, radius = picture_of_ball(camera, position, radius_mm)
+    disk = picture_of_ball(camera, position, radius_mm)
     angle = torch.linspace(0, 2 * torch.pi, 100, dtype=torch.float64)
-    rim = centre - corner + radius * torch.stack([angle.cos(), angle.sin()], dim=-1)
+    centre = disk.centre_px - corner
+    rim = centre + disk.radius_px * torch.stack([angle.cos(), angle.sin()], dim=-1)
     cell.plot(*rim.T, **look)
     for end in camera.project(position + AXIS_MM * R_lab_body.mT):
-        cell.plot(*torch.stack([centre - corner, end - corner]).T, **look)
+        cell.plot(*torch.stack([centre, end - corner]).T, **look)
 
 
 def main() -> None:

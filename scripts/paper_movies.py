@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,8 @@ from sphereorient.synth import EnsembleSpec, RandomMotion, SynthSettings, degrad
 from sphereorient.synth.degrade import Disk
 from sphereorient.synth.degrade_scene import picture_of_ball
 from sphereorient.synth.ensemble import Draw, Law
-from sphereorient.synth.scene import digitise, expose
-from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, write_truth
+from sphereorient.synth.scene import Exposure, digitise, exposures, seeded
+from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, instants_s, write_truth
 
 Floats = NDArray[np.float64]
 TEXTURE_SEED = 2011  # one painted sphere in all movies
@@ -31,7 +32,8 @@ LAWS = EnsembleSpec()  # of the paper's Table I, with docs/errata.md E6
 NEAR_MM = 40.0  # each coordinate of the centre is within this at one instant of every movie
 LAMPS = {"uneven_light": 2.5, "highlights": 80.0}  # severities as in docs/degradations.md
 MOST_BUBBLES = 4  # in front of the disk
-IMPELLER_HZ, BLADES, BAND_PX = 3.0, 8, 30.0
+BLADES, BAND_PX = 8, 30.0
+PHASES = 25  # frames until each blade is where the next one was: 3 turns a second at 600 Hz
 
 
 def waves(draws: list[Draw], scale: float, origin: Floats) -> Callable[..., Tensor]:
@@ -62,17 +64,19 @@ def tumbling(number: int, duration_s: float) -> RandomMotion:
     return RandomMotion(path=waves(moves, 1e3, there), omega=waves(turns, 1.0, np.zeros(3)), R_start=R_start)
 
 
-def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.float32]:
+@cache
+def impellers(size: tuple[int, int], camera: int, phase: int) -> NDArray[np.float32]:
     """Return the grey levels (H, W) of the turning disks on either side, seen from the edge, and of their reflections.
 
-    A blade is as wide as its height above the axis' plane and moves as the cosine of its angle.
+    A blade is as wide as its height above the axis' plane and moves as the cosine of its angle. `phase` counts frames:
+    one blade is where another was PHASES frames before.
     """
-    width, height = size
+    height, width = size
     u, v = np.arange(width), np.arange(height)[:, None]
     blade = np.arange(BLADES)
     light = np.zeros((height, width), np.float32)
     for side, edge in ((1, u), (-1, width - 1 - u)):
-        angle = 2 * np.pi * (side * IMPELLER_HZ * time_s + (blade + 0.3 * camera) / BLADES)
+        angle = 2 * np.pi * (side * phase / PHASES + blade + 0.3 * camera) / BLADES
         up = np.maximum(np.sin(angle), 0.0)
         down_px = height / 2 * (1 + 1.1 * np.cos(angle))
         profile = np.exp(-0.5 * ((v - down_px) / (4 + 14 * up)) ** 2)  # (H, blades)
@@ -83,27 +87,19 @@ def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.f
     return light
 
 
-def disturb(light: NDArray[np.float32], cover: NDArray[np.float32], disk: Disk, seeds: tuple[int, int, int]) -> None:
+def disturb(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]) -> None:
     """Put what real pictures have on the sphere in grey levels (H, W): lamps of the tank, and bubbles of each frame.
 
     `seeds` are camera, movie and frame.
     """
-    corner = [max(0, int(x) - round(1.5 * float(disk.radius_px))) for x in disk.centre_px]
-    window = tuple(slice(first, first + round(3 * float(disk.radius_px))) for first in reversed(corner))
-    part = torch.from_numpy(light[window])
-    if part.numel() == 0:
-        return
-    inside = replace(disk, centre_px=disk.centre_px - torch.tensor(corner), cover=torch.from_numpy(cover[window]))
-    static, moving = (torch.Generator().manual_seed(hash_of(seeds[:count])) for count in (1, 3))
-    part = degrade(part, inside, LAMPS, static)
-    light[window] = degrade(
-        part, inside, {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}, moving
-    )
-
-
-def hash_of(numbers: Sequence[int]) -> int:
-    """Return one seed of several numbers."""
-    return int(np.random.SeedSequence([TEXTURE_SEED, *numbers]).generate_state(1)[0])
+    part = exposure.within(round(0.5 * float(disk.radius_px)))
+    rows, columns = part.window
+    corner = torch.tensor([columns.start, rows.start])
+    inside = replace(disk, centre_px=disk.centre_px - corner, cover=torch.from_numpy(part.cover))
+    static, moving = (seeded(TEXTURE_SEED, *seeds[:count]) for count in (1, 3))
+    number = float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))
+    lit = degrade(torch.from_numpy(light[part.window]), inside, LAMPS, static)
+    light[part.window] = degrade(lit, inside, {"bubbles": number}, moving)
 
 
 def film(folder: Path, number: int, frames: int) -> None:
@@ -116,23 +112,21 @@ def film(folder: Path, number: int, frames: int) -> None:
     write_picture(aside / "texture.png", grey)
     scene = make_scene(torch.from_numpy(grey / np.float32(255)), settings)
     cameras, motion = default_cameras(settings), tumbling(number, frames / settings.frame_rate)
-    count, times_s = settings.exposure_samples, frame_times_s(settings)
-    within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
-    now = motion.at((times_s[:, None] + within).reshape(-1))
+    times_s, poses = frame_times_s(settings), motion.at(instants_s(settings).reshape(-1))
+    X, R = (part.unflatten(0, (frames, -1)) for part in (poses.position_lab_mm, poses.R_lab_body))
 
     def pictures(index: int, camera: Camera) -> Iterator[NDArray[np.uint8]]:
-        rng = np.random.default_rng([number, index])
-        for k, time_s in enumerate(times_s.tolist()):
-            row = slice(k * count, (k + 1) * count)
-            middle_mm, size = now.position_lab_mm[row].mean(0), torch.tensor(camera.image_size)
-            at = camera.project(middle_mm)
-            near = bool(((at > -size) & (at < 2 * size)).all())  # the lens's distortion is defined nearby only
-            shown = row if near else slice(0)
-            lit, cover = expose(scene, camera, now.position_lab_mm[shown], now.R_lab_body[shown])
-            lit += (1 - cover) * impellers(camera.image_size, index, time_s)
-            if near:
-                centre_px, radius_px = picture_of_ball(camera, middle_mm, settings.diameter_mm / 2)
-                disturb(lit, cover, Disk(centre_px=centre_px, radius_px=radius_px), (index, number, k))
+        rng, size = seeded(number, index), camera.image_size[::-1]
+        at, width = camera.project(X.mean(1)), torch.tensor(camera.image_size)
+        near = ((at > -width) & (at < 2 * width)).all(1)  # the lens's distortion is defined nearby only
+        disks = picture_of_ball(camera, X[near].mean(1), settings.diameter_mm / 2)
+        seen = zip(exposures([scene], camera, X[None, near], R[None, near]), disks.each(), strict=True)
+        for k in range(frames):
+            behind = settings.background + impellers(size, index, k % PHASES)
+            exposure, disk = next(seen) if near[k] else (Exposure.none(size), None)
+            lit = exposure.before(behind)
+            if disk is not None:
+                disturb(lit, exposure, disk, (index, number, k))
             yield digitise(lit, settings, rng)
 
     for index, (name, camera) in enumerate(cameras.items()):

@@ -40,7 +40,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.pose.fitter import widest_px
 from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.synth import SynthSettings
-from sphereorient.synth.scene import make_scene, render_frame
+from sphereorient.synth.scene import make_scene, render_frame, seeded
 from sphereorient.synth.textures import KINDS, random_texture
 from sphereorient.synth.write import default_cameras
 from sphereorient.trajectory import Trajectory
@@ -77,7 +77,7 @@ def write_stills(folder: Path, stills: Stills) -> Path:
     R = so3.random_rotations(stills.count, generator=rng)
     reach_mm = 0.5 * (WIDE_SIDE - 1.2) * settings.diameter_mm if stills.moves else 0.0
     X = (2 * torch.rand(stills.count, 3, generator=rng, dtype=torch.float64) - 1) * reach_mm
-    scene, noise = make_scene(texture, settings), np.random.default_rng(stills.seed)
+    scene, noise = make_scene(texture, settings), seeded(stills.seed)
     (folder / "photographs").mkdir(parents=True, exist_ok=True)
     for k in range(stills.count):
         grey = render_frame(scene, camera, X[k : k + 1], R[k : k + 1], noise)

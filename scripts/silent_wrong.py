@@ -37,7 +37,7 @@ from sphereorient.files.picture import write_picture
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.synth import SynthSettings, make_scene, random_texture
 from sphereorient.synth.motion import Motion6D
-from sphereorient.synth.scene import RenderedScene, digitise, expose
+from sphereorient.synth.scene import RenderedScene, digitise, expose, seeded
 from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, motion_of, write_truth
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -504,7 +504,7 @@ def film(folder: Path, case: Case) -> Path:
         return whole.position_lab_mm[index], whole.R_lab_body[index]
 
     for index, (name, camera) in enumerate(cameras.items()):
-        rng = np.random.default_rng([settings.seed, index])
+        rng = seeded(settings.seed, index)
         frames = np.stack(list(pictures(case, scene, camera, index, times_s, poses, rng)))
         if case.movie is not None:
             frames = case.movie(frames, index)
@@ -534,7 +534,7 @@ def pictures(
     index: int,
     times_s: Tensor,
     poses: Callable[[Tensor], tuple[Tensor, Tensor]],
-    rng: np.random.Generator,
+    rng: torch.Generator,
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield the frames (H, W) of one camera."""
     settings = scene.settings
@@ -542,7 +542,9 @@ def pictures(
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
 
     def filmed(time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        return expose(scene, camera, *poses(time_s + within))
+        X, R = poses(time_s + within)
+        exposure = expose([scene], camera, X[None], R[None])
+        return exposure.before(settings.background), exposure.covered
 
     for k, time_s in enumerate(times_s.tolist()):
         lit, cover = filmed(time_s)

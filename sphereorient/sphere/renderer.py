@@ -140,7 +140,8 @@ class SphereRenderer(nn.Module):
         (width, height), sampling = self.camera.image_size, self.sampling
         samples = sampling.supersampling
         middle_px = self.camera.project(position)
-        reach = reach_px(self.camera, position.detach(), float(radius.amax()) if len(radius) else 1.0)
+        reaches = reach_px(self.camera, position.detach(), float(radius.amax()) if len(radius) else 1.0)
+        reach = float(reaches.max()) if len(reaches) else 1.0
         half = math.ceil(reach + 4 * sampling.blur_px) + 1
         size = 2 * half + 1
         # Spheres may leave the picture: the canvas has room for a window beyond its edges.
@@ -216,20 +217,22 @@ def rim_directions(camera: Camera, position_lab_mm: Tensor, count: int) -> tuple
     return angle.cos()[:, None] * across[..., None, :] + angle.sin()[:, None] * second[..., None, :], sight
 
 
-def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> float:
-    """Return the largest distance from projected centres to rims, px, plus 4 %, for centres (N, 3), mm, lab.
+def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: Tensor | float) -> Tensor:
+    """Return the largest distances (...) from projected centres to rims, px, plus 4 %, for centres (..., 3), mm, lab.
+
+    `radius_mm` is one number or (...).
 
     Raises:
         CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
-    if len(position_lab_mm) == 0:
-        return 1.0
     rim, sight = rim_directions(camera, position_lab_mm, RIM_POINTS)
     # The point nearest to the camera is not on the rim but must be in the liquid too.
-    offset_mm = radius_mm * torch.cat([RIM_MARGIN * rim, -sight[:, None]], dim=1)
-    rim_px = camera.project(position_lab_mm[:, None] + offset_mm)
-    reach = float((rim_px - camera.project(position_lab_mm)[:, None]).norm(dim=-1).max())
-    if math.isnan(reach):
+    offset_mm = torch.as_tensor(radius_mm)[..., None, None] * torch.cat(
+        [RIM_MARGIN * rim, -sight[..., None, :]], dim=-2
+    )
+    rim_px = camera.project(position_lab_mm[..., None, :] + offset_mm)
+    reach: Tensor = (rim_px - camera.project(position_lab_mm)[..., None, :]).norm(dim=-1).amax(-1)
+    if bool(reach.isnan().any()):
         do = "move it away from the camera or the wall"
         raise CameraError(refusal("position_lab_mm", expected="a ball that is seen whole", got="another", do=do))
     return reach

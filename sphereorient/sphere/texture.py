@@ -131,12 +131,22 @@ def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
 
     Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
     """
+    check_texture_shape(texture)
+    return sample_closed(closed_texture(texture), direction_body)
+
+
+def closed_texture(texture: Tensor) -> Tensor:
+    """Return a map (H, 2 H) continued by a texel over its edges, (H + 2, 2 H + 2), for `sample_closed`."""
+    return _continued(texture, 1)
+
+
+def sample_closed(closed: Tensor, direction_body: Tensor) -> Tensor:
+    """Return the grey of `sample_texture`, of a map that is sampled more than once."""
     from kornia.geometry.transform import remap  # late: half a second, and tables do without it
 
-    check_texture_shape(texture)
-    column, row = texel_coordinates(direction_body, len(texture))
+    column, row = texel_coordinates(direction_body, len(closed) - 2)
     grey = remap(
-        _continued(texture, 1)[None, None],
+        closed[None, None],
         (column + 1).reshape(1, 1, -1),
         (row + 1).reshape(1, 1, -1),
         align_corners=True,

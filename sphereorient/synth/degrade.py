@@ -1,9 +1,10 @@
 """Degradations of picture batches, without kornia augmentations: these draw from torch's global generator."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -32,6 +33,12 @@ class Disk:
     def __post_init__(self) -> None:
         check_tail("centre_px", self.centre_px, 2)
 
+    def each(self) -> Iterator[Self]:
+        """Yield the disks of N pictures one by one."""
+        covers = [None] * len(self.radius_px) if self.cover is None else self.cover
+        for centre_px, radius_px, cover in zip(self.centre_px, self.radius_px, covers, strict=True):
+            yield type(self)(centre_px=centre_px, radius_px=radius_px, cover=cover)
+
     def offset(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's offset from the centre to the right and down, (..., H, W) each, px."""
         height, width = pictures.shape[-2:]
@@ -52,6 +59,8 @@ class Disk:
 
 
 Operation = Callable[[Tensor, float, Disk, torch.Generator], Tensor]
+Draw = Callable[[Tensor, float, torch.Generator], Tensor]
+Put = Callable[[Tensor, Tensor, Disk], Tensor]
 
 
 def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
@@ -102,13 +111,23 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
 
 
 def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Add structure behind the sphere, uniformly distributed, at least 0, standard deviation `rms` grey levels."""
+    """Add structure behind the sphere, see `clutter`."""
+    return add_behind(pictures, clutter(pictures, rms, rng), disk)
+
+
+def clutter(pictures: Tensor, rms: float, rng: torch.Generator) -> Tensor:
+    """Draw structure (..., H, W), uniformly distributed, at least 0, standard deviation `rms` grey levels."""
     field = blurred(_normal(pictures, rng), CLUTTER_PX)
     field = (field - field.mean((-2, -1), keepdim=True)) / _spread(field)
     even = torch.special.ndtr(field)
     even = even - even.amin((-2, -1), keepdim=True)
-    clutter: Tensor = (rms / _spread(even)) * even
-    return pictures + (1 - disk.covered(pictures)) * clutter
+    found: Tensor = (rms / _spread(even)) * even
+    return found
+
+
+def add_behind(pictures: Tensor, light: Tensor, disk: Disk) -> Tensor:
+    """Add grey levels (..., H, W) behind the sphere."""
+    return pictures + (1 - disk.covered(pictures)) * light
 
 
 def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
@@ -145,8 +164,13 @@ def bubbles(pictures: Tensor, number: float, disk: Disk, rng: torch.Generator) -
 
 def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -> Tensor:
     """Draw dark round specks of this radius, px, anywhere in the picture."""
-    if radius_px == 0:
-        return pictures
+    return darken(pictures, specks(pictures, radius_px, rng), disk)
+
+
+def specks(pictures: Tensor, radius_px: float, rng: torch.Generator) -> Tensor:
+    """Draw which share of each pixel specks hide, (..., H, W)."""
+    if radius_px == 0 or pictures.numel() == 0:
+        return torch.zeros_like(pictures)
     height, width = pictures.shape[-2:]
     half = math.ceil(radius_px)
     # Centres lie beyond the border too: specks reach in from there.
@@ -154,13 +178,16 @@ def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -
     middles = (torch.rand(wider.shape, generator=rng, dtype=wider.dtype, device=rng.device) < SPECKS_PER_PX2).to(wider)
     at = torch.arange(-half, half + 1, dtype=pictures.dtype, device=pictures.device)
     speck = _round(at, at[:, None], pictures.new_tensor(radius_px))
-    if pictures.numel() == 0:
-        return pictures
     from kornia.filters import filter2d
 
     flat = middles.reshape(-1, 1, *wider.shape[-2:])
-    hidden = filter2d(flat, speck[None], border_type="constant", padding="valid").clamp_max(1)
-    return pictures + hidden.reshape(pictures.shape) * (SPECK - pictures)
+    hidden: Tensor = filter2d(flat, speck[None], border_type="constant", padding="valid").clamp_max(1)
+    return hidden.reshape(pictures.shape)
+
+
+def darken(pictures: Tensor, hidden: Tensor, disk: Disk) -> Tensor:
+    """Hide shares (..., H, W) of the pixels behind specks."""
+    return pictures + hidden * (SPECK - pictures)
 
 
 def contrast_loss(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
@@ -221,6 +248,12 @@ OPERATIONS: Mapping[str, Operation] = MappingProxyType(
     }
 )
 
+# Those that draw a field of the whole picture: how it is drawn, and how it is put into a picture.
+FIELDS: Mapping[str, tuple[Draw, Put]] = MappingProxyType(
+    {"background_clutter": (clutter, add_behind), "dirt": (specks, darken)}
+)
+NOISE = ("shot_noise", "read_noise")  # of every pixel in every frame
+BEYOND = {"occlusion": 2.0, "bubbles": BUBBLE_RADII}  # how far these reach beyond the disk, radii
 OF_ONE_BALL = ("uneven_light", "highlights", "occlusion", "bubbles")  # lie on the disk of a ball
 
 
@@ -253,10 +286,15 @@ def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
         return pictures
     from kornia.filters import gaussian_blur2d
 
-    size = 2 * math.ceil(4 * sigma_px) + 1
+    size = 2 * blur_reach(sigma_px) + 1
     flat = pictures.reshape(-1, 1, *pictures.shape[-2:])
     smooth: Tensor = gaussian_blur2d(flat, (size, size), (sigma_px, sigma_px), border_type="replicate")
     return smooth.reshape(pictures.shape)
+
+
+def blur_reach(sigma_px: float) -> int:
+    """Return how far a pixel is spread by `blurred`, px."""
+    return math.ceil(4 * sigma_px)
 
 
 def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
 """What degradations change of a filmed scene: its settings, the map, the pictures, and the reported inputs."""
 
 import math
-import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -16,8 +15,8 @@ from sphereorient.cameras import Camera, TsaiCamera
 from sphereorient.sphere import sample_texture
 from sphereorient.sphere.renderer import rim_directions
 from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.degrade import OPERATIONS, Disk, gain_to_clip, lost_frames
-from sphereorient.synth.scene import expose, make_scene
+from sphereorient.synth.degrade import BEYOND, FIELDS, NOISE, OPERATIONS, Disk, blur_reach, gain_to_clip, lost_frames
+from sphereorient.synth.scene import Exposure, expose, make_scene, seeded
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, degradation
 
@@ -111,7 +110,21 @@ class Filming:
         self.settings = settings
         self.values = dict(values)
         self.cameras = cameras
-        self.gains = {name: self._gain(name) for name in cameras} if "saturation" in values else {}
+        self.applied = tuple(name for name in OPERATIONS if self.values.get(name, nothing(name)) != nothing(name))
+        self.optics = tuple(name for name in self.applied if name not in NOISE)
+        size = {name: camera.image_size[::-1] for name, camera in cameras.items()}
+        self.fields = {
+            (name, what): draw(torch.empty(size[name]), self.values[what], self._generator(what, name))
+            for name in cameras
+            for what, (draw, _) in FIELDS.items()
+            if what in self.applied
+        }
+        self.gains = {name: self._gain(name) for name in cameras} if "saturation" in self.applied else {}
+        anywhere = Disk(centre_px=torch.zeros(2), radius_px=torch.ones(()))
+        self.empty = {  # grey levels (H, W) without a ball, before noise
+            name: self._lit(Exposure.none(size[name]).within(max(size[name])), anywhere, name, None, self.optics)
+            for name in cameras
+        }
 
     def paint(self, texture: Tensor, number: int = 0) -> Tensor:
         """Return the map of a filmed paint, (H, 2 H), worn."""
@@ -121,15 +134,18 @@ class Filming:
         """Return the map of a paint to write, (H, 2 H), with exchanged patches."""
         return misdrawn(texture, self.values.get("texture_error", 0.0), self._of_paint("texture_error", number))
 
-    def disk(self, name: str, position_lab_mm: Tensor, cover: NDArray[np.float32]) -> Disk:
-        """Return the place of the sphere at (3,) in a camera's picture; `cover` (H, W): coverage of each pixel."""
-        centre_px, radius_px = picture_of_ball(self.cameras[name], position_lab_mm, self.settings.diameter_mm / 2)
-        return Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(cover))
+    def picture(self, exposure: Exposure, disk: Disk, name: str, frame: int) -> NDArray[np.float32]:
+        """Return degraded grey levels (H, W) of a camera's frame, before the camera's own noise.
 
-    def picture(self, picture: NDArray[np.float32], disk: Disk, name: str, frame: int | None) -> NDArray[np.float32]:
-        """Degrade grey levels (H, W) before noise; frame None gets only degradations that the movie shares."""
-        light = self._through(tuple(OPERATIONS), torch.from_numpy(picture), disk, name, frame)
-        return cast("NDArray[np.float32]", light.numpy())
+        `disk` is the place of the sphere. What the sphere cannot change is taken from the empty picture.
+        """
+        beyond = max((BEYOND.get(what, 0.0) for what in self.optics), default=0.0) * float(disk.radius_px)
+        changed = exposure.within(math.ceil(beyond) + self._spread)
+        picture = self.empty[name].clone()
+        picture[changed.window] = self._lit(changed, disk, name, frame, self.optics)
+        for what in self.applied[len(self.optics) :]:
+            picture = OPERATIONS[what](picture, self.values[what], disk, self._generator(what, name, frame))
+        return cast("NDArray[np.float32]", picture.numpy())
 
     def lost(self, name: str, frames: int) -> frozenset[int]:
         """Draw the black frames of a camera."""
@@ -137,43 +153,60 @@ class Filming:
         lost = lost_frames(torch.empty(frames), share, self._generator("dropped_frames", name))
         return frozenset(lost.nonzero()[:, 0].tolist())
 
-    def _through(self, operations: tuple[str, ...], light: Tensor, disk: Disk, name: str, frame: int | None) -> Tensor:
-        for what in operations:
-            row = DEGRADATIONS[what]
-            value = self.values.get(what, row.nothing)
-            if value is None or value == row.nothing or (row.where == "frame" and frame is None):
-                continue
-            # Static degradations use the same random numbers in every frame.
-            rng = self._generator(what, name, *([] if row.where != "frame" else [frame or 0]))
-            light = light * self.gains[name] if what == "saturation" else OPERATIONS[what](light, value, disk, rng)
-        return light
+    @property
+    def _spread(self) -> int:
+        """How far the lens spreads a pixel, px."""
+        return blur_reach(self.values.get("defocus", 0.0))
+
+    def _lit(self, part: Exposure, disk: Disk, name: str, frame: int | None, optics: Sequence[str]) -> Tensor:
+        """Return grey levels (h, w) of a part of a picture, before noise; frame None: as far as the movie shares it."""
+        wider = part.within(self._spread)
+        (rows, columns), height, width = wider.window, *part.light.shape
+        corner = disk.centre_px.new_tensor([columns.start, rows.start])
+        disk = replace(disk, centre_px=disk.centre_px - corner, cover=torch.from_numpy(wider.cover))
+        light = torch.from_numpy(wider.light + (1 - wider.cover) * np.float32(self.settings.background))
+        for what in optics:
+            moves = DEGRADATIONS[what].where == "frame"
+            if what in FIELDS:
+                light = FIELDS[what][1](light, self.fields[name, what][wider.window], disk)
+            elif what == "saturation":
+                light = light * self.gains[name]
+            elif not moves or frame is not None:
+                # Static degradations use the same random numbers in every frame.
+                rng = self._generator(what, name, *([frame] if moves and frame is not None else []))
+                light = OPERATIONS[what](light, self.values[what], disk, rng)
+        down, right = part.window[0].start - rows.start, part.window[1].start - columns.start
+        return light[down : down + height, right : right + width]
 
     def _gain(self, name: str) -> float:
         """Return the exposure gain that saturates a white sphere, after the operations before saturation."""
-        origin = torch.zeros(1, 3, dtype=torch.float64)
-        scene = make_scene(torch.ones(8, 16), self.settings)
-        picture, cover = expose(scene, self.cameras[name], origin, torch.eye(3, dtype=torch.float64)[None])
-        before = tuple(OPERATIONS)[: tuple(OPERATIONS).index("saturation")]
-        light = self._through(before, torch.from_numpy(picture), self.disk(name, origin[0], cover), name, None)
-        white = torch.from_numpy(cover) > 0.99
-        return float(gain_to_clip(light.flatten(), white.flatten(), self.values["saturation"]))
+        camera, origin = self.cameras[name], torch.zeros(1, 1, 3, dtype=torch.float64)
+        white = make_scene(torch.ones(8, 16), self.settings)
+        part = expose([white], camera, origin, torch.eye(3, dtype=torch.float64)[None, None])
+        disk = picture_of_ball(camera, origin[0, 0], self.settings.diameter_mm / 2)
+        light = self._lit(part, disk, name, None, self.optics[: self.optics.index("saturation")])
+        inside = torch.from_numpy(part.cover) > 0.99
+        return float(gain_to_clip(light.flatten(), inside.flatten(), self.values["saturation"]))
 
     def _of_paint(self, what: str, number: int) -> torch.Generator:
         return self._generator(what, *([number] if number else []))
 
     def _generator(self, *what: str | int) -> torch.Generator:
         # By name: another degradation does not change the random numbers of the rest.
-        words = [zlib.crc32(word.encode()) if isinstance(word, str) else word for word in what]
-        state = np.random.SeedSequence([self.settings.seed, *words]).generate_state(1, np.uint64)
-        return torch.Generator().manual_seed(int(state[0]) >> 1)
+        return seeded(self.settings.seed, *what)
 
 
-def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return the projected centres (..., 2) and mean rim radii (...), px, of spheres at (..., 3), mm, lab."""
+def nothing(name: str) -> float | None:
+    """Return the value of a degradation that has no effect."""
+    return DEGRADATIONS[name].nothing
+
+
+def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Disk:
+    """Return the disks of spheres at (..., 3), mm, lab: projected centres (..., 2) and mean rim radii (...), px."""
     centre_px = camera.project(position_lab_mm)
     rim, _ = rim_directions(camera, position_lab_mm, 4)
     rim_px = camera.project(position_lab_mm[..., None, :] + radius_mm * rim)
-    return centre_px, (rim_px - centre_px[..., None, :]).norm(dim=-1).mean(-1)
+    return Disk(centre_px=centre_px, radius_px=(rim_px - centre_px[..., None, :]).norm(dim=-1).mean(-1))
 
 
 def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float], seed: int = 0) -> Mapping[str, Camera]:

@@ -20,9 +20,9 @@ from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
 from sphereorient.synth.degrade import OF_ONE_BALL
-from sphereorient.synth.degrade_scene import Filming, degraded_settings, wrong_cameras
+from sphereorient.synth.degrade_scene import Filming, degraded_settings, picture_of_ball, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion, without_seam
-from sphereorient.synth.scene import RenderedScene, digitise, expose_several, make_scene
+from sphereorient.synth.scene import RenderedScene, digitise, exposures, make_scene, seeded
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import degradation, severity
 from sphereorient.synth.textures import random_texture
@@ -103,15 +103,13 @@ def write_synthetic_experiment(
         for k in range(min(settings.balls, settings.paints))
     ]
     scenes = [make_scene(filming.paint(texture, k), settings) for k, texture in enumerate(textures)]
-    instants_s = _instants_s(settings).reshape(-1)
-    filmed = [(scenes[settings.worn[name]], motion.at(instants_s)) for name, motion in motions.items()]
+    at_s = instants_s(settings).reshape(-1)
+    filmed = [(scenes[settings.worn[name]], motion.at(at_s)) for name, motion in motions.items()]
     for index, name in enumerate(cameras):
-        frames = _frames(filmed, filming, name, np.random.default_rng([settings.seed, index]), progress)
+        frames = _frames(filmed, filming, name, seeded(settings.seed, index), progress)
         write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
-        size = cameras[name].image_size[::-1]
-        disk = filming.disk(name, torch.zeros(3, dtype=torch.float64), np.zeros(size, np.float32))
-        empty = filming.picture(np.full(size, settings.background, np.float32), disk, name, None)
-        write_picture(folder / f"empty_{name}.png", np.clip(np.rint(empty), 0, 255).astype(np.uint8))
+        empty = filming.empty[name].round().clamp(0, 255).byte().numpy()
+        write_picture(folder / f"empty_{name}.png", empty)
     for k, texture in enumerate(textures):
         write_picture(folder / _texture_file(settings, k), _as_file(filming.reported_texture(texture, k)))
     reported = wrong_cameras(cameras, values, settings.seed)
@@ -129,7 +127,7 @@ def frame_times_s(settings: SynthSettings) -> Tensor:
     return torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
 
 
-def _instants_s(settings: SynthSettings) -> Tensor:
+def instants_s(settings: SynthSettings) -> Tensor:
     """Return the instants of each exposure, (N, E) float64, s."""
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
@@ -142,7 +140,7 @@ def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
     Raises:
         SettingsError: no room for a ball.
     """
-    times_s, motions, paths = _instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
+    times_s, motions, paths = instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
     for k, name in enumerate(settings.worn):
         for draw in range(DRAWS):
             seed = settings.seed + NEXT_SEED * (k + 8 * draw)
@@ -185,20 +183,21 @@ def _frames(
     filmed: Sequence[tuple[RenderedScene, Motion6D]],
     filming: Filming,
     name: str,
-    rng: np.random.Generator,
+    rng: torch.Generator,
     progress: Callable[[int], None],
 ) -> Iterator[NDArray[np.uint8]]:
-    settings, count = filming.settings, filming.settings.exposure_samples
-    scenes = [scene for scene, _ in filmed]
-    position = torch.stack([poses.position_lab_mm for _, poses in filmed])
-    R_lab_body = torch.stack([poses.R_lab_body for _, poses in filmed])
+    settings, camera = filming.settings, filming.cameras[name]
+    position, R_lab_body = (
+        torch.stack([part.reshape(settings.frames, -1, *part.shape[1:]) for part in parts])
+        for parts in zip(*((poses.position_lab_mm, poses.R_lab_body) for _, poses in filmed), strict=True)
+    )
+    # Of several balls the degradations know only the cover.
+    disks = picture_of_ball(camera, position[0].mean(1), settings.diameter_mm / 2).each()
+    seen = exposures([scene for scene, _ in filmed], camera, position, R_lab_body)
     lost = filming.lost(name, settings.frames)
-    for k in range(settings.frames):
-        X, R = (x[:, k * count : (k + 1) * count] for x in (position, R_lab_body))
-        picture, cover = expose_several(scenes, filming.cameras[name], X, R)
-        # Lost frames draw noise too: the other frames do not depend on losses. Of several balls only the cover counts.
-        disk = filming.disk(name, X[0].mean(0), cover)
-        frame = digitise(filming.picture(picture, disk, name, k), settings, rng)
+    for k, (exposure, disk) in enumerate(zip(seen, disks, strict=True)):
+        # Lost frames draw noise too: the other frames do not depend on losses.
+        frame = digitise(filming.picture(exposure, disk, name, k), settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
         progress(1)
 

@@ -13,7 +13,7 @@ from sphereorient import so3
 from sphereorient.cameras import save_cameras
 from sphereorient.files.picture import write_picture
 from sphereorient.synth import SynthSettings, make_scene, random_texture
-from sphereorient.synth.scene import digitise, expose_several
+from sphereorient.synth.scene import digitise, expose, seeded
 from sphereorient.synth.write import default_cameras
 
 FRAMES, RATE_HZ, DIAMETER_MM = 30, 600.0, 14.0
@@ -59,15 +59,15 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several
         write_picture(folder / f"texture_{seed}.png", np.rint(texture.numpy() * 255).astype(np.uint8))
     scenes = [make_scene(paint[PAINTS[name]], settings) for name in balls]
     for n, (name, camera) in enumerate(seen.items()):
-        rng = np.random.default_rng(n)
+        rng = seeded(n)
         movie = [
             digitise(
-                expose_several(
+                expose(
                     scenes,
                     camera,
                     torch.stack([place[ball][k : k + 1] for ball in balls]),
                     torch.stack([R[ball][k : k + 1] for ball in balls]),
-                )[0],
+                ).before(settings.background),
                 settings,
                 rng,
             )

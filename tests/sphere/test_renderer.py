@@ -229,7 +229,8 @@ def test_the_picture_is_the_synthetic_movies_one():
     unit = lamps[:, :3] / lamps[:, :3].norm(dim=-1, keepdim=True)
     ball = replace(a_ball(texture.double(), 0.25), lamps_lab=unit * lamps[:, 3:] * (0.5 / 0.75))
     got = expected_grey(rays, place, R, ball).reshape(75, 75)
-    expected, cover = expose(make_scene(texture, settings), camera, place[None], R[None])
+    exposure = expose([make_scene(texture, settings)], camera, place[None, None], R[None, None])
+    expected, cover = exposure.before(settings.background), exposure.covered
     miss = got - torch.from_numpy(expected)
     full = torch.from_numpy(cover) > 0.99
     assert miss.square().mean().sqrt() < 4.0  # of 150 grey levels from black to white

@@ -215,9 +215,9 @@ def test_the_ball_in_a_picture_is_where_and_as_large_as_it_is_seen(plain):
     # Over the limb's threshold: the disk's area and middle, 40 px at the origin.
     camera = default_cameras(SETTINGS)["cam1"]
     near = torch.tensor([[0.0, -60.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)  # mm; cam1 looks along +y
-    centre, radius = picture_of_ball(camera, near, 9.0)
-    assert_close(centre, camera.project(near))
-    assert radius.tolist() == pytest.approx([20 * 520 / 460, 20.0], rel=1e-3)
+    disk = picture_of_ball(camera, near, 9.0)
+    assert_close(disk.centre_px, camera.project(near))
+    assert disk.radius_px.tolist() == pytest.approx([20 * 520 / 460, 20.0], rel=1e-3)
 
 
 # The scene.
@@ -342,8 +342,8 @@ def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     path = write_synthetic_experiment(tmp_path, SETTINGS, values={"radius_error": 2.0})
     told = load_experiment(path)
     assert told.diameter_mm == pytest.approx(18.0 * (20 + 2) / 20)
-    _, radius = picture_of_ball(told.cameras["cam1"], torch.zeros(3, dtype=torch.float64), told.diameter_mm / 2)
-    assert float(radius) == pytest.approx(22.0, rel=1e-3)
+    disk = picture_of_ball(told.cameras["cam1"], torch.zeros(3, dtype=torch.float64), told.diameter_mm / 2)
+    assert float(disk.radius_px) == pytest.approx(22.0, rel=1e-3)
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def test_paint_is_that_which_the_projects_other_renderer_shows(rng):
     centre = seen_at(lens, 0.0, 0.0)
     inside = np.hypot(*np.moveaxis(AT, -1, 0)) < 0.9
     for R_lab_body in so3.random_rotations(4, generator=rng):
-        frame = render_frame(stage, lens, centre[None], R_lab_body[None], np.random.default_rng(0))
+        frame = render_frame(stage, lens, centre[None], R_lab_body[None], seeded(0))
         u, v = (side.item() for side in lens.centre_px)
         cropped = crop_disk(frame, u, v, 36.0, EXACT.size_px)[inside]
         R_view_body = (lens.R_cam_lab @ R_lab_body).float()

@@ -14,6 +14,7 @@ from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.renderer import reach_px
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture, render_frame
+from sphereorient.synth.scene import seeded
 
 RADIUS_MM = 9.0
 LENSES = {
@@ -78,7 +79,7 @@ def test_spots_of_paint_are_where_the_camera_shows_that_point_of_the_sphere(name
 
 @pytest.mark.parametrize("name", LENSES)
 def test_the_scene_shows_the_same_outline(name):  # oracle
-    frame = render_frame(scene(), LENSES[name], PLACE[name][None], TURN[None], np.random.default_rng(0))
+    frame = render_frame(scene(), LENSES[name], PLACE[name][None], TURN[None], seeded(0))
     area, middle = mass(torch.from_numpy(frame.astype(np.float64)))
     expected_area, expected_middle = outline_of(LENSES[name], PLACE[name], RADIUS_MM)
     assert area / frame.max() == pytest.approx(expected_area, rel=5e-3)
@@ -88,9 +89,7 @@ def test_the_scene_shows_the_same_outline(name):  # oracle
 @pytest.mark.parametrize("name", LENSES)
 def test_scene_and_clean_picture_show_the_same_paint(name):
     texture = random_texture("blobs", 3, 256)
-    frame = render_frame(
-        scene(texture, black=0.0, white=200.0), LENSES[name], PLACE[name][None], TURN[None], np.random.default_rng(0)
-    )
+    frame = render_frame(scene(texture, black=0.0, white=200.0), LENSES[name], PLACE[name][None], TURN[None], seeded(0))
     sampling = Sampling(blur_px=0.0)
     sharp = 200 * SphereRenderer(texture, radius_mm=RADIUS_MM, camera=LENSES[name], sampling=sampling)(
         TURN, PLACE[name]
@@ -111,4 +110,4 @@ def test_a_ball_that_touches_the_wall_is_refused():
     normal = lens.port.normal_lab
     at_the_wall = PLACE["near"] + (lens.port.offset_mm - 0.5 * RADIUS_MM - PLACE["near"] @ normal) * normal
     with pytest.raises(CameraError, match="expected a ball that is seen whole"):
-        render_frame(scene(), lens, at_the_wall[None], TURN[None], np.random.default_rng(0))
+        render_frame(scene(), lens, at_the_wall[None], TURN[None], seeded(0))

@@ -6,16 +6,19 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synth_examples import camera, f64, scene, seen_at
+from synth_examples import behind_wall, camera, f64, scene, seen_at
 
 from sphereorient import so3
+from sphereorient.sphere import see_sphere
+from sphereorient.sphere.renderer import fine_pixels, lambert
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
+from sphereorient.synth.scene import LAMPS, LIT, SUPERSAMPLING, expose, exposures, seeded
 
 UPRIGHT = torch.eye(3, dtype=torch.float64)
 
 
 def picture(a_scene, place, R_lab_body=UPRIGHT, lens=None, seed=0) -> np.ndarray:
-    return render_frame(a_scene, lens or camera(), place[None], R_lab_body[None], np.random.default_rng(seed))
+    return render_frame(a_scene, lens or camera(), place[None], R_lab_body[None], seeded(seed))
 
 
 def centre_of_mass(grey: np.ndarray) -> tuple[float, float]:
@@ -79,7 +82,7 @@ def test_a_long_exposure_is_the_mean_of_its_instants():
     lens, a_scene = camera(), scene(random_texture("blobs", 1, 64), background=30.0)
     places = torch.stack([seen_at(lens, 0.0, 0.0), seen_at(lens, 0.5, -0.3)])
     R = so3.random_rotations(2, generator=torch.Generator().manual_seed(1))
-    both = render_frame(a_scene, lens, places, R, np.random.default_rng(0)).astype(float)
+    both = render_frame(a_scene, lens, places, R, seeded(0)).astype(float)
     single = [picture(a_scene, place, r, lens).astype(float) for place, r in zip(places, R, strict=True)]
     assert np.abs(both - (single[0] + single[1]) / 2).max() <= 1.0  # each is rounded to whole levels
 
@@ -118,3 +121,41 @@ def test_noise_has_its_standard_deviation_and_its_seed():
 def test_a_scene_holds_the_map_at_the_pictures_resolution():
     # 3 rays a pixel: 3 x 40 px of diameter show 377 texels around.
     assert make_scene(torch.zeros(512, 1024), SynthSettings(diameter_px=40.0)).texture.shape == (256, 512)
+
+
+@pytest.mark.parametrize("lens", [camera(), behind_wall(camera())], ids=["air", "wall"])
+def test_fast_pixels_are_those_of_see_sphere(lens):  # oracle: the renderer's own rays, all in double precision
+    texture = random_texture("blobs", 3, 64)
+    a_scene = scene(texture, ambient=0.3, background=7.0)
+    places = torch.stack([seen_at(camera(), 1.0, -0.5), seen_at(camera(), 1.1, -0.45)])
+    R = so3.random_rotations(2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    exposure = expose([a_scene], lens, places[None], R[None])
+    at = fine_pixels(200, SUPERSAMPLING)[: 160 * SUPERSAMPLING], fine_pixels(200, SUPERSAMPLING)
+    v, u = torch.meshgrid(*at, indexing="ij")
+    lamps = f64(LAMPS)
+    towards = torch.nn.functional.normalize(lamps[:, :3], dim=-1)
+    fine = torch.zeros(v.shape, dtype=torch.float64)
+    for place, turn in zip(places, R, strict=True):
+        seen = see_sphere(lens.rays(torch.stack([u, v], -1).flatten(0, 1)), place, turn, a_scene.texture, 9.0)
+        light = 0.3 + 0.7 * lambert(seen.normal, towards, lamps[:, 3]) / LIT
+        grey = (20.0 + 150.0 * seen.paint) * light
+        fine += torch.where(seen.depth2 > 0, grey, 7.0).reshape(v.shape) / 2
+    expected = torch.nn.functional.avg_pool2d(fine[None], SUPERSAMPLING)[0]
+    assert np.abs(exposure.before(7.0) - expected.numpy()).max() < 0.01
+
+
+def test_a_movie_is_its_frames_one_by_one():  # the batch law, also where rays are kept and where they are made anew
+    lens, a_scene = camera(), scene(random_texture("dots", 4, 64), blur_px=0.6)
+    places = torch.stack([seen_at(lens, 0.3 * k - 4.0, 0.1 * k) for k in range(24)]).reshape(1, 12, 2, 3)
+    R = so3.random_rotations(24, generator=torch.Generator().manual_seed(3), dtype=torch.float64).reshape(
+        1, 12, 2, 3, 3
+    )
+    movie = list(exposures([a_scene], lens, places, R))
+    assert len(movie) == 12
+    for k, exposure in enumerate(movie):
+        alone = expose([a_scene], lens, places[:, k], R[:, k])
+        assert exposure.window == alone.window
+        np.testing.assert_array_equal(exposure.light, alone.light)
+        np.testing.assert_array_equal(exposure.cover, alone.cover)
+        wider = exposure.within(7)
+        np.testing.assert_array_equal(wider.before(3.0), exposure.before(3.0))

@@ -14,7 +14,7 @@ from sphereorient.errors import SettingsError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, make_scene, write_synthetic_experiment
-from sphereorient.synth.scene import expose, expose_several
+from sphereorient.synth.scene import expose
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of, motions_of
 
 SMALL = SynthSettings(
@@ -68,9 +68,11 @@ def test_each_picture_is_that_of_the_balls_at_their_true_places(written):
         alone = {}
         for ball, motion in motions_of(SMALL).items():
             at = motion.at(frame_times_s(SMALL)[:1])
-            alone[ball] = expose(make_scene(textures[SMALL.worn[ball]], SMALL), one, at.position_lab_mm, at.R_lab_body)
-        covers = np.stack([cover for _, cover in alone.values()])
-        for k, (picture, cover) in enumerate(alone.values()):
+            ball_alone = make_scene(textures[SMALL.worn[ball]], SMALL)
+            alone[ball] = expose([ball_alone], one, at.position_lab_mm[None], at.R_lab_body[None])
+        covers = np.stack([exposure.covered for exposure in alone.values()])
+        for k, exposure in enumerate(alone.values()):
+            picture, cover = exposure.before(0.0), exposure.covered
             free = (cover > 0.99) & (np.delete(covers, k, axis=0).max(0) < 1e-3)
             assert free.sum() > 100
             assert np.abs(frame - picture)[free].max() < noise
@@ -134,9 +136,10 @@ def test_a_nearer_ball_covers_those_behind_it_whatever_their_order():
     eye = torch.eye(3, dtype=torch.float64)[None, None].expand(2, 1, -1, -1)
     u, v = lens.project(near).round().int().tolist()
     for scenes, places in (([dark, bright], [near, far]), ([bright, dark], [far, near])):
-        picture, cover = expose_several(scenes, lens, torch.stack(places)[:, None], eye)
+        exposure = expose(scenes, lens, torch.stack(places)[:, None], eye)
+        picture = exposure.before(0.0)
         assert picture[v, u] == pytest.approx(50.0)
-        assert cover.max() == pytest.approx(1.0)
+        assert exposure.cover.max() == pytest.approx(1.0)
         assert picture.max() == pytest.approx(200.0)
 
 
@@ -144,10 +147,10 @@ def test_balls_apart_add_and_the_cover_is_that_of_all():
     lens = camera()
     places = torch.stack([seen_at(lens, -3.0, 0.0), seen_at(lens, 3.0, 1.0)])[:, None]
     eye = torch.eye(3, dtype=torch.float64)[None]
-    both, cover = expose_several([white(), white()], lens, places, eye.expand(2, 1, -1, -1))
-    parts = [expose(white(), lens, X, eye) for X in places]
-    np.testing.assert_array_equal(both, parts[0][0] + parts[1][0])
-    np.testing.assert_array_equal(cover, parts[0][1] + parts[1][1])
+    both = expose([white(), white()], lens, places, eye.expand(2, 1, -1, -1))
+    parts = [expose([white()], lens, X[None], eye[None]) for X in places]
+    np.testing.assert_array_equal(both.before(0.0), parts[0].before(0.0) + parts[1].before(0.0))
+    np.testing.assert_array_equal(both.covered, parts[0].covered + parts[1].covered)
 
 
 def test_the_names_of_balls_that_look_alike_follow_the_number_of_paints():

@@ -14,6 +14,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.search import OrientSettings, TemplateBank, crop_disk
 from sphereorient.synth import SynthSettings, random_texture, render_frame
+from sphereorient.synth.scene import seeded
 from sphereorient.synth.write import default_cameras
 
 FRAMES, STEP_RAD = 7, math.radians(9.0)
@@ -40,7 +41,7 @@ def measured(lens: Camera, place: Tensor, R_lab_body: Tensor, perspective: bool 
     place_cam = lens.R_cam_lab @ place + lens.T_cam_lab_mm
     radius_px = DIAMETER_PX / 2 * 400.0 / float(place_cam[2])
     disks = [
-        crop_disk(render_frame(a_scene, lens, place[None], R[None], np.random.default_rng(k)), u, v, radius_px, 48)
+        crop_disk(render_frame(a_scene, lens, place[None], R[None], seeded(k)), u, v, radius_px, 48)
         for k, R in enumerate(R_lab_body)
     ]
     found = TemplateBank(TEXTURE, 48, OrientSettings()).propose(torch.from_numpy(np.stack(disks)))

@@ -17,6 +17,7 @@ from sphereorient.errors import OutputError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, make_scene, random_motion, render_frame, write_synthetic_experiment
+from sphereorient.synth.scene import seeded
 from sphereorient.synth.write import default_cameras
 
 FRAMES = 6
@@ -194,7 +195,7 @@ def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
         for k, frame in enumerate(frames_of(path)[name]):
             # The middles of the exposure's halves: 1 ms before and after the frame's time.
             now = motion.at(torch.tensor([k / 200 - 0.001, k / 200 + 0.001], dtype=torch.float64))
-            rng = np.random.default_rng(0)
+            rng = seeded(0)
             expected = render_frame(scene, camera, now.position_lab_mm, now.R_lab_body, rng)
             assert np.abs(frame.astype(int) - expected).max() <= 1
 
