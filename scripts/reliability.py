@@ -19,7 +19,7 @@ import numpy as np
 from sphereorient.cli.app import progress_bar
 from sphereorient.evaluate.robustness import BenchSettings, SceneResult
 from sphereorient.evaluate.robustness.results import WRONG_DEG
-from sphereorient.evaluate.robustness.run import KEPT, kept_results, limit_threads, run_scene, trackers_of
+from sphereorient.evaluate.robustness.run import CACHE, KEPT, kept_results, limit_threads, run_scene, trackers_of
 from sphereorient.evaluate.robustness.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.severities import LEVELS
@@ -42,7 +42,9 @@ def main() -> None:
     missing = [scene for scene, place in zip(scenes, places, strict=True) if not place.exists()]
     with (
         progress_bar(unit="") as advance,
-        ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn"), limit_threads) as pool,
+        ProcessPoolExecutor(
+            options.jobs, multiprocessing.get_context("spawn"), limit_threads, (options.out / CACHE,)
+        ) as pool,
     ):
         tasks = [pool.submit(run_scene, options.out, scene, trackers_of([METHOD])) for scene in missing]
         for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):

@@ -10,6 +10,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,7 @@ import pytest
 import typer
 import yaml
 from conftest import REPO
+from packaging.requirements import Requirement
 
 from sphereorient.calibration import load_calibration
 from sphereorient.calibration.document import CalibrationKeys
@@ -293,3 +295,15 @@ def test_links_between_the_pages_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)\)", page.read_text()):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), f"{page.name} -> {target}"
+
+
+def test_the_oldest_versions_that_are_tried_are_allowed_ones():
+    allowed = {
+        Requirement(line).name: Requirement(line).specifier
+        for line in tomllib.loads((REPO / "pyproject.toml").read_text())["project"]["dependencies"]
+    }
+    (command,) = re.findall(r"pip install (torch==.*)", (REPO / ".github" / "workflows" / "tests.yml").read_text())
+    tried = dict(re.findall(r'"?(\w+)(?:==|<)([\d.]+)', command))
+    assert {"torch", "kornia", "numpy", "h5py", "scipy", "av"} <= set(tried)
+    for name, version in tried.items():
+        assert allowed[name].contains(f"{version.rstrip('.')}"), (name, version)

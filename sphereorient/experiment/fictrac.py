@@ -15,6 +15,11 @@ from sphereorient.files.whole_file import TEXT_BYTES, read_text
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 DO = "name the config.txt with which FicTrac ran"
+# Keys that change the picture and are not taken over: values without effect, what is expected, and what to do.
+NOT_READ = {
+    "fisheye": (("n", ""), "n, a lens without fisheye", "undistort the movie, then calibrate its camera"),
+    "thr_rgb_tfrm": (("grey", "gray", ""), "grey, all colours", "write a movie of this colour alone, in grey"),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +35,9 @@ class FicTracConfig:
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
-    """Read config.txt; ExperimentError for another file, or one without movie or field of view."""
+    """Read config.txt; ExperimentError for another file, one that lacks movie, field of view or the animal's frame, or
+    one of a lens or a colour that is not taken over.
+    """
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
     pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith("#"))
     values = {key.strip(): value.strip() for key, _, value in pairs}
@@ -42,8 +49,14 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
         raise ExperimentError(
             refusal(f"{path}, vfov", expected="degrees, 0 to 180", got=f"'{values['vfov'][:40]}'", do="correct it")
         )
+    for name, (usual, what, do) in NOT_READ.items():
+        if values.get(name, usual[0]).lower() not in usual:
+            raise ExperimentError(refusal(f"{path}, {name}", expected=what, got=f"'{values[name][:40]}'", do=do))
+    if not values.get("c2a_r"):
+        do = "run FicTrac's configGui, or write c2a_r : { 0, 0, 0 } for the camera's own frame"
+        raise ExperimentError(refusal(f"{path}, c2a_r", expected="the turn to the animal, rad", got="none", do=do))
     rate = _numbers(values.get("src_fps", ""))
-    turn = _numbers(values.get("c2a_r", "")) or [0.0, 0.0, 0.0]
+    turn = _numbers(values["c2a_r"])
     if len(turn) != 3:
         got = f"{len(turn)}"
         raise ExperimentError(refusal(f"{path}, c2a_r", expected="three numbers, rad", got=got, do="correct it"))

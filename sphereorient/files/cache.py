@@ -20,7 +20,8 @@ from torch import Tensor
 
 from sphereorient.errors import error_words
 
-WITHOUT = "SPHEREORIENT_NO_CACHE"  # an environment variable: where it is set, nothing is kept or read
+# Environment variables: where this is set, nothing is kept or read; the folder in place of the user's.
+WITHOUT, FOLDER = "SPHEREORIENT_NO_CACHE", "SPHEREORIENT_CACHE"
 LARGEST_BYTES = 500_000_000  # of all files; the least recently used go first
 PACKAGE = Path(__file__).parents[1]
 MAKERS = ("so3.py", "sphere", "search", "pose")  # whose code what is kept depends on
@@ -29,7 +30,10 @@ Arrays = Mapping[str, NDArray[Any]]
 
 def cache_folder() -> Path | None:
     """Return the folder of kept arrays, there or not; None where `WITHOUT` is set."""
-    return None if os.environ.get(WITHOUT) else platformdirs.user_cache_path("sphereorient", appauthor=False)
+    if os.environ.get(WITHOUT):
+        return None
+    given = os.environ.get(FOLDER)
+    return Path(given) if given else platformdirs.user_cache_path("sphereorient", appauthor=False)
 
 
 def cached(kind: str, inputs: Iterable[Tensor | str | float | None], make: Callable[[], Arrays]) -> Arrays:

@@ -7,6 +7,7 @@ from typing import Any
 import yaml
 
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.whole_file import sealed
 from sphereorient.files.yaml_file import FAULTS, parse_yaml, refuse_unknown, short
 
 WIDTH = 120  # characters of a line
@@ -71,17 +72,17 @@ def draft_yaml(schema: str, keys: Sequence[DraftKey], head: str = "") -> str:
             lines += _line(children[0], parent, "")
             continue
         known = any(key.value is not ... for key in children)
-        lines.append(f"{'' if known else '# '}{parent}:")
+        lines.append(f"{'' if known else '#'}{parent}:")
         for key in children:
             lines += _line(key, key.name.partition(".")[2], "  ")
-    return "\n".join([*lines, ""])
+    return sealed("\n".join([*lines, ""]))
 
 
 def _line(key: DraftKey, name: str, indent: str) -> list[str]:
     known = key.value is not ...
     values = key.value if known else key.example
     comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}"
-    mark = indent if known else f"# {indent}"
+    mark = indent if known else f"{indent}#"  # without the "#" the key stands where it belongs
     if isinstance(values, list) and values and isinstance(values[0], Mapping):
         return [f"{mark}{name}:  {comment}", *(f"{mark}  - {_flow(value)}" for value in values)]
     text = f"{mark}{name}: {_flow(values)}"

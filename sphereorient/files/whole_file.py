@@ -22,6 +22,9 @@ TEXT_MARK = re.compile(
     rb"(?:#|<!--).*made by sphereorient|# repaired by sphereorient |# experiment: .*\n# method: .*\n# frame_rate_hz: "
     rb'|\{\s*(?:"map": .*,\s*)?(?:"command": ?"sphereorient |"schema": ?"sphereorient-robustness)'
 )
+SEAL = re.compile(
+    rb"# Until it is changed, init may replace it: ([0-9a-f]{8})\n"
+)  # of a draft for people to go on with
 OLD_PAGE = b'<footer class="faint">sphereorient '
 PNG, PNG_HEAD = b"\x89PNG\r\n\x1a\n", 33  # signature; bytes of it and of the first chunk
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -104,8 +107,18 @@ def check_target(path: Path) -> None:
     elif is_forced() or _made.get(path.absolute()) == _state(found) or has_mark(path):
         return
     else:
-        got, do = "a file without its mark", f"{do}, or add --force to replace it"
+        got, do = _foreign(path), f"{do}, or add --force to replace it"
     raise OutputError(refusal(str(path), expected="a new file, or one made by sphereorient", got=got, do=do))
+
+
+def _foreign(path: Path) -> str:
+    """Return what a file without the mark is."""
+    try:
+        with path.open("rb") as file:
+            drafted = SEAL.match(file.read(HEAD_BYTES)) is not None
+    except OSError:
+        drafted = False
+    return "one of `sphereorient init` that was changed since" if drafted else "a file without its mark"
 
 
 def has_mark(path: Path) -> bool:
@@ -115,11 +128,20 @@ def has_mark(path: Path) -> bool:
             head = file.read(HEAD_BYTES)
             if head.startswith(b"<!doctype html>"):
                 return MARK.encode() in head or OLD_PAGE in file.read()
+            seal = SEAL.match(head)
+            if seal is not None:
+                file.seek(seal.end())
+                return f"{zlib.crc32(file.read(TEXT_BYTES)):08x}".encode() == seal[1]
         if head.startswith(HDF5):
             return _hdf5_has_mark(path)
         return MARK.encode() in head if head.startswith(PNG) else TEXT_MARK.match(head) is not None
     except (OSError, RuntimeError, ValueError, TypeError, LookupError):  # of damaged HDF5
         return False
+
+
+def sealed(text: str) -> str:
+    """Return a text with a line on top by which `has_mark` knows whether somebody has changed it."""
+    return f"# Until it is changed, init may replace it: {zlib.crc32(text.encode()):08x}\n{text}"
 
 
 def _hdf5_has_mark(path: Path) -> bool:

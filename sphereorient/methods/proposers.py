@@ -1,10 +1,10 @@
 """The choice of proposer: the only place that knows both the template searches and the trained network."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from sphereorient.search.settings import ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable
 
 DEFAULT = "default"  # the checkpoint that comes along
+Search = TypeVar("Search", GreySearch, TemplateBank)
 
 
 def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> Proposer:
@@ -33,14 +34,22 @@ def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> 
 
 
 def _grey_search(texture: Tensor, settings: Settings, blur: float) -> GreySearch:
-    made: list[GreySearch] = []
+    def make(bank: Tensor | None = None) -> GreySearch:
+        return GreySearch(texture, settings.search, blur, bank)
 
-    def make() -> dict[str, NDArray[Any]]:
-        made.append(GreySearch(texture, settings.search, blur))
-        return {"bank": made[0].bank.numpy()}
+    return _with_bank("bank", (texture, settings.search.model_dump_json(), blur), make)
 
-    kept = cached("bank", (texture, settings.search.model_dump_json(), blur), make)
-    return made[0] if made else GreySearch(texture, settings.search, blur, bank=torch.from_numpy(kept["bank"]))
+
+def _with_bank(kind: str, inputs: Iterable[Tensor | str | float], make: Callable[..., Search]) -> Search:
+    """Return a template search whose bank, whole numbers -127 .. 127, is kept between runs; `make` may be given it."""
+    made: list[Search] = []
+
+    def bank() -> dict[str, NDArray[Any]]:
+        made.append(make())
+        return {"bank": made[0].bank.to(torch.int8).numpy()}
+
+    kept = cached(kind, inputs, bank)
+    return made[0] if made else make(torch.from_numpy(kept["bank"]))
 
 
 def finest_table(texture: Tensor, diameter_px: float, unseen: Tensor | None) -> TextureTable:
@@ -115,7 +124,14 @@ def open_view(recording: Recording, stream: CameraStream, settings: Settings, pr
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
     """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
-    return _proposer(texture, settings.propose, lambda: TemplateBank(texture, size_px, settings.orient))
+
+    def make(bank: Tensor | None = None) -> TemplateBank:
+        return TemplateBank(texture, size_px, settings.orient, bank)
+
+    def templates() -> Proposer:
+        return _with_bank("templates", (texture, size_px, settings.orient.model_dump_json()), make)
+
+    return _proposer(texture, settings.propose, templates)
 
 
 def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:

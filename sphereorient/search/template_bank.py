@@ -35,6 +35,7 @@ class TemplateBank(DiskSearch):
         texture: (H, 2 H), the texture map, 0 black .. 1 white; an `nn.Parameter` gets gradients through `quality`.
         size_px: side of the disks, rounded up to an even number; the templates of the coarse grid have half of it.
         settings: of the search; None: the defaults.
+        bank: that of another search with the same arguments; None: made now.
 
     `grid` (K, 3, 3) float32 are the rotations of the coarse grid, `bank` (K, P) their templates at half size.
     """
@@ -43,7 +44,11 @@ class TemplateBank(DiskSearch):
     bank: Tensor
 
     def __init__(
-        self, texture: Tensor | NDArray[np.generic], size_px: int = 80, settings: OrientSettings | None = None
+        self,
+        texture: Tensor | NDArray[np.generic],
+        size_px: int = 80,
+        settings: OrientSettings | None = None,
+        bank: Tensor | None = None,
     ) -> None:
         super().__init__()
         self._settings = settings = settings or OrientSettings()
@@ -58,8 +63,10 @@ class TemplateBank(DiskSearch):
         around = so3.local_grid(math.radians(settings.fine_step_deg), math.radians(settings.fine_radius_deg))
         self._around = around.float()
         self.register_buffer("grid", so3.lattman_grid(math.radians(settings.coarse_step_deg)).float(), persistent=False)
-        half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=HALF)
-        self.register_buffer("bank", _templates(half, self._half, self.grid), persistent=False)
+        if bank is None:
+            half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=HALF)
+            bank = _templates(half, self._half, self.grid)
+        self.register_buffer("bank", bank.float(), persistent=False)
 
     def paint(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the paint (..., S, S) of grey disks: -1 black, +1 white, 0 undecided or outside."""

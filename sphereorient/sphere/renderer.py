@@ -168,10 +168,16 @@ class SphereRenderer(nn.Module):
             share = ((1.0 - distance_radii) * radius[at, None] / fine_mm + 0.5).clamp(0, 1)
             fine = R.new_zeros(len(k), *reached.shape)
             fine[:, reached] = (share * (seen.paint - sampling.outside)).to(R.dtype)
+            window = aperture @ fine @ aperture.mT
+            if len(position) == 1:  # nothing is scattered
+                left, top = corner[0].tolist()
+                sides = left, width - left - size, top, height - top - size
+                pictures.append(torch.nn.functional.pad(window, sides) + sampling.outside)
+                continue
             canvas = R.new_full((len(k), height + 2 * size, width + 2 * size), sampling.outside)
             rows, columns = ((corner[at, axis, None] + size + across).expand(len(k), -1) for axis in (1, 0))
             place = (every[: len(k), None, None], rows[:, :, None], columns[:, None, :])
-            canvas = canvas.index_put(place, aperture @ fine @ aperture.mT, accumulate=True)
+            canvas = canvas.index_put(place, window, accumulate=True)
             pictures.append(canvas[:, size : size + height, size : size + width])
         return torch.cat(pictures)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from sphereorient.cameras import Rays
 from sphereorient.files.threads import side_by_side
 from sphereorient.sphere.renderer import see_sphere
-from sphereorient.sphere.texture import reduced_texture, sample_texture
+from sphereorient.sphere.texture import closed_texture, reduced_texture, sample_closed
 
 # Nodes and weights of the 5-point and 3-point Gauss-Hermite rules for a unit normal.
 FIVE = (
@@ -31,6 +32,9 @@ STEPS = 127.0  # of a direction table: white paint; black is its negative
 AT_ONCE = 16  # orientations looked up at once: temporaries stay in the cache
 SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
 CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
+
+
+Cells = tuple[Tensor, Tensor, Tensor]  # directions and two tangents of each, (M, 3) float64
 
 
 def octahedral_directions(side: int) -> Tensor:
@@ -141,9 +145,10 @@ class TextureTable:
         # A cell is 2.2 / side wide: a wider blur needs fewer cells.
         side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
 
-        def rows(centre: Tensor) -> Tensor:
+        def rows(cells: Cells) -> Tensor:
+            centre = cells[0]
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
-            for share, _, at in _disk_nodes(centre, added, SQUARE_9):
+            for share, _, at in _disk_nodes(cells, added, SQUARE_9):
                 v, g = self.sample(at.T[None])
                 value, slope = value + share * v[0], slope + share * g[0].T
             return _rows(value, slope, centre.float())
@@ -158,12 +163,13 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
     """
     finest = min(blur_rad, BASE_RAD)
     hidden = None if unseen is None else texture_table(unseen.float(), finest, side)
-    reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: no steps
+    closed = closed_texture(reduced_texture(texture.float(), 2.0 / finest))  # pixels as wide as the blur: no steps
 
-    def rows(centre: Tensor) -> Tensor:
+    def rows(cells: Cells) -> Tensor:
+        centre = cells[0]
         value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
-        for share, offset, at in _disk_nodes(centre, finest, SQUARE_25):
-            v = sample_texture(reduced, at)
+        for share, offset, at in _disk_nodes(cells, finest, SQUARE_25):
+            v = sample_closed(closed, at)
             value = value + share * v
             slope = slope + share * v[:, None] * offset / finest**2
         return _rows(value, slope, centre.float())
@@ -171,16 +177,22 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
     return TextureTable(_in_chunks(rows, side), finest, hidden).blurred(blur_rad)
 
 
-def _in_chunks(rows: Callable[[Tensor], Tensor], side: int) -> Tensor:
+def _in_chunks(rows: Callable[[Cells], Tensor], side: int) -> Tensor:
     """Return the rows (side^2, 4) of all cells of directions."""
-    return torch.cat([torch.zeros(0, 4), *side_by_side(rows, torch.split(octahedral_directions(side), CHUNK))])
+    return torch.cat([torch.zeros(0, 4), *side_by_side(rows, _cells(side))])
+
+
+@lru_cache(maxsize=4)  # 19 MB at most for each
+def _cells(side: int) -> list[Cells]:
+    """Return the directions of all cells, and two tangents of each, (M, 3) float64 each, in chunks."""
+    return [(some, *tangents(some)) for some in torch.split(octahedral_directions(side), CHUNK)]
 
 
 def _disk_nodes(
-    centre: Tensor, width: float, rule: Sequence[tuple[float, float, float]]
+    cells: Cells, width: float, rule: Sequence[tuple[float, float, float]]
 ) -> Iterator[tuple[float, Tensor, Tensor]]:
-    """Yield weight, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about directions (M, 3)."""
-    right, up = tangents(centre)
+    """Yield weight, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about M cells."""
+    centre, right, up = cells
     right, up, centre = (width * right).float(), (width * up).float(), centre.float()
     for a, b, share in rule:
         offset = a * right + b * up

@@ -126,13 +126,10 @@ class Filming:
             for name in cameras
         }
 
-    def paint(self, texture: Tensor, number: int = 0) -> Tensor:
-        """Return the map of a filmed paint, (H, 2 H), worn."""
-        return worn(texture, self.values.get("paint_wear", 0.0), self._of_paint("paint_wear", number))
-
     def reported_texture(self, texture: Tensor, number: int = 0) -> Tensor:
         """Return the map of a paint to write, (H, 2 H), with exchanged patches."""
-        return misdrawn(texture, self.values.get("texture_error", 0.0), self._of_paint("texture_error", number))
+        share = self.values.get("texture_error", 0.0)
+        return misdrawn(texture, share, of_paint(self.settings.seed, "texture_error", number))
 
     def picture(self, exposure: Exposure, disk: Disk, name: str, frame: int) -> NDArray[np.float32]:
         """Return degraded grey levels (H, W) of a camera's frame, before the camera's own noise.
@@ -188,12 +185,14 @@ class Filming:
         inside = torch.from_numpy(part.cover) > 0.99
         return float(gain_to_clip(light.flatten(), inside.flatten(), self.values["saturation"]))
 
-    def _of_paint(self, what: str, number: int) -> torch.Generator:
-        return self._generator(what, *([number] if number else []))
-
     def _generator(self, *what: str | int) -> torch.Generator:
         # By name: another degradation does not change the random numbers of the rest.
         return seeded(self.settings.seed, *what)
+
+
+def of_paint(seed: int, what: str, number: int) -> torch.Generator:
+    """Return the random numbers of a degradation of a paint."""
+    return seeded(seed, what, *([number] if number else []))
 
 
 def nothing(name: str) -> float | None:

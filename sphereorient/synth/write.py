@@ -1,11 +1,12 @@
 """Write synthetic experiments in the format that `sphereorient track` reads."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -19,10 +20,10 @@ from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
-from sphereorient.synth.degrade import OF_ONE_BALL
-from sphereorient.synth.degrade_scene import Filming, degraded_settings, picture_of_ball, wrong_cameras
+from sphereorient.synth.degrade import OF_ONE_BALL, Disk
+from sphereorient.synth.degrade_scene import Filming, degraded_settings, of_paint, picture_of_ball, worn, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion, without_seam
-from sphereorient.synth.scene import RenderedScene, digitise, exposures, make_scene, seeded
+from sphereorient.synth.scene import Exposure, digitise, exposures, make_scene, seeded
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import degradation, severity
 from sphereorient.synth.textures import random_texture
@@ -30,6 +31,23 @@ from sphereorient.synth.textures import random_texture
 PIXEL_PITCH_MM = 0.02
 DRAWS = 500  # motions tried for each ball
 NEXT_SEED = 1_000_003  # from one ball or draw to the next: no two scenes share one
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CleanMovie:
+    """What cameras see of balls before degradations of pictures; made by `clean_movie`."""
+
+    textures: Sequence[Tensor]  # (H, 2 H) of each paint, not worn
+    truth: Mapping[str, Motion6D]  # by ball, at the times of the frames
+    disks: Mapping[str, Disk]  # by camera: the first ball in the N frames
+    exposures: Mapping[str, Callable[[], Iterable[Exposure]]]  # by camera: those of the N frames
+
+    def kept(self) -> Self:
+        """Return it with all exposures computed, to be used more than once."""
+        return replace(self, exposures={name: list(each()).__iter__ for name, each in self.exposures.items()})
+
+
+Clean = Callable[[SynthSettings, float], CleanMovie]
 
 
 def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
@@ -59,7 +77,11 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
 
 
 def write_degraded(
-    folder: Path, base: SynthSettings, applied: Mapping[str, int], progress: Callable[[int], None] = lambda done: None
+    folder: Path,
+    base: SynthSettings,
+    applied: Mapping[str, int],
+    progress: Callable[[int], None] = lambda done: None,
+    clean: Clean | None = None,
 ) -> Path:
     """Render as `write_synthetic_experiment` does; `applied` maps degradations to levels 1 .. 5.
 
@@ -67,7 +89,8 @@ def write_degraded(
         SettingsError: unknown name or level, or impossible scene.
         OutputError: folder not writable.
     """
-    return write_synthetic_experiment(folder, base, progress, {name: severity(name, k) for name, k in applied.items()})
+    values = {name: severity(name, k) for name, k in applied.items()}
+    return write_synthetic_experiment(folder, base, progress, values, clean)
 
 
 def write_synthetic_experiment(
@@ -75,13 +98,14 @@ def write_synthetic_experiment(
     settings: SynthSettings,
     progress: Callable[[int], None] = lambda done: None,
     values: Mapping[str, float] = MappingProxyType({}),
+    clean: Clean | None = None,
 ) -> Path:
     """Render an experiment with exact truth in `folder` and return the path of experiment.yaml.
 
     The folder also receives movies, backgrounds, texture.png (of several balls texture_0.png, ... of each paint),
     cameras.yaml and truth.h5; old files are replaced. `progress` receives the number of frames rendered since the last
     call. `values` maps degradations to physical values: reported cameras, texture map and diameter may be wrong;
-    truth.h5 describes the filmed cameras and sphere.
+    truth.h5 describes the filmed cameras and sphere. `clean` is called in place of `clean_movie`.
 
     Raises:
         SettingsError: unknown degradation, one of a single ball for several, or impossible value or scene.
@@ -93,33 +117,57 @@ def write_synthetic_experiment(
             do = "leave it out, or set balls to 1"
             raise SettingsError(refusal(f"degradation {name}", expected="one ball", got=str(settings.balls), do=do))
     settings = degraded_settings(settings, values)
-    motions = motions_of(settings)
+    movie = (clean or clean_movie)(settings, values.get("paint_wear", 0.0))
     make_folder(folder, f"folder {folder}")
     cameras = default_cameras(settings)
     filming = Filming(settings, values, cameras)
+    for index, name in enumerate(cameras):
+        frames = _frames(movie, filming, name, seeded(settings.seed, index), progress)
+        write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
+        empty = filming.empty[name].round().clamp(0, 255).byte().numpy()
+        write_picture(folder / f"empty_{name}.png", empty)
+    for k, texture in enumerate(movie.textures):
+        write_picture(folder / _texture_file(settings, k), _as_file(filming.reported_texture(texture, k)))
+    reported = wrong_cameras(cameras, values, settings.seed)
+    exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
+    save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
+    write_truth(folder / "truth.h5", movie.truth, cameras)
+    path = folder / "experiment.yaml"
+    write_text(path, yaml.safe_dump(_experiment(filming), sort_keys=False))
+    return path
+
+
+def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
+    """Return what the cameras of `default_cameras` see, before degradations of pictures.
+
+    Raises:
+        SettingsError: no room for a ball.
+    """
+    motions = motions_of(settings)
     # Rounded to grey levels, as in the file.
     textures = [
         torch.from_numpy(_as_file(random_texture(settings.texture, settings.seed + k * NEXT_SEED)) / np.float32(255))
         for k in range(min(settings.balls, settings.paints))
     ]
-    scenes = [make_scene(filming.paint(texture, k), settings) for k, texture in enumerate(textures)]
-    at_s = instants_s(settings).reshape(-1)
-    filmed = [(scenes[settings.worn[name]], motion.at(at_s)) for name, motion in motions.items()]
-    for index, name in enumerate(cameras):
-        frames = _frames(filmed, filming, name, seeded(settings.seed, index), progress)
-        write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
-        empty = filming.empty[name].round().clamp(0, 255).byte().numpy()
-        write_picture(folder / f"empty_{name}.png", empty)
-    for k, texture in enumerate(textures):
-        write_picture(folder / _texture_file(settings, k), _as_file(filming.reported_texture(texture, k)))
-    reported = wrong_cameras(cameras, values, settings.seed)
-    exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
-    save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
-    times_s = frame_times_s(settings)
-    write_truth(folder / "truth.h5", {name: motion.at(times_s) for name, motion in motions.items()}, cameras)
-    path = folder / "experiment.yaml"
-    write_text(path, yaml.safe_dump(_experiment(filming), sort_keys=False))
-    return path
+    scenes = [
+        make_scene(worn(texture, paint_wear, of_paint(settings.seed, "paint_wear", k)), settings)
+        for k, texture in enumerate(textures)
+    ]
+    at = [motion.at(instants_s(settings).reshape(-1)) for motion in motions.values()]
+    X = torch.stack([poses.position_lab_mm.reshape(settings.frames, -1, 3) for poses in at])
+    R = torch.stack([poses.R_lab_body.reshape(settings.frames, -1, 3, 3) for poses in at])
+    wearing, cameras, times_s = (
+        [scenes[k] for k in settings.worn.values()],
+        default_cameras(settings),
+        frame_times_s(settings),
+    )
+    return CleanMovie(
+        textures=textures,
+        truth={name: motion.at(times_s) for name, motion in motions.items()},
+        # Of several balls degradations know only the cover.
+        disks={name: picture_of_ball(one, X[0].mean(1), settings.diameter_mm / 2) for name, one in cameras.items()},
+        exposures={name: partial(exposures, wearing, camera, X, R) for name, camera in cameras.items()},
+    )
 
 
 def frame_times_s(settings: SynthSettings) -> Tensor:
@@ -180,24 +228,12 @@ def _as_file(texture: Tensor) -> NDArray[np.uint8]:
 
 
 def _frames(
-    filmed: Sequence[tuple[RenderedScene, Motion6D]],
-    filming: Filming,
-    name: str,
-    rng: torch.Generator,
-    progress: Callable[[int], None],
+    movie: CleanMovie, filming: Filming, name: str, rng: torch.Generator, progress: Callable[[int], None]
 ) -> Iterator[NDArray[np.uint8]]:
-    settings, camera = filming.settings, filming.cameras[name]
-    position, R_lab_body = (
-        torch.stack([part.reshape(settings.frames, -1, *part.shape[1:]) for part in parts])
-        for parts in zip(*((poses.position_lab_mm, poses.R_lab_body) for _, poses in filmed), strict=True)
-    )
-    # Of several balls the degradations know only the cover.
-    disks = picture_of_ball(camera, position[0].mean(1), settings.diameter_mm / 2).each()
-    seen = exposures([scene for scene, _ in filmed], camera, position, R_lab_body)
-    lost = filming.lost(name, settings.frames)
-    for k, (exposure, disk) in enumerate(zip(seen, disks, strict=True)):
+    lost = filming.lost(name, filming.settings.frames)
+    for k, (exposure, disk) in enumerate(zip(movie.exposures[name](), movie.disks[name].each(), strict=True)):
         # Lost frames draw noise too: the other frames do not depend on losses.
-        frame = digitise(filming.picture(exposure, disk, name, k), settings, rng)
+        frame = digitise(filming.picture(exposure, disk, name, k), filming.settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
         progress(1)
 

@@ -82,14 +82,18 @@ def test_a_size_that_the_file_does_not_say_is_given(tmp_path):
 
 
 FAULTS = {
-    "no matrix": ({"camera_matrix": None}, "camera_matrix: expected an OpenCV matrix, got none"),
+    "no matrix": (
+        {"camera_matrix": None},
+        "camera_matrix: expected an OpenCV matrix, got none; name a file with",
+    ),
     "number for a matrix": ({"camera_matrix": 3.0}, "camera_matrix: expected an OpenCV matrix, got none"),
     "matrix of another shape": ({"camera_matrix": K[:2]}, r"camera_matrix: expected 3 x 3 numbers, got \(2, 3\)"),
     "shear": ({"camera_matrix": K + np.eye(3, k=1)}, "camera_matrix: expected fx and fy on the diagonal"),
+    "stereo of OpenCV's sample": ({"camera_matrix": None, "M1": K}, r"got a stereo pair \(M1, D1, \.\.\.\); split"),
     "stereo": ({"camera_matrix": None, "K1": K}, r"got a stereo pair \(K1, D1, \.\.\.\); split"),
     "no distortion": (
         {"distortion_coefficients": None},
-        "distortion_coefficients: expected an OpenCV matrix, got none",
+        "distortion_coefficients: expected an OpenCV matrix, got none; write five zeros",
     ),
     "three": ({"distortion_coefficients": D[:3]}, "expected 4, 5, 8, 12 or 14 numbers, got 3"),
     "rational": ({"distortion_coefficients": np.append(D, [0, 0.1, 0])}, "expected k1, k2, p1, p2, k3 and nothing"),

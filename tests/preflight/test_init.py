@@ -29,6 +29,7 @@ from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import ExperimentKeys
 from sphereorient.experiment.fictrac import read_fictrac_config
 from sphereorient.files.draft import DraftKey, draft_yaml, given
+from sphereorient.files.whole_file import has_mark
 from sphereorient.movies import open_movie
 from sphereorient.preflight.draft import experiment_keys
 from sphereorient.preflight.first_look import FirstLook, look_at
@@ -138,8 +139,8 @@ def look(folder: Path) -> FirstLook:
 
 
 def uncommented(text: str) -> str:
-    """Return a draft with its examples put to use."""
-    return "\n".join(re.sub(r"^# (\s*[\w]+:( |$))", r"\1", line) for line in text.splitlines())
+    """Return a draft with its examples put to use, as a user does: the "#" before a key goes, and nothing else."""
+    return re.sub(r"(?m)^(\s*)#(\w+:)", r"\1\2", text)
 
 
 def test_a_draft_has_every_key_and_valid_examples(tmp_path):
@@ -275,14 +276,37 @@ def test_fictrac_is_taken_over(clean, tmp_path):
         ("vfov             : 190", "vfov: expected degrees"),
         ("c2a_r            : { 1, 2 }", "c2a_r: expected three numbers"),
         ("roi_ignr         : { { 1, 2, 3 } }", "roi_ignr: expected u, v"),
+        ("c2a_r            :", "c2a_r: expected the turn to the animal"),
+        ("fisheye          : y", "fisheye: expected n"),
+        ("thr_rgb_tfrm     : red", "thr_rgb_tfrm: expected grey"),
     ],
 )
 def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
     key = line.partition(":")[0]
-    lines = [line if each.startswith(key) else each for each in CONFIG.splitlines()]
-    (tmp_path / "config.txt").write_text("\n".join(lines))
+    others = [each for each in CONFIG.splitlines() if not each.startswith(key)]
+    (tmp_path / "config.txt").write_text("\n".join([*others, line]))
     with pytest.raises(ExperimentError, match=message):
         read_fictrac_config(tmp_path / "config.txt")
+
+
+def test_keys_of_fictrac_that_change_nothing_are_taken(tmp_path):
+    (tmp_path / "config.txt").write_text(CONFIG + "fisheye          : n\nthr_rgb_tfrm     : grey\n")
+    assert read_fictrac_config(tmp_path / "config.txt").vfov_deg == 45.0
+
+
+def test_init_replaces_its_own_file_until_somebody_changes_it(clean, tmp_path):
+    movies, out = two_movies(clean, tmp_path), tmp_path / "experiment.yaml"
+    init(*movies, "--out", out)
+    first = out.read_text()
+    assert has_mark(out)  # also for another process
+    init(*movies, "--out", out, *ROUND)
+    second = out.read_text()
+    assert second != first
+    out.write_text(second.replace("diameter: 18", "diameter: 19"))
+    with pytest.raises(SphereOrientError, match=r"of `sphereorient init` that was changed since; .*--force"):
+        init(*movies, "--out", out)
+    assert "diameter: 19" in out.read_text()
+    assert not has_mark(out)
 
 
 def test_one_camera_needs_no_pose_and_two_do(tmp_path):

@@ -118,10 +118,13 @@ def _required(storage: cv2.FileStorage, key: str) -> Array:
     matrix = _node(storage, key)
     if matrix is not None:
         return matrix
-    if key == "camera_matrix" and _node(storage, "K1") is not None:
-        expected, got = "the matrix of one camera", "a stereo pair (K1, D1, ...)"
-        raise camera_error(key, expected, got, "split the stereo file into one file per camera")
-    do = "calibrate with OpenCV, or name the file it wrote; write five zeros where there is no distortion"
+    for first in ("K1", "M1"):
+        if key == "camera_matrix" and _node(storage, first) is not None:
+            expected, got = "the matrix of one camera", f"a stereo pair ({first}, D1, ...)"
+            raise camera_error(key, expected, got, "split the stereo file into one file per camera")
+    do = "write five zeros where there is no distortion"
+    if key == "camera_matrix":
+        do = "name a file with camera_matrix as OpenCV writes it, or write f, centre and distortion into cameras.yaml"
     raise camera_error(key, "an OpenCV matrix", "none", do)
 
 

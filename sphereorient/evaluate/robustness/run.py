@@ -2,6 +2,7 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,7 @@ from sphereorient.evaluate.score import (
     true_orientations,
 )
 from sphereorient.experiment import load_experiment
-from sphereorient.files.cache import WITHOUT
+from sphereorient.files.cache import FOLDER
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
@@ -39,7 +40,7 @@ from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
 Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]
-PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
+PLAN, RESULTS, KEPT, CACHE = "plan.json", "results.json", "scenes", "cache"
 DIGITS = 5
 MOSTLY = 0.5  # share of a disk from which it counts as hidden
 Floats = NDArray[np.float64]
@@ -80,7 +81,7 @@ def run_benchmark(
     progress(len(scenes) - len(missing), len(scenes))
     context = multiprocessing.get_context("spawn")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
-    with ProcessPoolExecutor(jobs, context, limit_threads) as pool:
+    with ProcessPoolExecutor(jobs, context, limit_threads, (folder / CACHE,)) as pool:
         tasks = [pool.submit(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
         try:
             for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
@@ -92,6 +93,7 @@ def run_benchmark(
     outcomes = [one for scene in scenes for name in chosen for one in kept_results(_path(folder, scene, name))]
     results = Results(settings=settings, versions=versions(), outcomes=outcomes)
     save_results(results, folder / RESULTS)
+    shutil.rmtree(folder / CACHE, ignore_errors=True)
     return results
 
 
@@ -115,9 +117,9 @@ def run_benchmarks(
     return found
 
 
-def limit_threads() -> None:
-    """Limit a worker to one thread; its scenes have a map of their own, which no other run uses."""
-    os.environ[WITHOUT] = "1"
+def limit_threads(cache: Path) -> None:
+    """Limit a worker to one thread; what depends on the maps, which scenes share, is kept in a folder of the run."""
+    os.environ[FOLDER] = str(cache)
     torch.set_num_threads(1)
     limit_cores(1)
 

@@ -1,6 +1,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Self
 
@@ -12,6 +13,7 @@ from sphereorient.synth import write_degraded
 from sphereorient.synth.degrade import OF_ONE_BALL
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, LEVELS, degradation
+from sphereorient.synth.write import CleanMovie, clean_movie
 
 CLEAN, TOGETHER = "clean", "together"
 SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of an only ball's volume: small, for speed
@@ -134,4 +136,13 @@ def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int
 
 def write_scene(folder: Path, scene: BenchmarkScene) -> Path:
     """Render a scene into a folder, with truth.h5 (docs/data-format.md); return the path of experiment.yaml."""
-    return write_degraded(folder, scene.base, scene.degradations)
+    return write_degraded(folder, scene.base, scene.degradations, clean=_clean)
+
+
+def _clean(settings: SynthSettings, paint_wear: float) -> CleanMovie:
+    return _rendered(settings.model_copy(update={"name": ""}), paint_wear)
+
+
+@lru_cache(maxsize=2)  # most scenes of a seed share their motion: what is seen is rendered once
+def _rendered(settings: SynthSettings, paint_wear: float) -> CleanMovie:
+    return clean_movie(settings, paint_wear).kept()
