@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -103,13 +102,11 @@ def disturb(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: t
 
 
 def film(folder: Path, number: int, frames: int) -> None:
-    """Render one movie of two cameras with its truth; the folder appears when it is whole."""
+    """Render one movie of two cameras with its truth into a new folder."""
     settings = SynthSettings(name=f"movie {number:03d}", frames=frames, diameter_px=78, seed=number)
-    aside = folder.with_name(f"{folder.name}.part")
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
+    folder.mkdir(parents=True)
     grey = np.rint(random_texture(settings.texture, TEXTURE_SEED).numpy() * 255).astype(np.uint8)
-    write_picture(aside / "texture.png", grey)
+    write_picture(folder / "texture.png", grey)
     scene = make_scene(torch.from_numpy(grey / np.float32(255)), settings)
     cameras, motion = default_cameras(settings), tumbling(number, frames / settings.frame_rate)
     times_s, poses = frame_times_s(settings), motion.at(instants_s(settings).reshape(-1))
@@ -130,11 +127,10 @@ def film(folder: Path, number: int, frames: int) -> None:
             yield digitise(lit, settings, rng)
 
     for index, (name, camera) in enumerate(cameras.items()):
-        write_ffv1(aside / f"{name}.mkv", pictures(index, camera), settings.frame_rate)
-    save_cameras(aside / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
-    write_truth(aside / "truth.h5", {"": motion.at(times_s)}, cameras)
+        write_ffv1(folder / f"{name}.mkv", pictures(index, camera), settings.frame_rate)
+    save_cameras(folder / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
+    write_truth(folder / "truth.h5", {"": motion.at(times_s)}, cameras)
     # Without backgrounds: the mean of the movie is used, as in the paper.
     document = experiment_document(settings, cameras)
     del document["backgrounds"]
-    (aside / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-    aside.rename(folder)
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")

@@ -2,8 +2,9 @@
 
     scripts/reproduce_paper.py --out DIR [--quick] [--docs]
 
-DIR/movies and DIR/tracks keep what is done: a killed run continues. DIR/paper.md is the page. `--quick` films 3 x 90
-frames instead of 40 x 375. `--docs` copies page and pictures into docs/.
+DIR/movies and DIR/tracks keep what is done, each beside what it was made of: a killed run continues, and what changed
+code made is made anew. DIR/paper.md is the page. `--quick` films 3 x 90 frames instead of 40 x 375. `--docs` copies
+page and pictures into docs/.
 """
 
 from __future__ import annotations
@@ -14,19 +15,21 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
-from typing import Any
 
-import h5py
+import kept
+import paper_movies
 import torch
 from paper_figures import OF_EXAMPLE, OF_PRECISE, OF_TRACKS, example_of
-from paper_movies import film
 from paper_table import markdown, measured, single_views, table
 
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, refusal
+from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import MARK, make_folder, write_text
 from sphereorient.report.plots import style as look
 from sphereorient.run import MemoryStore, Request, run
@@ -53,87 +56,112 @@ QUICK = Plan(
     statistics=StatisticsSettings(integral_time_s=T_L_S, min_frames=20, min_integral_times=0.1, resamples=200),
 )
 METHODS = ("paper", "precise")
+# What `paper` imports and does not run: tests/end_to_end/test_reproduce_paper.py runs it to see.
+NOT_OF_PAPER = ("follow", "pose", "mapping", "learn", "methods.precise", "methods.several")
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 DPI, LARGEST_BYTES = 130, 3_000_000  # of the pictures
 
 
-def place_of(out: Path, number: int, method: str = "") -> Path:
-    """Return the folder of a movie, or the file of its track."""
-    return out / "tracks" / f"{number:03d}-{method}.h5" if method else out / "movies" / f"{number:03d}"
+def made_by(out: Path, number: int, stage: str) -> Path:
+    """Return what a stage makes of a movie: its folder (film), or the file of its track (a method)."""
+    return out / "movies" / f"{number:03d}" if stage == "film" else out / "tracks" / f"{number:03d}-{stage}.h5"
 
 
-def make_movie(out: Path, number: int, frames: int) -> list[str]:
-    """Film one movie and track it by both methods, as far as it is not done; return the errors of methods."""
+@lru_cache(maxsize=1)
+def code() -> dict[str, str]:
+    """Return a word for the code of each stage: a film does not change with a tracker, nor `paper` with `precise`."""
+    stages = kept.rooms.modules()
+    track = [stages["run.stages"], stages["methods.paper"]]
+    return {
+        "film": kept.digest(kept.code_of([Path(paper_movies.__file__)])),
+        "paper": kept.digest(kept.code_of(track, NOT_OF_PAPER)),
+        "precise": kept.digest(kept.code_of(track)),
+    }
+
+
+def key_of(number: int, stage: str, frames: int) -> str:
+    """Return what the work of a stage depends on, as one word."""
+    return " ".join([f"{number} {frames}", code()["film"], *([code()[stage]] if stage != "film" else [])])
+
+
+def todo(out: Path, plan: Plan, stages: Sequence[str]) -> list[tuple[int, str]]:
+    """Return what is to be made, movie and stage; BenchError for a folder in the way that no run has made."""
+    missing = []
+    for number, stage in product(range(1, plan.movies + 1), stages):
+        made = made_by(out, number, stage)
+        found = kept.known(made)
+        if stage == "film" and made.exists() and "key" not in found:
+            expected, do = f"a movie with its {kept.RECORD}", "remove it, or choose another --out"
+            raise BenchError(refusal(str(made), expected=expected, got="a folder without", do=do))
+        whole = made.exists() or found.get("failed")
+        if not whole or found.get("key") != key_of(number, stage, plan.frames):
+            missing.append((number, stage))
+    return missing
+
+
+def make(out: Path, number: int, stage: str, frames: int, key: str) -> None:
+    """Film a movie or track it, and note what it was made of; a refusal of a method is a result."""
     torch.set_num_threads(1)
-    folder, failed = place_of(out, number), []
-    if not folder.exists():
-        timed(out, number, "film", lambda: film(folder, number, frames))
-    for method in METHODS:
-        track = place_of(out, number, method)
-        request = Request(experiment=folder / "experiment.yaml", out=track, method=method, command="reproduce_paper.py")
-        if not track.exists():
-            try:
-                timed(out, number, method, lambda request=request: run(request, MemoryStore()))
-            except SphereOrientError as error:
-                failed.append(f"movie {number:03d}, {method}: {error}")
-    return failed
-
-
-def timed(out: Path, number: int, step: str, work: Callable[[], Any]) -> None:
-    """Do a step, print its time, and append it to costs.csv."""
+    limit_cores(1)
+    made, failed = made_by(out, number, stage), ""
     wall_s, cpu_s = time.perf_counter(), time.process_time()
-    work()
+    if stage == "film":
+        aside = made.with_name(f"{made.name}.part")
+        for old in (aside, made):
+            shutil.rmtree(old, ignore_errors=True)
+        paper_movies.film(aside, number, frames)
+    else:
+        kept.record_of(made).unlink(missing_ok=True)
+        experiment = made_by(out, number, "film") / "experiment.yaml"
+        try:
+            run(Request(experiment=experiment, out=made, method=stage, command="reproduce_paper.py"), MemoryStore())
+        except OutputError:
+            raise
+        except SphereOrientError as error:
+            made.unlink(missing_ok=True)
+            failed = f"movie {number:03d}, {stage}: {error}"
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-    print(f"movie {number:03d}: {step:8} {wall_s:5.0f} s, {cpu_s:5.0f} s of CPU", file=sys.stderr, flush=True)
-    with (out / "costs.csv").open("a", encoding="utf-8") as file:
-        file.write(f"{number},{step},{wall_s:.1f},{cpu_s:.1f}\n")
+    words = {"key": key, "failed": failed, "wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1)}
+    kept.note(aside if stage == "film" else made, **words)
+    if stage == "film":
+        aside.rename(made)  # a movie that is there is whole
+    print(f"movie {number:03d}: {stage:8} {wall_s:5.0f} s, {cpu_s:5.0f} s of CPU", file=sys.stderr, flush=True)
 
 
-def make_movies(out: Path, plan: Plan) -> list[str]:
-    """Film and track all movies on all cores, and return the errors of methods; refuse a broken folder."""
+def make_movies(out: Path, plan: Plan) -> None:
+    """Film all movies, then track them, both methods side by side on all cores.
+
+    What is there and made by the code as it is stays.
+    """
     for part in ("movies", "tracks"):
         make_folder(out / part, f"folder {out / part}")
-    for number in range(1, plan.movies + 1):
-        check_movie(place_of(out, number), plan.frames)
-    todo = [n for n in range(1, plan.movies + 1) if not all(place_of(out, n, method).exists() for method in METHODS)]
-    begin, failed = time.perf_counter(), []
     # One worker a core: idle threads of their libraries would take the processor from the other workers.
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     context = multiprocessing.get_context("spawn")  # forked children of a process that used torch's threads hang
-    workers = max(1, min(len(todo), os.cpu_count() or 1))
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
-        made = [pool.submit(make_movie, out, number, plan.frames) for number in todo]
-        for done, future in enumerate(as_completed(made), 1):
-            failed += future.result()
-            minutes = (time.perf_counter() - begin) / 60
-            left = minutes / done * (len(todo) - done)
-            print(f"{done} of {len(todo)} movies, {minutes:.0f} min, {left:.0f} min left", file=sys.stderr, flush=True)
-    return failed
+    with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=context, initializer=end_with_parent) as pool:
+        for stages in (("film",), METHODS):
+            missing, begin = todo(out, plan, stages), time.perf_counter()
+            jobs = [(out, number, stage, plan.frames, key_of(number, stage, plan.frames)) for number, stage in missing]
+            making = [pool.submit(make, *job) for job in jobs]
+            try:
+                for done, future in enumerate(as_completed(making), 1):
+                    future.result()
+                    minutes = (time.perf_counter() - begin) / 60
+                    left = minutes / done * (len(making) - done)
+                    said = f"{' and '.join(stages)}: {done} of {len(making)}, {minutes:.0f} min, {left:.0f} min left"
+                    print(said, file=sys.stderr, flush=True)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
 
 
-def check_movie(folder: Path, frames: int) -> None:
-    """Refuse a folder that is there but is no whole movie of this many frames."""
-    if not folder.exists():
-        return
-    do = "remove it, or choose another --out"
-    expected = f"experiment.yaml, truth.h5 and two movies of {frames} frames"
-    lacking = [
-        name for name in ("experiment.yaml", "truth.h5", "cam1.mkv", "cam2.mkv") if not (folder / name).is_file()
-    ]
-    if lacking:
-        raise BenchError(refusal(str(folder), expected=expected, got=f"no {lacking[0]}", do=do))
-    with h5py.File(folder / "truth.h5") as file:
-        got = len(file["time"])
-    if got != frames:
-        raise BenchError(refusal(str(folder), expected=expected, got=f"{got} frames", do=do))
-
-
-def write_page(out: Path, plan: Plan, failed: list[str]) -> list[Path]:
+def write_page(out: Path, plan: Plan) -> list[Path]:
     """Write paper.md and the figures from all tracks, and return the pictures."""
     numbers = range(1, plan.movies + 1)
-    folders = [place_of(out, number) for number in numbers]
+    folders = [made_by(out, number, "film") for number in numbers]
+    failed = [kept.known(made_by(out, number, method)).get("failed") for number, method in product(numbers, METHODS)]
     found = {
-        method: measured(folders, [place_of(out, number, method) for number in numbers], plan.statistics)
+        method: measured(folders, [made_by(out, number, method) for number in numbers], plan.statistics)
         for method in METHODS
     }
     make_folder(out / "paper", f"folder {out / 'paper'}")
@@ -150,8 +178,8 @@ def write_page(out: Path, plan: Plan, failed: list[str]) -> list[Path]:
         option=" --quick" if plan is QUICK else "",
         least=plan.statistics.min_frames,
         share=plan.statistics.min_integral_times,
-        costs=costs(out),
-        failed="".join(f"- {line}\n" for line in failed) or "- none\n",
+        costs=costs(out, plan),
+        failed="".join(f"- {line}\n" for line in failed if line) or "- none\n",
         table=markdown(table(found, views, plan.statistics)),
         figures="\n".join(parts),
     )
@@ -159,13 +187,13 @@ def write_page(out: Path, plan: Plan, failed: list[str]) -> list[Path]:
     return pictures
 
 
-def costs(out: Path) -> str:
-    """Return the processor time of each step, s per movie, and the sum."""
-    rows = [line.split(",") for line in (out / "costs.csv").read_text(encoding="utf-8").splitlines()]
+def costs(out: Path, plan: Plan) -> str:
+    """Return the processor time of each stage, s per movie, and the sum."""
     spent: dict[str, list[float]] = {}
-    for _, step, _, cpu_s in rows:
-        spent.setdefault(step, []).append(float(cpu_s))
-    each = ", ".join(f"{step} {sum(times) / len(times):.0f} s" for step, times in spent.items())
+    for number, stage in product(range(1, plan.movies + 1), ("film", *METHODS)):
+        cpu_s = kept.known(made_by(out, number, stage)).get("cpu_s", 0.0)
+        spent.setdefault(stage, []).append(float(cpu_s))
+    each = ", ".join(f"{stage} {sum(times) / len(times):.0f} s" for stage, times in spent.items())
     return f"{each}; {sum(map(sum, spent.values())) / 3600:.1f} h in all"
 
 
@@ -233,10 +261,11 @@ def main() -> None:
     plan = QUICK if options.quick else FULL
     try:
         make_folder(options.out, f"--out {options.out}")
-        pictures = write_page(options.out, plan, make_movies(options.out, plan))
+        make_movies(options.out, plan)
+        pictures = write_page(options.out, plan)
         if options.docs:
             copy_to_docs(options.out, pictures)
-    except SphereOrientError as error:
+    except (SphereOrientError, OSError) as error:
         sys.exit(f"reproduce_paper.py: {error}")
     print(f"Page: {options.out / 'paper.md'}")
 

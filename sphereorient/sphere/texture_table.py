@@ -29,7 +29,7 @@ SQUARE_25, SQUARE_9 = ([(a, b, p * q) for a, p in rule for b, q in rule] for rul
 BASE_RAD = 0.008  # blur of the finest table: below half a pixel for disks up to 160 px
 CHUNK = 1 << 14  # directions per batch while a table is built
 STEPS = 127.0  # of a direction table: white paint; black is its negative
-AT_ONCE = 16  # orientations looked up at once: temporaries stay in the cache
+AT_ONCE = 1 << 17  # pixels looked up at once: temporaries stay in the cache
 SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
 CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
@@ -89,7 +89,8 @@ class DirectionTable(nn.Module):
         columns = normal_view.T.contiguous() * (0.5 * n * (1.0 - 1e-6))
         rows = R_view_body.permute(2, 0, 1).reshape(3, -1, 3)
         out = self.paint.new_empty((len(R_view_body), count))
-        for some, at in zip(torch.split(rows, AT_ONCE, 1), torch.split(out, AT_ONCE), strict=True):
+        size = max(1, AT_ONCE // max(1, count))
+        for some, at in zip(torch.split(rows, size, 1), torch.split(out, size), strict=True):
             place = torch.addmm(columns.new_tensor(0.5 * n), some.reshape(-1, 3), columns)
             x, y, z = place.to(torch.int32).reshape(3, -1, count)
             at.copy_(self.paint.index_select(0, x.mul_(n).add_(y).mul_(n).add_(z).reshape(-1)).reshape(at.shape))

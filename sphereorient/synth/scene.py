@@ -110,11 +110,9 @@ class FineRays:
         """Return origins (3, M S) or (3, 1) and directions (3, M S) of the M pixels (v, u), (M, 2)."""
         rows, columns = self.window
         place = (pixels[:, 0] - rows.start) * (columns.stop - columns.start) + pixels[:, 1] - columns.start
-        origin, direction = (
-            part if part.shape[1] == 1 else part.flatten(1, 2).index_select(1, place)
-            for part in (self.origin, self.direction)
-        )
-        return origin.flatten(1), direction.flatten(1)
+        parts = [self.direction] if self.origin.numel() == 3 else [self.direction, self.origin]
+        found = [part.flatten(1, 2).index_select(1, place).flatten(1) for part in parts]
+        return (found[1] if len(found) > 1 else self.origin.flatten(1)), found[0]
 
 
 def render_frame(

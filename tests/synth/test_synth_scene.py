@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -98,6 +100,15 @@ def test_a_sphere_that_the_border_cuts_is_the_part_of_the_whole_one():
     place = seen_at(lens, 7.0, 5.0)
     assert np.array_equal(picture(scene(), place, lens=lens), picture(scene(), place, lens=wide)[30:190, 30:230])
     assert picture(scene(), place, lens=lens)[:, -1].max() > 0
+
+
+@pytest.mark.parametrize("beyond_px", [15.0, 17.0, 17.5, 18.0, 18.5, 18.9, 19.5])
+def test_a_ball_that_reaches_a_few_rows_of_the_picture_is_there(beyond_px):
+    tall, low = camera((200, 160)), camera((200, 100))  # both look along one axis
+    place = seen_at(tall, 0.0, math.degrees(math.atan((49.5 + beyond_px) / 800)))
+    whole = expose([scene()], tall, place[None, None], UPRIGHT[None, None]).before(5.0)[30:130]
+    cut = expose([scene()], low, place[None, None], UPRIGHT[None, None]).before(5.0)
+    np.testing.assert_allclose(cut, whole, atol=1e-3)
 
 
 def test_blur_is_the_gaussian_of_its_width():
