@@ -25,31 +25,42 @@ RECORD = "made_of.json"  # in a folder; beside a file: its name with this ending
 
 def code_of(scripts: Iterable[Path], without: Iterable[str] = ()) -> set[Path]:
     """Return the files of code, C sources too, that scripts or modules depend on, but for those `without`."""
-    known, found, todo = rooms.modules(), set[Path](), list(scripts)
+    known, found, left_out, todo = _modules(), set[Path](), set(without), list(scripts)
     while todo:
         path = todo.pop()
         if path in found:
             continue
         found.add(path)
-        for name in rooms.imports(path, known) | _beside(path):
+        for name in _imports(path):
             parts = name.split(".")
-            if name not in known and not (SCRIPTS / f"{name}.py").is_file():
-                continue
-            if any(".".join(parts[: k + 1]) in set(without) for k in range(len(parts))):
-                continue
             # What a module imports runs its packages' front doors as well.
-            todo += [known[part] for k in range(1, len(parts) + 1) if (part := ".".join(parts[:k])) in known]
-            todo += [SCRIPTS / f"{name}.py"] if name not in known else []
+            whole = [".".join(parts[: k + 1]) for k in range(len(parts))]
+            if not left_out.intersection(whole):
+                todo += [known[part] for part in whole if part in known]
+                todo += [] if name in known else filter(Path.is_file, [SCRIPTS / f"{name}.py"])
     return found | {source for path in found if (source := path.with_suffix(".c")).is_file()} | _compiled(found)
 
 
-def _beside(path: Path) -> set[str]:
-    """Return the scripts that a script imports."""
+@lru_cache(maxsize=1)
+def _modules() -> dict[str, Path]:
+    return rooms.modules()
+
+
+@lru_cache(maxsize=1024)
+def _imports(path: Path) -> set[str]:
+    """Return the modules of the package that a file imports, and, of a script, the scripts."""
+    names = rooms.imports(path, _modules())
     if path.parent != SCRIPTS:
-        return set()
-    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import | ast.ImportFrom)]
-    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    return names | {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
+        return names
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(str(node.module))
+            # The front door hands out names of all rooms.
+            doors = node.module == "sphereorient" and any(alias.name not in _modules() for alias in node.names)
+            names |= {"cli.app", "run"} if doors else set()
+    return names | ({"cli.app", "run"} if "subprocess" in names else set())  # programs may do anything
 
 
 def _compiled(found: set[Path]) -> set[Path]:

@@ -31,8 +31,7 @@ LAWS = EnsembleSpec()  # of the paper's Table I, with docs/errata.md E6
 NEAR_MM = 40.0  # each coordinate of the centre is within this at one instant of every movie
 LAMPS = {"uneven_light": 2.5, "highlights": 80.0}  # severities as in docs/degradations.md
 MOST_BUBBLES = 4  # in front of the disk
-BLADES, BAND_PX = 8, 30.0
-PHASES = 25  # frames until each blade is where the next one was: 3 turns a second at 600 Hz
+IMPELLER_HZ, BLADES, BAND_PX = 3.0, 8, 30.0
 
 
 def waves(draws: list[Draw], scale: float, origin: Floats) -> Callable[..., Tensor]:
@@ -64,26 +63,28 @@ def tumbling(number: int, duration_s: float) -> RandomMotion:
 
 
 @cache
-def impellers(size: tuple[int, int], camera: int, phase: int) -> NDArray[np.float32]:
+def reflections(width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the grey levels along a row: of the disks, (2, W), and of each blade's reflection, (2, BLADES, W)."""
+    edge = np.stack([np.arange(width), width - 1 - np.arange(width)])
+    from_px = 50 + 0.085 * width * (np.arange(BLADES)[:, None] + 1)
+    mirrored = np.exp(-0.5 * ((edge[:, None] - from_px) / 13) ** 2)
+    return expit((BAND_PX - edge) / 2).astype(np.float32), mirrored.astype(np.float32)
+
+
+def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.float32]:
     """Return the grey levels (H, W) of the turning disks on either side, seen from the edge, and of their reflections.
 
-    A blade is as wide as its height above the axis' plane and moves as the cosine of its angle. `phase` counts frames:
-    one blade is where another was PHASES frames before.
+    A blade is as wide as its height above the axis' plane and moves as the cosine of its angle.
     """
-    height, width = size
-    u, v = np.arange(width), np.arange(height)[:, None]
-    blade = np.arange(BLADES)
-    light = np.zeros((height, width), np.float32)
-    for side, edge in ((1, u), (-1, width - 1 - u)):
-        angle = 2 * np.pi * (side * phase / PHASES + blade + 0.3 * camera) / BLADES
-        up = np.maximum(np.sin(angle), 0.0)
-        down_px = height / 2 * (1 + 1.1 * np.cos(angle))
-        profile = np.exp(-0.5 * ((v - down_px) / (4 + 14 * up)) ** 2)  # (H, blades)
-        band = expit((BAND_PX - edge) / 2)
-        mirrored = np.exp(-0.5 * ((edge[:, None] - 50 - 0.085 * width * (blade + 1)) / 13) ** 2).T
-        across = np.where(up > 0, 35 + 65 * up, 0.0)[:, None] * band + 26 * up[:, None] * mirrored
-        light += profile.astype(np.float32) @ across.astype(np.float32) + 20 * band.astype(np.float32)
-    return light
+    width, height = size
+    band, mirrored = reflections(width)
+    turned = IMPELLER_HZ * time_s * np.array([[1.0], [-1.0]]) + (np.arange(BLADES) + 0.3 * camera) / BLADES
+    angle = (2 * np.pi * turned)[..., None]  # (2, BLADES, 1)
+    up = np.maximum(np.sin(angle), 0.0)
+    profile = np.exp(-0.5 * ((np.arange(height) - height / 2 * (1 + 1.1 * np.cos(angle))) / (4 + 14 * up)) ** 2)
+    across = np.where(up > 0, 35 + 65 * up, 0.0) * band[:, None] + 26 * up * mirrored
+    of_blades, along = (part.reshape(2 * BLADES, -1).astype(np.float32) for part in (profile, across))
+    return of_blades.T @ along + 20 * band.sum(0)
 
 
 def disturb(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]) -> None:
@@ -119,7 +120,7 @@ def film(folder: Path, number: int, frames: int) -> None:
         disks = picture_of_ball(camera, X[near].mean(1), settings.diameter_mm / 2)
         seen = zip(exposures([scene], camera, X[None, near], R[None, near]), disks.each(), strict=True)
         for k in range(frames):
-            behind = settings.background + impellers(size, index, k % PHASES)
+            behind = settings.background + impellers(camera.image_size, index, float(times_s[k]))
             exposure, disk = next(seen) if near[k] else (Exposure.none(size), None)
             lit = exposure.before(behind)
             if disk is not None:

@@ -345,6 +345,11 @@ def local_grid(
     return exp(places[inside][order].to(torch.float64) * unit).to(dtype=dtype, device=device)
 
 
+def trace(matrix: Tensor) -> Tensor:
+    """Return the traces (...) of matrices (..., n, n)."""
+    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
 def solve_damped(matrix: Tensor, right: Tensor, ridge: float = 1e-9) -> Tensor:
     """Solve symmetric positive semidefinite systems (..., n, n), (..., n); `ridge` is a share of each diagonal element.
     A direction without information gets no step.

@@ -36,6 +36,8 @@ class Limits:
     size: float  # relative
 
 
+GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
+TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
 OUTLINES = Limits(gap_px=1.5, turn_deg=1.0, size=0.01)  # of outlines alone: they jump where paint is dark
 
 
@@ -61,6 +63,16 @@ class Seen:
     def stretch(self) -> Tensor:
         """(N, C): `outline_stretch`, NaN if unknown."""
         return torch.full_like(self.radius_px, torch.nan) if self.outline_stretch is None else self.outline_stretch
+
+
+def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
+    """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
+    sigma_deg = math.degrees(float(so3.trace(covariance_rad2).sqrt().nanmedian()))
+    return Limits(
+        gap_px=GAP_PX,
+        turn_deg=max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg if math.isfinite(sigma_deg) else 0.0),
+        size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

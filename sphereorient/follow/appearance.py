@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, compare_cameras, majority
+from sphereorient.calibration.consistency import Seen, compare_cameras, limits_of, majority
 from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.files.threads import side_by_side
@@ -19,7 +19,7 @@ from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.blur import FINER, FINEST, best_blur_px
-from sphereorient.pose.fit import FittedPoses, trace
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import (
     FEWEST_LIT,
     FINEST_PX,
@@ -52,8 +52,6 @@ ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the sphere
 
-GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
-TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
 BLUR_ROUNDS = 4
 # By how much paint differs that is not used, round by round: while poses are wrong, so do the borders of right paint.
 WORN_ROUNDS = (0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2, CHANGED, CHANGED)
@@ -248,16 +246,6 @@ def estimate_appearance(
     )
 
 
-def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
-    """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
-    sigma_deg = math.degrees(float(trace(covariance_rad2).sqrt().nanmedian()))
-    return Limits(
-        gap_px=GAP_PX,
-        turn_deg=max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg if math.isfinite(sigma_deg) else 0.0),
-        size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())),
-    )
-
-
 def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
     """Raise ExperimentError if the cameras contradict each other in a way that nothing can be measured, and no majority
     agrees; `alone`: poses by camera and frame.
@@ -357,7 +345,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
         rays.append(view.camera.rays(view.camera.project(X)))
         alone.append((view.camera, X, R))
-        covariance_rad2.append(trace(fit.covariance[:, :3, :3]))
+        covariance_rad2.append(so3.trace(fit.covariance[:, :3, :3]))
     gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
     radius_px = widest_px(fitter.views) / 2
     gap_px = gap_mm * (radius_px / fitter.radius_mm)

@@ -12,21 +12,27 @@ from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration import systematic_errors
-from sphereorient.calibration.consistency import Consistency, Gaps, Limits, Seen, compare_cameras, gaps_between
+from sphereorient.calibration.consistency import (
+    Consistency,
+    Gaps,
+    Limits,
+    Seen,
+    compare_cameras,
+    gaps_between,
+    limits_of,
+)
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
-from sphereorient.follow.appearance import limits_of
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
-from sphereorient.pose.fit import trace
 from sphereorient.pose.fitter import CameraView
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
-from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
+from sphereorient.so3 import exp, geodesic_distance, log, solve_damped, trace
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 TWO_BALLS = (
@@ -316,7 +322,7 @@ def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
 
 
 def with_contradictions(
-    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool, lasting: Lasting
+    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool, lasting: Lasting | None
 ) -> tuple[Trajectory, Consistency]:
     """Mark frames in which two cameras contradict each other, and make the covariances hold what they disagree by.
     Errors that last, see `with_lasting_errors`, let them disagree without a contradiction. A camera that contradicts
@@ -379,10 +385,11 @@ class _Compared:
         return self.away > CONTRADICTS_SIGMAS
 
 
-def _compared(track: Trajectory, seen: Seen, lasting: Lasting, k: int, m: int) -> _Compared:
+def _compared(track: Trajectory, seen: Seen, lasting: Lasting | None, k: int, m: int) -> _Compared:
     """Compare the cameras k and m of a track."""
     radius_mm = seen.diameter_mm / 2
-    spread = (_of_cameras(track, "orientation_cov") + lasting.own_rad2)[:, [k, m]].sum(1)
+    own_rad2 = _of_cameras(track, "orientation_cov") + (0.0 if lasting is None else lasting.own_rad2)
+    spread = own_rad2[:, [k, m]].sum(1)
     turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT)
     gaps = gaps_between([list(seen.cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
     across, known = gaps.across_lab[..., None], torch.from_numpy(np.nan_to_num(track.position_systematic_cov))

@@ -145,7 +145,7 @@ def refine(
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / radius_mm, aside_mm], dim=1).square())
     sight = torch.nn.functional.normalize(to_centre, dim=-1)[..., None]
     place = (freely @ shared @ freely)[..., 3:, 3:]
-    across = trace(place) - (sight.mT @ place @ sight)[..., 0, 0]
+    across = so3.trace(place) - (sight.mT @ place @ sight)[..., 0, 0]
     any_seen = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
     covariance = torch.where(any_seen[:, None, None], 0.5 * (covariance + covariance.mT), bread)
     return FittedPoses(
@@ -156,7 +156,7 @@ def refine(
         own_move=by_pose(alone[:, 3:], cameras),
         own_covariance=own_covariance,
         own_sigma_mm=(across.clamp_min(0) / 2).sqrt(),
-        excess=(trace(own_covariance) / trace(own_bread).clamp_min(1e-30)).sqrt(),
+        excess=(so3.trace(own_covariance) / so3.trace(own_bread).clamp_min(1e-30)).sqrt(),
         score=by_pose(told.share, cameras),
         nll=(by_pose(told.loss, cameras) * seen).sum(1),
         step=step,
@@ -167,11 +167,6 @@ def settled(pixels: Pixels, fit: FittedPoses, model: SphereModel, cameras: int) 
     """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model, cameras)
-
-
-def trace(matrix: Tensor) -> Tensor:
-    """Return the traces (...) of matrices (..., n, n)."""
-    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:

@@ -209,13 +209,13 @@ def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | N
         track, recording.cameras, recording.covariance, recording.experiment.radius_mm
     )
     remarks = [*recording.remarks, *track.provenance.get("remarks", ())]
-    lasting = Lasting.none(len(recording.cameras)) if lasting is None else lasting
     if len(recording.cameras) > 1:
         diameter_mm, even = 2 * recording.experiment.radius_mm, recording.timeline.even
         track, found = results.with_contradictions(track, recording.cameras, diameter_mm, even, lasting)
         if found.contradicts:
             remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
-    track = results.with_lasting_errors(track, lasting)  # after the others: only noise is scaled
+    if lasting is not None:
+        track = results.with_lasting_errors(track, lasting)  # after the others: only noise is scaled
     inputs = input_files(recording.experiment, list(recording.cameras))
     origin = dict(track.provenance) | provenance(inputs, recording.experiment.folder, request.command)
     origin["remarks"] = remarks

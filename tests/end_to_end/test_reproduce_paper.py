@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,11 +17,12 @@ from conftest import REPO
 
 sys.path.insert(0, str(REPO / "scripts"))
 
+import kept
 import paper_movies
 import paper_table
 import reproduce_paper
 
-from sphereorient import so3
+from sphereorient import load_experiment, so3, track_movies
 from sphereorient.errors import BenchError
 from sphereorient.statistics import BootstrapSettings, ensemble_of
 from sphereorient.synth import EnsembleSpec, draw_ensemble
@@ -61,10 +64,11 @@ def test_impellers_turn_against_each_other_and_their_light_moves():
 def test_lamps_stand_still_and_bubbles_change():
     disk = paper_movies.Disk(centre_px=torch.tensor([60.0, 50.0]), radius_px=torch.tensor(30.0))
     lit = [np.full((100, 120), 90.0, np.float32) for _ in range(4)]
-    cover = np.zeros((100, 120), np.float32)
-    cover[20:80, 30:90] = 1.0
+    cover = np.ones((60, 60), np.float32)
+    window = slice(20, 80), slice(30, 90)
+    exposure = paper_movies.Exposure(size=(100, 120), window=window, light=90 * cover, cover=cover)
     for light, frame in zip(lit, (1, 1, 2, 3), strict=True):
-        paper_movies.disturb(light, cover, disk, (0, 5, frame))
+        paper_movies.disturb(light, exposure, disk, (0, 5, frame))
     np.testing.assert_array_equal(lit[0], lit[1])
     assert np.abs(lit[0] - 90).max() > 10
     unlike = [np.abs(lit[0] - other).mean() for other in lit[2:]]
@@ -113,8 +117,8 @@ def test_means_have_the_error_of_resampled_movies():
 
 def test_a_broken_folder_of_movies_is_refused_in_one_line(tmp_path, monkeypatch):
     (tmp_path / "movies" / "002").mkdir(parents=True)
-    with pytest.raises(BenchError, match=r"002: expected .*, got no experiment.yaml; remove it"):
-        reproduce_paper.make_movies(tmp_path, reproduce_paper.QUICK)
+    with pytest.raises(BenchError, match=r"002: expected a movie with .*, got a folder without; remove it"):
+        reproduce_paper.todo(tmp_path, reproduce_paper.QUICK, ["film"])
     file = tmp_path / "file"
     file.write_text("")
     for out in (file, tmp_path):
@@ -125,6 +129,51 @@ def test_a_broken_folder_of_movies_is_refused_in_one_line(tmp_path, monkeypatch)
         assert line.startswith("reproduce_paper.py: ")
         assert "\n" not in line
         assert {"expected", "got"} <= set(re.findall(r"\w+", line))
+
+
+def test_what_a_stage_made_stays_until_its_own_code_changes(tmp_path, monkeypatch):
+    plan = reproduce_paper.QUICK
+    for number, stage in ((1, "film"), (2, "film"), (1, "paper"), (1, "precise"), (2, "precise")):
+        made = reproduce_paper.made_by(tmp_path, number, stage)
+        made.parent.mkdir(parents=True, exist_ok=True)
+        made.mkdir() if stage == "film" else made.write_text("")
+        kept.note(made, key=reproduce_paper.key_of(number, stage, plan.frames))
+    refused = reproduce_paper.made_by(tmp_path, 2, "paper")
+    kept.note(refused, key=reproduce_paper.key_of(2, "paper", plan.frames), failed="no ball")
+    stages = ("film", *reproduce_paper.METHODS)
+    left = [(3, "film"), (3, "paper"), (3, "precise")]
+    assert reproduce_paper.todo(tmp_path, plan, stages) == left  # a refusal is a result
+    reproduce_paper.made_by(tmp_path, 2, "precise").unlink()
+    assert reproduce_paper.todo(tmp_path, plan, stages) == [(2, "precise"), *left]
+    now = reproduce_paper.code()
+    for changed, stage in (("precise", "precise"), ("paper", "paper"), ("film", None)):
+        monkeypatch.setattr(reproduce_paper, "code", lambda changed=changed: now | {changed: "another"})
+        again = {name for number, name in reproduce_paper.todo(tmp_path, plan, stages) if number == 1}
+        assert again == ({stage} if stage else {"film", "paper", "precise"})
+
+
+@pytest.mark.slow  # tracks 12 frames
+def test_the_paper_runs_nothing_of_what_its_key_leaves_out():
+    ran, package = set(), REPO / "sphereorient"
+
+    def look(frame: FrameType, event: str, argument: object) -> None:
+        if event == "call":
+            ran.add(frame.f_code.co_filename)
+
+    experiment = load_experiment(REPO / "synthetic_data" / "excerpt" / "experiment.yaml")
+    track_movies(replace(experiment, frames=(0, 12)), method="paper")  # what runs at imports does not count
+    threading.setprofile(look)
+    sys.setprofile(look)
+    try:
+        track_movies(replace(experiment, frames=(0, 12)), method="paper")
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+    files = {path for path in map(Path, ran) if package in path.parents}
+    stages = kept.rooms.modules()
+    counted = kept.code_of([stages["run.stages"], stages["methods.paper"]], reproduce_paper.NOT_OF_PAPER)
+    assert len(files) > 40
+    assert files <= counted, files - counted
 
 
 def check_page(out: Path) -> None:

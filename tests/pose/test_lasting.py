@@ -11,7 +11,7 @@ from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, ri
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import FittedPoses, learn_light, refine, trace
+from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lasting import Lasting, _of_left_out, lasting_errors
 from sphereorient.pose.start import PoseStart
 
@@ -45,8 +45,8 @@ def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
 
 def test_of_noise_alone_little_lasts():
     _, fit, found = measured(COUNT, 0.0)
-    frame = trace(fit.covariance[:, :3, :3]).mean()
-    assert trace(found.covariance[:3, :3]) < 0.1 * frame
+    frame = so3.trace(fit.covariance[:, :3, :3]).mean()
+    assert so3.trace(found.covariance[:3, :3]) < 0.1 * frame
     assert bool((torch.linalg.eigvalsh(found.covariance) > 0).all())
     assert found.own_rad2.shape == (2, 3, 3)
 
@@ -54,7 +54,7 @@ def test_of_noise_alone_little_lasts():
 def test_what_a_reflection_does_to_all_poses_is_stated():
     off, _, found = measured(COUNT, LOBE)
     calm = measured(COUNT, 0.0)[2]
-    assert trace(found.covariance[:3, :3]) > 3 * trace(calm.covariance[:3, :3])
+    assert so3.trace(found.covariance[:3, :3]) > 3 * so3.trace(calm.covariance[:3, :3])
     mean = off.mean(0)
     distance2 = mean @ torch.linalg.solve(found.covariance, mean)
     assert 0.3 < float((distance2 / 6).sqrt()) < 3.0
@@ -62,7 +62,7 @@ def test_what_a_reflection_does_to_all_poses_is_stated():
 
 def test_of_one_frame_more_may_last_than_of_many():
     one, many = (measured(count, LOBE)[2] for count in (1, COUNT))
-    assert trace(one.covariance[:3, :3]) > trace(many.covariance[:3, :3])
+    assert so3.trace(one.covariance[:3, :3]) > so3.trace(many.covariance[:3, :3])
     alone = many.of(1)
     assert alone.own_rad2.shape == (1, 3, 3)
     assert torch.equal(alone.covariance[:3, :3], many.own_rad2[1])
