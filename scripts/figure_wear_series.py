@@ -45,7 +45,7 @@ def main() -> None:
         paths = [Path(temporary) / f"movie {k + 1}.png" for k in range(len(RADII_DEG))]
         for k, path in enumerate(paths):
             write_texture(learnt(k), path)
-        command = [sys.executable, "-m", "sphereorient.cli", "compare-maps", "--series", *map(str, paths)]
+        command = [sys.executable, "-m", "sphereorient.cli", "compare-maps", "--force", "--series", *map(str, paths)]
         subprocess.run([*command, "--out", str(options.out)], check=True)
     area = texel_areas(HEIGHT) / (4 * math.pi)
     for k in range(1, len(RADII_DEG)):

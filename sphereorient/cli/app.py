@@ -26,7 +26,7 @@ class InOrder(TyperGroup):
     """Commands in the order of use, not of their files."""
 
     ORDER = (
-        *("init", "mark", "track", "live", "report", "overlay", "export", "view"),
+        *("init", "mark", "track", "live", "report", "overlay", "export"),
         *("check", "movie", "convert", "calibrate", "check-cameras", "convert-cameras"),
         *("map", "compare-maps", "spin", "synth", "texture"),
         *("score", "bench", "train", "evaluate", "settings", "info"),

@@ -1,4 +1,4 @@
-"""`sphereorient report`, `overlay`, `export` and `view`: what a track is looked at with."""
+"""`sphereorient report`, `overlay` and `export`: what a track is looked at with."""
 
 from functools import partial
 from pathlib import Path
@@ -170,37 +170,3 @@ def export(
             export_track(loaded[ball], path, to, told, camera)
     for ball, path in paths.items() if not quiet else ():
         typer.echo(f"Wrote {path}: {len(loaded[ball])} frames")
-
-
-@app.command()
-def view(
-    track: TrackPath,
-    experiment: Annotated[
-        Path | None, typer.Option(help="experiment.yaml of the track: adds cameras, texture and pictures.")
-    ] = None,
-    save: Annotated[Path | None, typer.Option(help="Write this .rrd instead of opening a window.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Include the pictures of one of so many frames.")] = 1,
-    pictures: Annotated[bool, typer.Option(help="Include the pictures of the movies.")] = True,
-    sphere: SphereName = None,
-    quiet: Quiet = False,
-) -> None:
-    """Show a track in space and time with Rerun: cameras, pictures, the sphere, its motion, its warnings."""
-    if save is not None:
-        check_writable(save)
-    from sphereorient.experiment import load_experiment
-    from sphereorient.report.recording import view_track
-
-    measured = tracks_in(track, sphere)
-    seen = None if experiment is None else load_experiment(experiment)
-    with progress_bar(quiet) as advance:
-        view_track(
-            measured,
-            experiment=seen,
-            save=save,
-            every=every,
-            pictures=pictures,
-            progress=lambda *at: advance("pictures", *at),
-        )
-    if not quiet and save is not None:
-        frames = len(next(iter(measured.values())))
-        typer.echo(f"Wrote {save}: {frames} frames; look at it with `rerun {save}`")

@@ -35,14 +35,6 @@ BRANCHES: dict[str, tuple[str, ...]] = {
 }
 _OF_GAPS = ("locate.gap_frames_max", "locate.spline_knot_frames", "locate.outlier_px", "locate.outlier_factor")
 NOT_READ: dict[str, tuple[str, ...]] = {"precise": _OF_GAPS}
-# Old names of keys; accepted with a remark.
-RENAMED: dict[str, str] = {
-    "refine.block_frames": "refine.chunk_frames",
-    "refine.lanes": "refine.chunks",
-    "refine.study_frames": "refine.appearance_frames",
-}
-# Old keys that nothing reads any more; left aside with a remark, for one version.
-RETIRED = {"paint.smooth": "the pictures' noise and the edges of the paint set it"}
 
 
 class Settings(BaseModel, frozen=True, extra="forbid"):
@@ -102,22 +94,12 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
             file: with another value than the default).
     """
     remarks: list[str] = []
-    parts = [text.partition("=") for text in overrides]
-    parts = [part for part in parts if not _retired(part[0].strip(), "--set", remarks)]
-    overrides = [f"{_renamed(key.strip(), '--set', remarks)}{equals}{value}" for key, equals, value in parts]
+    overrides = ["=".join(part.strip() for part in text.split("=", 1)) for text in overrides]
     for text in overrides if method is not None else ():
         key = text.partition("=")[0]
         if key in DEFAULTS and not is_read(key, str(method)):
             raise SettingsError(_not_read(f"--set {key}", key, str(method)))
     tree = _read(path)
-    for branch, part in tree.items():
-        for name in list(part) if isinstance(part, dict) else ():
-            if _retired(f"{branch}.{name}", f"{path}:", remarks):
-                del part[name]
-                continue
-            new = _renamed(f"{branch}.{name}", f"{path}:", remarks).partition(".")[2]
-            if new != name:
-                part.setdefault(new, part.pop(name))
     settings = _load(Settings, tree, path, overrides)
     if method is not None and path is not None:
         check_settings(settings, method, str(path))
@@ -152,21 +134,6 @@ def _not_read(name: str, key: str, method: str) -> str:
     instead = f"use {known[near[0]]}, " if near else ""
     do = f"leave it out, {instead}or use it with {' or '.join(others)}"
     return refusal(name, expected=f"a key that method {method} reads", got=f"one of {' and '.join(others)}", do=do)
-
-
-def _renamed(key: str, where: str, remarks: list[str]) -> str:
-    """Return the name of a key today, with a remark if `key` is its old one."""
-    new = RENAMED.get(key, key)
-    if new != key:
-        remarks.append(f"{where} {key} is now {new}; the old name goes with the next version")
-    return new
-
-
-def _retired(key: str, where: str, remarks: list[str]) -> bool:
-    """Return whether nothing reads a key any more, with a remark."""
-    if key in RETIRED:
-        remarks.append(f"{where} {key} is no longer read: {RETIRED[key]}")
-    return key in RETIRED
 
 
 def read_flat(model: type[Model], path: Path | None, changes: Mapping[str, Any]) -> Model:

@@ -15,7 +15,7 @@ import pytest
 from conftest import REPO
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"
-EXTRAS = ("pandas", "pyarrow", "xarray", "rerun", "distributed", "pynwb")
+EXTRAS = ("pandas", "pyarrow", "xarray", "distributed", "pynwb")
 
 
 @pytest.fixture(scope="module")

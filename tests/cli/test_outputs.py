@@ -135,7 +135,7 @@ def test_every_command_that_writes_has_force():
         left += getattr(one, "commands", {}).values()
         found[one.name] = {parameter.name for parameter in one.params}
     writing = {name for name, parameters in found.items() if parameters & OUTPUTS}
-    assert {"track", "export", "convert", "view", "overlay", "design", "robustness", "settings"} <= writing
+    assert {"track", "export", "convert", "overlay", "design", "robustness", "settings"} <= writing
     assert {name for name, parameters in found.items() if "force" in parameters} == writing
 
 

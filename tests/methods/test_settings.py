@@ -21,8 +21,6 @@ from sphereorient.methods.settings import (
     BRANCHES,
     DEFAULT_METHOD,
     DEFAULTS,
-    RENAMED,
-    RETIRED,
     Settings,
     check_settings,
     flat_settings_yaml,
@@ -334,29 +332,6 @@ def test_the_settings_of_a_method_are_accepted_by_it(method):
     check_settings(Settings(), method)
     for branch in BRANCHES[method]:
         assert branch in Settings.model_fields
-
-
-@pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_old_names_are_read_with_a_remark(tmp_path, old, new):
-    branch, _, name = old.partition(".")
-    from_file = read_settings(write(tmp_path, f"{branch}:\n  {name}: 7\n"), [], "precise")
-    from_set = read_settings(None, [f"{old}=7"], "precise")
-    assert from_file.settings == from_set.settings != Settings()
-    for loaded in (from_file, from_set):
-        assert any(f"{old} is now {new}" in remark for remark in loaded.remarks)
-    with pytest.warns(UserWarning, match=f"{old} is now {new}"):
-        load_settings(None, [f"{old}=7"])
-
-
-@pytest.mark.parametrize(("key", "why"), RETIRED.items())
-def test_retired_keys_are_left_aside_with_a_remark(tmp_path, key, why):
-    branch, _, name = key.partition(".")
-    for loaded in (
-        read_settings(write(tmp_path, f"{branch}:\n  {name}: 7\n"), [], "map"),
-        read_settings(None, [f"{key}=7"], "map"),
-    ):
-        assert loaded.settings == Settings()
-        assert any(f"{key} is no longer read: {why}" in remark for remark in loaded.remarks)
 
 
 def two_folders(folder: Path):

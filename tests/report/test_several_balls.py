@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -132,14 +130,3 @@ def test_the_overlay_of_several_balls_is_one_movie_and_a_sheet_each(tracks, tmp_
     code, _, err = command(monkeypatch, capsys, "overlay", path, tmp_path / "track.h5", *options)
     assert code == 0, err
     assert sorted(one.name for one in Path(tmp_path).glob("[ow]*")) == ["o.mp4", "w_a.png", "w_b.png"]
-
-
-@pytest.mark.slow
-def test_a_recording_holds_every_ball(tracks, tmp_path):
-    pytest.importorskip("rerun")
-    from sphereorient.report.recording import view_track
-
-    view_track(tracks, save=tmp_path / "t.rrd", pictures=False, experiment=several(a=18.0, b=18.0))
-    printing = [sys.executable, "-m", "rerun", "rrd", "print", str(tmp_path / "t.rrd")]
-    found = subprocess.run(printing, capture_output=True, text=True)
-    assert all(f"/lab/spheres/{name}/ball" in found.stdout for name in tracks), found.stderr

@@ -19,7 +19,6 @@ from sphereorient.report import plots
 from sphereorient.report.build import write_report
 from sphereorient.report.columns import columns, to_xarray
 from sphereorient.report.export import export_track
-from sphereorient.report.recording import series_of
 from sphereorient.report.verdicts import verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.noise import width_curve
@@ -69,11 +68,11 @@ def test_a_file_without_the_unit_is_in_mm(track, tmp_path):
     assert Trajectory.load(tmp_path / "track.h5").length_unit == "mm"
 
 
-def test_figures_and_recordings_say_radii(track):
+def test_figures_say_radii(track):
     labels = [axes.get_ylabel() for axes in (*plots.track_figure(track).axes, *track.plot().axes)]
     (path,) = plots.path_figure(track).axes
-    labels += [path.get_xlabel(), path.get_zlabel(), *series_of(track)]
-    assert {"position, lab (radii)", "velocity, lab (radii/s)", "x, lab (radii)", "position, radii"} <= set(labels)
+    labels += [path.get_xlabel(), path.get_zlabel()]
+    assert {"position, lab (radii)", "velocity, lab (radii/s)", "x, lab (radii)"} <= set(labels)
     assert not lengths_in(" ".join(labels))
 
 
