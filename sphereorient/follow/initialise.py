@@ -1,11 +1,12 @@
 """The pose of a single frame without history: outlines, search over all rotations, fits from coarse to fine."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -46,6 +47,8 @@ class Initialiser:
     candidates: int  # proposals of each camera that are fitted
     score_min: float = 0.0  # where no picture is explained this well, other outlines are tried
     finalists: int = 2  # poses that are fitted to all detail
+    # What was found in pictures looked at before, whatever the fitter; None: none of them is looked at again.
+    known: dict[Hashable, tuple[Picture, Any]] | None = None
 
     def all_poses(self, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
         """Find the poses of n frames of C pictures; see `poses`."""
@@ -88,6 +91,11 @@ class Initialiser:
 
     def relocalise(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
+        key = (view.name, view.diameter_px, self.locating)
+        found: Found = self._once(picture, key, lambda: self._relocalised(picture, view))
+        return found
+
+    def _relocalised(self, picture: Picture, view: CameraView) -> Found:
         proposer = self.proposers[view.name]
         difference = view.background.difference(picture)
         blobs = find_blobs(difference, view.background.noise, view.diameter_px, self.locating)
@@ -130,6 +138,15 @@ class Initialiser:
         best = [float(own.score[:1].sum()) for own in proposer.propose(torch.from_numpy(np.stack(disks))).each()]
         return sum(score > RIVAL_SCORE * max(best) for score in best)
 
+    def _once(self, picture: Picture, key: Hashable, find: Callable[[], Any]) -> Any:
+        """Return what `find` does, or did when the same picture was looked at with this key."""
+        if self.known is None:
+            return find()
+        place = id(picture), key
+        if place not in self.known:
+            self.known[place] = picture, find()  # the picture is kept: its identity is that of no other
+        return self.known[place][1]
+
     def _found(self, shots: Sequence[Frame], find: Callable[[Picture, CameraView], Found]) -> list[Found]:
         return [
             find(shot.picture, view) if shot.usable else (None, shot.reason)
@@ -163,8 +180,13 @@ class Initialiser:
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
-        starts = [self.proposals([one])[0][0] for one in seen]  # one by one: sums depend on how many are added
+        # One by one: sums depend on how many are added.
+        keys = [(self.fitter.views[k].name, outline) for k, _, outline in seen]
+        starts = [self._once(one[1], key, partial(self._starts, one)) for one, key in zip(seen, keys, strict=True)]
         return self.fitted(shots, found, torch.cat([torch.zeros(0, 3, 3, dtype=torch.float64), *starts]))
+
+    def _starts(self, disk: tuple[int, Picture, Outline]) -> Tensor:
+        return self.proposals([disk])[0][0]
 
     def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""

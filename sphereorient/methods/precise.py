@@ -36,6 +36,7 @@ def learn(job: Job, progress: Progress) -> Follower:
         proposers=search.by_camera(views, blur_px),
         locating=settings.locate,
         candidates=settings.refine.candidates,
+        known={},
     )
     following = None
     if exposure_s(job) > 0 and len(recording.clock) > 1:

@@ -77,7 +77,8 @@ def run_benchmark(
     chosen = trackers_of(DEFAULT) if trackers is None else trackers
     _prepare(folder, settings)
     scenes = scenes_of(settings)
-    missing = [scene for scene in scenes if _missing(folder, scene, chosen)]
+    # The hardest first, which take longest: no process waits for another's last one.
+    missing = sorted((scene for scene in scenes if _missing(folder, scene, chosen)), key=lambda scene: -scene.level)
     progress(len(scenes) - len(missing), len(scenes))
     context = multiprocessing.get_context("spawn")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
