@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | test-portable | mutants | lint | types | docs
+# make setup | demo | test | test-all | test-portable | mutants | lint | types | docs | figures
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 
-.PHONY: setup demo test test-all test-portable mutants lint types docs clean
+.PHONY: setup demo test test-all test-portable mutants lint types docs figures clean
 
 setup: $(VENV)/.ready
 
@@ -47,6 +47,10 @@ types: setup
 docs: setup
 	$(BIN)/python -m pip install -q $(INDEX) -e '.[docs]'
 	$(BIN)/mkdocs build
+
+# The tables and figures of the docs that are older than the code that they measure: hours where all are.
+figures: setup
+	$(BIN)/python scripts/figures.py
 
 clean:
 	rm -rf out .cache .pytest_cache .mypy_cache .ruff_cache
