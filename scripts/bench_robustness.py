@@ -4,7 +4,7 @@
 
 The same as `sphereorient bench robustness`; besides, it writes docs/robustness.png, the table in docs/robustness.md and
 docs/robustness-baseline.json, with which later runs are compared, and prints where `precise` is not better than `paper`
-and how well the confidence is calibrated. Ten minutes on two cores; an unfinished run goes on.
+and how well the confidence is calibrated. Half an hour on two cores; an unfinished run goes on.
 """
 
 from __future__ import annotations

@@ -176,6 +176,18 @@ def test_the_paper_runs_nothing_of_what_its_key_leaves_out():
     assert files <= counted, files - counted
 
 
+@pytest.mark.slow  # begins to film
+def test_a_full_disk_ends_in_one_line_and_no_movie_is_half_made(tmp_path):
+    resource = pytest.importorskip("resource")
+    script = [sys.executable, REPO / "scripts" / "reproduce_paper.py", "--out", tmp_path, "--quick"]
+    full = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))}
+    run = subprocess.run(script, capture_output=True, text=True, **full)
+    assert run.returncode == 1
+    said = run.stderr.strip().splitlines()
+    assert [line for line in said if line.startswith("reproduce_paper.py: ")] == said[-1:], said
+    assert [path.name for path in (tmp_path / "movies").iterdir() if not path.name.endswith(".part")] == []
+
+
 def check_page(out: Path) -> None:
     """Check the page of a quick run: its figures exist, and its numbers are sane."""
     page = (out / "paper.md").read_text()
