@@ -39,8 +39,8 @@ def printed(text: str, folder: Path) -> list[str]:
 
 
 def words(line: str) -> str:
-    """Return a line without its numbers, however it is spaced."""
-    return " ".join(re.sub(r"[\d.]+|[│┃|]", " ", line).split())
+    """Return a line without its numbers, however it is spaced; those of names, as cam1, stay."""
+    return " ".join(re.sub(r"(?<![\w/])\d[\d.]*|[│┃|]", " ", line).split())
 
 
 def main() -> None:
