@@ -118,12 +118,13 @@ def film(folder: Path, number: int, frames: int) -> None:
         at, width = camera.project(X.mean(1)), torch.tensor(camera.image_size)
         near = ((at > -width) & (at < 2 * width)).all(1)  # the lens's distortion is defined nearby only
         disks = picture_of_ball(camera, X[near].mean(1), settings.diameter_mm / 2)
-        seen = zip(exposures([scene], camera, X[None, near], R[None, near]), disks.each(), strict=True)
+        seen, place = exposures([scene], camera, X[None, near], R[None, near]), near.cumsum(0) - 1
         for k in range(frames):
             behind = settings.background + impellers(camera.image_size, index, float(times_s[k]))
-            exposure, disk = next(seen) if near[k] else (Exposure.none(size), None)
+            exposure = next(seen) if near[k] else Exposure.none(size)
             lit = exposure.before(behind)
-            if disk is not None:
+            if near[k]:
+                disk = Disk(centre_px=disks.centre_px[place[k]], radius_px=disks.radius_px[place[k]])
                 disturb(lit, exposure, disk, (index, number, k))
             yield digitise(lit, settings, rng)
 

@@ -55,11 +55,10 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     if not values.get("c2a_r"):
         do = "run FicTrac's configGui, or write c2a_r : { 0, 0, 0 } for the camera's own frame"
         raise ExperimentError(refusal(f"{path}, c2a_r", expected="the turn to the animal, rad", got="none", do=do))
-    rate = _numbers(values.get("src_fps", ""))
-    turn = _numbers(values["c2a_r"])
+    rate, turn = _numbers(values.get("src_fps", "")), _numbers(values["c2a_r"])
     if len(turn) != 3:
-        got = f"{len(turn)}"
-        raise ExperimentError(refusal(f"{path}, c2a_r", expected="three numbers, rad", got=got, do="correct it"))
+        got, do = f"{len(turn)}", "correct it"
+        raise ExperimentError(refusal(f"{path}, c2a_r", expected="three numbers, rad", got=got, do=do))
     limb = np.array(_numbers(values.get("roi_circ", "")))
     return FicTracConfig(
         movie=path.parent / values["src_fn"],

@@ -180,13 +180,11 @@ class Initialiser:
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
-        # One by one: sums depend on how many are added.
         keys = [(self.fitter.views[k].name, outline) for k, _, outline in seen]
-        starts = [self._once(one[1], key, partial(self._starts, one)) for one, key in zip(seen, keys, strict=True)]
-        return self.fitted(shots, found, torch.cat([torch.zeros(0, 3, 3, dtype=torch.float64), *starts]))
-
-    def _starts(self, disk: tuple[int, Picture, Outline]) -> Tensor:
-        return self.proposals([disk])[0][0]
+        # One by one: sums depend on how many are added.
+        looks = [self._once(one[1], key, partial(self.proposals, [one])) for one, key in zip(seen, keys, strict=True)]
+        none = torch.zeros(0, 3, 3, dtype=torch.float64)
+        return self.fitted(shots, found, torch.cat([none, *(R for ((R, _),) in looks)]))
 
     def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""

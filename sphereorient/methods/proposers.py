@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,9 +35,7 @@ def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> 
 
 
 def _grey_search(texture: Tensor, settings: Settings, blur: float) -> GreySearch:
-    def make(bank: Tensor | None = None) -> GreySearch:
-        return GreySearch(texture, settings.search, blur, bank)
-
+    make = partial(GreySearch, texture, settings.search, blur)
     return _with_bank("bank", (texture, settings.search.model_dump_json(), blur), make)
 
 
@@ -124,9 +123,7 @@ def open_view(recording: Recording, stream: CameraStream, settings: Settings, pr
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
     """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
-
-    def make(bank: Tensor | None = None) -> TemplateBank:
-        return TemplateBank(texture, size_px, settings.orient, bank)
+    make = partial(TemplateBank, texture, size_px, settings.orient)
 
     def templates() -> Proposer:
         return _with_bank("templates", (texture, size_px, settings.orient.model_dump_json()), make)

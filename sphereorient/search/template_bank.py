@@ -167,17 +167,26 @@ class TemplateBank(DiskSearch):
             near = self._around @ at[:, None]  # (q, A, 3, 3)
             for pixels, keep in [*steps, (self._real, count)]:
                 template = self._rendered(near.flatten(0, 1), pixels).reshape(*near.shape[:2], int(pixels.sum()))
-                best = (template @ paint[of][:, pixels][..., None])[..., 0].topk(keep)
+                best = _matches(template, paint[of][:, pixels]).topk(keep)
                 near = near[torch.arange(len(near))[:, None], best.indices]
             R.append(near.flatten(0, 1))
             match.append(best.values.flatten())
         return torch.cat(R), torch.cat(match), torch.arange(len(starts)).repeat_interleave(count)
 
     def _rendered(self, R_view_body: Tensor, pixels: Tensor) -> Tensor:
-        """Return templates (K, P) at the P pixels (S, S) bool of the real size, whole numbers."""
+        """Return templates (K, P) at the P pixels (S, S) bool of the real size, whole numbers, from a table int8."""
         if self._table is None:
             return _templates(self.renderer, pixels, R_view_body)
-        return self._table.render(R_view_body, self._view.normal_view[pixels[self._view.inside]]).float()
+        return self._table.render(R_view_body, self._view.normal_view[pixels[self._view.inside]])
+
+
+def _matches(template: Tensor, paint: Tensor) -> Tensor:
+    """Return the sums of products (Q, A) of templates (Q, A, P) with their paint (Q, P), -1, 0 or 1."""
+    if template.dtype is not torch.int8 or not template.is_cpu or not len(paint):
+        return (template.float() @ paint[..., None])[..., 0]
+    # In whole numbers products with the paint of all starts take a third of the time.
+    every = torch._int_mm(template.flatten(0, 1), paint.to(torch.int8).T.contiguous())
+    return every.float().reshape(*template.shape[:2], len(paint)).diagonal(dim1=0, dim2=2).T
 
 
 def best_of_each(group: Tensor, value: Tensor, count: int) -> Tensor:

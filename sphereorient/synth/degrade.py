@@ -1,10 +1,9 @@
 """Degradations of picture batches, without kornia augmentations: these draw from torch's global generator."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -32,12 +31,6 @@ class Disk:
 
     def __post_init__(self) -> None:
         check_tail("centre_px", self.centre_px, 2)
-
-    def each(self) -> Iterator[Self]:
-        """Yield the disks of N pictures one by one."""
-        covers = [None] * len(self.radius_px) if self.cover is None else self.cover
-        for centre_px, radius_px, cover in zip(self.centre_px, self.radius_px, covers, strict=True):
-            yield type(self)(centre_px=centre_px, radius_px=radius_px, cover=cover)
 
     def offset(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's offset from the centre to the right and down, (..., H, W) each, px."""

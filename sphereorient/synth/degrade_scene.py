@@ -110,7 +110,8 @@ class Filming:
         self.settings = settings
         self.values = dict(values)
         self.cameras = cameras
-        self.applied = tuple(name for name in OPERATIONS if self.values.get(name, nothing(name)) != nothing(name))
+        without = {name: DEGRADATIONS[name].nothing for name in OPERATIONS}
+        self.applied = tuple(name for name, value in without.items() if self.values.get(name, value) != value)
         self.optics = tuple(name for name in self.applied if name not in NOISE)
         size = {name: camera.image_size[::-1] for name, camera in cameras.items()}
         self.fields = {
@@ -128,8 +129,8 @@ class Filming:
 
     def reported_texture(self, texture: Tensor, number: int = 0) -> Tensor:
         """Return the map of a paint to write, (H, 2 H), with exchanged patches."""
-        share = self.values.get("texture_error", 0.0)
-        return misdrawn(texture, share, of_paint(self.settings.seed, "texture_error", number))
+        rng = self._generator("texture_error", *[number] * (number > 0))
+        return misdrawn(texture, self.values.get("texture_error", 0.0), rng)
 
     def picture(self, exposure: Exposure, disk: Disk, name: str, frame: int) -> NDArray[np.float32]:
         """Return degraded grey levels (H, W) of a camera's frame, before the camera's own noise.
@@ -188,16 +189,6 @@ class Filming:
     def _generator(self, *what: str | int) -> torch.Generator:
         # By name: another degradation does not change the random numbers of the rest.
         return seeded(self.settings.seed, *what)
-
-
-def of_paint(seed: int, what: str, number: int) -> torch.Generator:
-    """Return the random numbers of a degradation of a paint."""
-    return seeded(seed, what, *([number] if number else []))
-
-
-def nothing(name: str) -> float | None:
-    """Return the value of a degradation that has no effect."""
-    return DEGRADATIONS[name].nothing
 
 
 def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Disk:

@@ -216,8 +216,7 @@ def _seen(
     first = along - depth2.clamp_min(0).sqrt()
     normal = ((first * direction - to_centre) / radius_mm).float()
     lamps = torch.tensor(LAMPS)
-    towards = torch.nn.functional.normalize(lamps[:, :3], dim=-1)
-    lit = (lamps[:, 3] / LIT) @ (towards @ normal).clamp_min(0)
+    lit = (lamps[:, 3] / LIT) @ (torch.nn.functional.normalize(lamps[:, :3], dim=-1) @ normal).clamp_min(0)
     light = settings.ambient + (1 - settings.ambient) * lit
     paint = sample_closed(scene.closed, (R_lab_body.mT.float() @ normal).mT)
     hit = (depth2 > 0).float()

@@ -21,7 +21,7 @@ from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
 from sphereorient.synth.degrade import OF_ONE_BALL, Disk
-from sphereorient.synth.degrade_scene import Filming, degraded_settings, of_paint, picture_of_ball, worn, wrong_cameras
+from sphereorient.synth.degrade_scene import Filming, degraded_settings, picture_of_ball, worn, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion, without_seam
 from sphereorient.synth.scene import Exposure, digitise, exposures, make_scene, seeded
 from sphereorient.synth.settings import SynthSettings
@@ -150,7 +150,7 @@ def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
         for k in range(min(settings.balls, settings.paints))
     ]
     scenes = [
-        make_scene(worn(texture, paint_wear, of_paint(settings.seed, "paint_wear", k)), settings)
+        make_scene(worn(texture, paint_wear, seeded(settings.seed, "paint_wear", *[k] * (k > 0))), settings)
         for k, texture in enumerate(textures)
     ]
     at = [motion.at(instants_s(settings).reshape(-1)) for motion in motions.values()]
@@ -230,8 +230,9 @@ def _as_file(texture: Tensor) -> NDArray[np.uint8]:
 def _frames(
     movie: CleanMovie, filming: Filming, name: str, rng: torch.Generator, progress: Callable[[int], None]
 ) -> Iterator[NDArray[np.uint8]]:
-    lost = filming.lost(name, filming.settings.frames)
-    for k, (exposure, disk) in enumerate(zip(movie.exposures[name](), movie.disks[name].each(), strict=True)):
+    lost, disks = filming.lost(name, filming.settings.frames), movie.disks[name]
+    for k, exposure in enumerate(movie.exposures[name]()):
+        disk = Disk(centre_px=disks.centre_px[k], radius_px=disks.radius_px[k])
         # Lost frames draw noise too: the other frames do not depend on losses.
         frame = digitise(filming.picture(exposure, disk, name, k), filming.settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
