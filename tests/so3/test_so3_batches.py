@@ -44,6 +44,7 @@ CASES = {
     so3.from_lattman: (vectors, (3,)),
     so3.log: (rotations, (3,)),
     so3.vee: (rotations, (3,)),
+    so3.trace: (rotations, ()),
     so3.angle: (rotations, ()),
     so3.to_tait_bryan: (rotations, (3,)),
     so3.nearest_rotation: (rotations, (3, 3)),
