@@ -21,13 +21,11 @@ from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import (
     DEGRADATIONS,
     SynthSettings,
-    random_texture,
     severity,
     write_degraded,
     write_synthetic_experiment,
 )
 from sphereorient.synth.degrade_scene import (
-    Filming,
     degraded_settings,
     misdrawn,
     picture_of_ball,
@@ -38,7 +36,7 @@ from sphereorient.synth.degrade_scene import (
     worn,
     wrong_cameras,
 )
-from sphereorient.synth.write import default_cameras, motion_of
+from sphereorient.synth.write import clean_movie, default_cameras, motion_of
 
 SETTINGS = SynthSettings(
     frames=10,
@@ -326,11 +324,13 @@ def test_the_given_map_differs_from_the_filmed_one_by_its_share(plain, tmp_path)
 
 
 def test_worn_paint_is_on_the_filmed_ball_only():
-    filming = Filming(SETTINGS, {"paint_wear": 0.25}, default_cameras(SETTINGS))
-    texture = random_texture("blobs", 6)
-    assert torch.equal(filming.reported_texture(texture), texture)
+    plain, spoilt = (clean_movie(SETTINGS, share) for share in (0.0, 0.25))
+    assert torch.equal(plain.textures[0], spoilt.textures[0])
+    before, after = (next(iter(movie.exposures["cam1"]())) for movie in (plain, spoilt))
+    assert np.array_equal(before.cover, after.cover)
+    assert np.abs(before.light - after.light).mean() > 3.0
     area = map_directions(512)[..., :2].norm(dim=-1)
-    bare = filming.paint(texture) == 0.5
+    bare = worn(plain.textures[0], 0.25, torch.Generator().manual_seed(6)) == 0.5
     assert float((area * bare).sum() / area.sum()) == pytest.approx(0.25, abs=5e-3)
 
 
