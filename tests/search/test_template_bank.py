@@ -177,7 +177,7 @@ def test_the_table_is_pinned_to_the_renderer(kind):
     kornia = TemplateBank(texture_of(kind), size, settings.model_copy(update={"renderer": "kornia"}))
     paint, about = table.paint(disks), so3.random_rotations(20, generator=torch.Generator().manual_seed(3)).float()
     T = [
-        0.5 + bank._rendered(about, bank._real) @ paint[:, bank._real].T / (254 * bank._real.sum())
+        0.5 + bank._rendered(about, bank._real).float() @ paint[:, bank._real].T / (254 * bank._real.sum())
         for bank in (table, kornia)
     ]
     assert (T[0] - T[1]).abs().max() < 0.01
