@@ -105,6 +105,7 @@ def known(made: Path) -> dict[str, Any]:
 
 def note(made: Path, **words: Any) -> None:
     """Note what a file or a folder was made of."""
+    # By its command `write_text` knows the file as ours, and replaces it.
     write_text(record_of(made), json.dumps({"command": "sphereorient scripts", **words}) + "\n")
 
 

@@ -22,9 +22,8 @@ TEXT_MARK = re.compile(
     rb"(?:#|<!--).*made by sphereorient|# repaired by sphereorient |# experiment: .*\n# method: .*\n# frame_rate_hz: "
     rb'|\{\s*(?:"map": .*,\s*)?(?:"command": ?"sphereorient |"schema": ?"sphereorient-robustness)'
 )
-SEAL = re.compile(
-    rb"# Until it is changed, init may replace it: ([0-9a-f]{8})\n"
-)  # of a draft for people to go on with
+# The first line of a draft for people to go on with, see `sealed`.
+SEAL = re.compile(rb"# Until it is changed, init may replace it: ([0-9a-f]{8})\n")
 OLD_PAGE = b'<footer class="faint">sphereorient '
 PNG, PNG_HEAD = b"\x89PNG\r\n\x1a\n", 33  # signature; bytes of it and of the first chunk
 HDF5 = b"\x89HDF\r\n\x1a\n"
