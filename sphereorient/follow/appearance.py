@@ -24,6 +24,7 @@ from sphereorient.pose.fitter import (
     FEWEST_LIT,
     FINEST_PX,
     LEAST_LEFT,
+    CameraView,
     Fitter,
     Optics,
     Picture,
@@ -46,6 +47,7 @@ FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
 RIVALS = 0.1  # share of the frames with two claimants, two frames at least: there is a second ball
 FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
 TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees the sphere elsewhere than the other
+BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
 TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
 ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
@@ -66,6 +68,7 @@ BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which
 CLEAR = 3.0  # times the variance that the typical right pose leaves
 LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
 MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured
+FAINT = 0.3  # of the merit of the faintest blob that is proven to be the sphere: fainter ones are not looked at
 MORE_LEFT = 0.05  # of the variance: by as much more is left where the exposure is certainly another one
 APART_BLURS, MOST_INSTANTS = 3.0, 8  # between neighbouring instants of the exposure, and of these
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
@@ -98,8 +101,8 @@ class Appearance:
 
     @property
     def clear_score(self) -> float:
-        """Score of a typical right pose; out of reach for blurred pictures."""
-        return ALWAYS if self.soft else max(self.score_min, _clear_of(self.right_score))
+        """Score from which a search ends; out of reach for blurred pictures."""
+        return ALWAYS if self.soft else self.score_min
 
     @property
     def soft(self) -> bool:
@@ -154,7 +157,7 @@ def estimate_appearance(
         found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
     else:
         found = list(among.found)
-    if not _clear(found):
+    if not proven(found):
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found) if among is None else (1.0, 0.0)
     looked, seen, others = found, [], None
@@ -164,14 +167,14 @@ def estimate_appearance(
         each = [one.all_poses([[frame[k]] for frame in frames]) for k, one in enumerate(alone)]
         looked = [poses for of_camera in each for poses in of_camera]
         _check_cameras(fitter, each)
-        seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in _clear(of_camera)]
+        seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in proven(of_camera)]
         X, R, _ = best_poses([each[camera][frame] for frame, camera in seen])
         use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in seen]), len(each)).bool()
         shown = [pictures[frame] for frame, _ in seen]
     else:
-        X, R, use = best_poses([found[k] for k in _clear(found)])
-        shown = [pictures[k] for k in _clear(found)]
-        others = None if among is None else among.neighbours.of(_clear(found))
+        X, R, use = best_poses([found[k] for k in proven(found)])
+        shown = [pictures[k] for k in proven(found)]
+        others = None if among is None else among.neighbours.of(proven(found))
     whole = fitter.pixels(shown, X, fitter.optics.fine, neighbours=others)
     thin = max(1, round(whole.grey.shape[1] / ENOUGH))
     pixels = whole.thinned(thin)
@@ -198,7 +201,7 @@ def estimate_appearance(
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
     blurred, moved, sharper = fitter.optics, None, False
     if following is not None and looked is found:
-        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following, others)
+        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, proven(found), following, others)
     if moved is not None:
         smeared, known = open_.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         open_, there = _light_and_blur(open_, paint, smeared, fit, known, given=False)
@@ -223,14 +226,21 @@ def estimate_appearance(
         # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
     limb_px = _limb_px(fitter, fit, use)
-    fitter, still = (replace(one, widest_px=widest, limb_px=limb_px) for one in (fitter, still))
+    views = _with_least_merit(first, frames, looked) if among is None and looked is found else fitter.views
+    fitter, still = (replace(one, views=views, widest_px=widest, limb_px=limb_px) for one in (fitter, still))
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
     if defocus_radii(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
         score_min = min(score_min, _clear_of(right))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine))
-    claimed = 0 if among is not None else sum(count > 1 for count in side_by_side(first.claimants, frames))
+    claimed = (
+        0
+        if among is not None
+        else sum(
+            count > 1 for count in side_by_side(first.claimants, [frames[k] for k in proven(looked[: len(frames)])])
+        )
+    )
     return Appearance(
         fitter=fitter,
         still=still,
@@ -252,7 +262,7 @@ def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
     """
     parts = []
     for of_camera in alone:
-        clear = torch.tensor([0 if k in _clear(of_camera) else -1 for k in range(len(of_camera))])
+        clear = torch.tensor([0 if k in proven(of_camera) else -1 for k in range(len(of_camera))])
         best = pose_table([of_camera], 1).rows(clear)
         parts.append((best["position_lab_mm"], best["R_lab_body"], best["covariance"][:, :3, :3]))
     X, R, covariance = (torch.stack(part, 1) for part in zip(*parts, strict=True))
@@ -315,6 +325,18 @@ def _limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     return found
 
 
+def _with_least_merit(
+    search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]
+) -> list[CameraView]:
+    """Return the views with the least merit of a blob in which the sphere is looked for."""
+    views = []
+    for camera, view in enumerate(search.fitter.views):
+        shown = [frames[k][camera].picture for k in proven(found) if bool(found[k].use[camera])]
+        merits = list(side_by_side(lambda picture, view=view: search.merit(picture, view), shown))
+        views.append(replace(view, merit_min=FAINT * min(merits) if merits else 0.0))
+    return views
+
+
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
     """Measure on a few frames whether the cameras see one sphere at one position.
     Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
@@ -323,13 +345,11 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     Rotations that differ by less than their own errors do not count: a small disk shows little.
     """
     cameras = len(fitter.views)
-    whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
-    if cameras == 1:
-        return 1.0, 0.0
-    torn = [poses for poses in found if len(poses) and any(why in TORN for why in poses.reason)]
-    if len(whole) < len(torn):
+    sure = proven(found)
+    whole = [k for k in sure if bool(found[k].use.all())]
+    if len(whole) < sum(_torn(fitter, found[k]) for k in sure):
         return math.inf, math.inf  # outlines that miss each other already
-    if not whole:
+    if cameras == 1 or not whole:
         return 1.0, 0.0
     whole = [k for k in whole if _in_view(fitter, found[k].position_lab_mm[:1])] or whole
     tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
@@ -362,6 +382,15 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     differ_px = float(torch.stack([gap_px, *others_px]).amax(0).quantile(0.75))
     gain = float(torch.stack(gains).amax(0).quantile(0.75)) if differ_px > APART_PX else 1.0
     return gain, float(gap_px.quantile(0.75))
+
+
+def _torn(fitter: Fitter, poses: Poses) -> bool:
+    """Return whether a camera that should show the whole sphere at the best pose sees it elsewhere, or nothing."""
+    X = poses.position_lab_mm[:1]
+    return any(
+        why in TORN and bool(view.shows_whole(view.camera.project(X), view.radius_px(X, fitter.radius_mm)).all())
+        for view, why in zip(fitter.views, poses.reason, strict=True)
+    )
 
 
 def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:
@@ -454,7 +483,7 @@ def _exposed(
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:
     """Return the median score of the best poses of clear frames, and the highest typical score of wrong ones."""
-    clear = _clear(found)
+    clear = proven(found)
     best = torch.cat([found[k].score[0][found[k].use] for k in clear])
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in clear])
     return float(best.median()), float(wrong.quantile(0.9)) if len(wrong) else 0.0
@@ -462,7 +491,7 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
 
 def _times_better(found: Sequence[Poses]) -> float:
     """Return the median ratio of the variances left by second and best pose; blurred pictures need the ratio."""
-    rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
+    rows = [(found[k].score[:2], found[k].use) for k in proven(found) if len(found[k]) > 1]
     if not rows:
         return math.inf
     left = torch.stack([(1 - score[:, use]).mean(1).clamp_min(LEAST_LEFT) for score, use in rows])
@@ -480,12 +509,18 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
     return ExperimentError(refusal("movies", expected=expected, got=got, do=do))
 
 
-def _clear(found: Sequence[Poses]) -> list[int]:
-    """Return the frames whose best pose explains the picture about as well as in the typical frame."""
-    best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else torch.nan for poses in found])
-    if torch.isnan(best).all():
+def proven(found: Sequence[Poses]) -> list[int]:
+    """Return the frames whose best pose explains every picture in use better than wrong poses do, and about as well as
+    in the typical frame of these.
+    """
+    best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else -1.0 for poses in found])
+    wrong = torch.tensor([float(poses.score[1, poses.use].min()) for poses in found if len(poses) > 1])
+    least = BETTER + (float(wrong.quantile(0.9)) if len(wrong) else 0.0)
+    right = best[best >= least]
+    if not len(right):
         return []
-    return [k for k, score in enumerate(best.tolist()) if score >= _clear_of(float(best.nanquantile(0.75)))]
+    least = max(least, _clear_of(float(right.quantile(0.75))))
+    return [k for k, score in enumerate(best.tolist()) if score >= least]
 
 
 def _clear_of(typical: float) -> float:

@@ -1,11 +1,13 @@
 """Tracking batch by batch, while the next one is decoded; all cameras together, or those that agree."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import accumulate, islice, pairwise
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.experiment.recording import Recording
@@ -18,9 +20,13 @@ from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import OWN, ChunkTracker
 from sphereorient.locate import Frame, screened_frames
+from sphereorient.locate.outline import Outline
 from sphereorient.pose import CameraView
 from sphereorient.trajectory import Reason
 
+MOST, KEPT = 8, 2  # times the frames that are wanted: looked at, and kept
+SHOWN = 0.75  # of the frames that are wanted, in which each camera is to show the ball
+FEWEST = 4  # frames that show it
 DECODING = 2  # threads in which parts of pictures are decoded
 
 
@@ -175,6 +181,36 @@ def sample_frames(
     with ThreadPoolExecutor(DECODING) as parts:  # `usable` decodes all of a picture
         found = list(side_by_side(of_stretch, zip(spread, [*spread[1:], total], strict=True)))
     return [shots for shots, _ in found], [place for _, place in found]
+
+
+def frames_showing(
+    recording: Recording,
+    views: Sequence[CameraView],
+    count: int,
+    disks: Callable[[Sequence[Frame]], list[Outline | None]],
+) -> tuple[list[tuple[Frame, ...]], list[int]]:
+    """Return frames of all cameras that show the ball, spread over the movies, and their places among the frames in
+    use. `disks` finds it in the C pictures of a frame. `count` frames are looked at, and more, up to `MOST` times as
+    many, until each camera shows it in `SHOWN` of that count; of these at most `KEPT` times as many are returned, those
+    that most cameras show. Where hardly a frame shows it, the first `count` are returned.
+    """
+    frames, places = sample_frames(recording, views, count)
+    looked, total, times = list(places), len(recording.timeline), 1
+
+    def shown(some: Sequence[tuple[Frame, ...]]) -> Iterator[NDArray[np.bool_]]:
+        return (np.array([disk is not None for disk in found]) for found in side_by_side(disks, some))
+
+    seen = dict(zip(places, zip(frames, shown(frames), strict=True), strict=True))
+    while times < MOST and sum(by for _, by in seen.values()).min() < SHOWN * count:
+        times *= 2
+        more = sorted(set(spread_frames(range(total), times * count)) - set(looked))
+        looked += more
+        new = frames_at(recording, views, more)
+        seen |= {k: (shots, by) for k, shots, by in zip(more, new, shown(new), strict=True) if by.any()}
+    kept = sorted((k for k, (_, by) in seen.items() if by.any()), key=lambda k: -seen[k][1].sum())[: KEPT * count]
+    if len(kept) < FEWEST:
+        return frames, places
+    return [seen[k][0] for k in sorted(kept)], sorted(kept)
 
 
 def frames_at(recording: Recording, views: Sequence[CameraView], places: Sequence[int]) -> list[tuple[Frame, ...]]:

@@ -25,6 +25,7 @@ from sphereorient.trajectory import Reason
 
 Place = TypeVar("Place", Blob, Outline)
 
+UNPROVEN = -1.0  # score of no pose
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
 DEPTH_SHARE = 0.08  # of the distance: how far off it may be where only one outline's size gives it
@@ -60,9 +61,10 @@ class Initialiser:
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
         explained well, outlines nearer to the usual size are tried, and the texture locates the disk.
         """
+        if not any(self._may_show(shot, view) for shot, view in zip(shots, self.fitter.views, strict=True)):
+            reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
+            return no_pose(len(shots), reason)
         poses = self._with_outlines(shots, self.locating)
-        if not any(shot.usable for shot in shots):
-            return poses
         for tolerance in NARROWER:
             if _best_score(poses) >= self.score_min:
                 break
@@ -73,8 +75,17 @@ class Initialiser:
             poses = max(poses, self._search(shots, self._found(shots, self.relocalise)), key=_best_score)
         return poses
 
+    def _may_show(self, shot: Frame, view: CameraView) -> bool:
+        """Return whether a picture may show the sphere: a look at its blobs."""
+        return shot.usable and (view.merit_min == 0.0 or self.merit(shot.picture, view) >= view.merit_min)
+
+    def merit(self, picture: Picture, view: CameraView) -> float:
+        """Return the merit of the best blob of a picture, 0 without one."""
+        blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, self.locating)
+        return blobs[0].merit if blobs else 0.0
+
     def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
-        found = self._found(shots, lambda seen, view: find_ball(seen, view.background, view.diameter_px, locating))
+        found = self._found(shots, replace(self, locating=locating).outline)
         seeing = [k for k, (outline, _) in enumerate(found) if outline is not None]
         if len(seeing) < 2 or self._meet(found):
             return self._search(shots, found)
@@ -88,6 +99,17 @@ class Initialiser:
     def _meet(self, found: Sequence[Found]) -> bool:
         """Return whether the lines of sight meet; that of one camera does."""
         return not float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm
+
+    def outline(self, picture: Picture, view: CameraView) -> Found:
+        """Return the outline of the sphere in a camera's picture, or None and the reason; see `find_ball`."""
+        key = ("outline", view.name, view.diameter_px, self.locating)
+        there = view.background, view.diameter_px, self.locating
+        found: Found = self._once(picture, key, lambda: find_ball(picture, *there))
+        return found
+
+    def disks(self, shots: Sequence[Frame]) -> list[Outline | None]:
+        """Return the outline of a painted sphere in each of C pictures; None without one."""
+        return [one if one is not None and one.painted else None for one, _ in self._found(shots, self.outline)]
 
     def relocalise(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
@@ -250,7 +272,7 @@ def _distinct_places(places: Sequence[Place], radius_px: float) -> list[Place]:
 
 
 def _best_score(poses: Poses) -> float:
-    return float(poses.score[0, poses.use].max()) if len(poses) else -1.0
+    return float(poses.score[0, poses.use].max()) if len(poses) else UNPROVEN
 
 
 def by_decreasing_size(cameras: Sequence[int]) -> Iterator[list[tuple[int, ...]]]:

@@ -16,7 +16,7 @@ from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.chunk import Chunk, Expected
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
-from sphereorient.follow.poses import Poses, poses_of, supported
+from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
@@ -305,11 +305,12 @@ class ChunkTracker:
             Reason.LOW_SCORE if was and not now else why
             for was, now, why in zip(poses.use.tolist(), seen.tolist(), poses.reason, strict=True)
         ]
+        if not bool(seen.any()):
+            return no_pose(len(shots), reason)
         if bool(self._contradictory(poses, seen.expand(len(poses), -1))[0]):
             return self._by_each(poses, frames, seen)
-        if bool((seen == poses.use).all()) or not bool(seen.any()):
-            # Keep all where no camera is sure: the path decides.
-            return replace(poses, use=seen, reason=tuple(reason))
+        if bool((seen == poses.use).all()):
+            return poses
         fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 

@@ -33,6 +33,7 @@ class CameraScene:
 
     background: Background
     diameter_px: float
+    merit_min: float = 0.0  # of a blob that may be the sphere; 0: not known
 
 
 def known_diameter_px(recording: Recording, name: str, settings: LocateSettings) -> float | None:

@@ -31,7 +31,7 @@ from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.trajectory import SPHERES
 
-SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/1", "sphereorient-learnt/2"
+SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
 WHETHER = ("together", "second_ball", "sharper")
 LASTING = ("covariance", "own_rad2")
@@ -70,10 +70,7 @@ class Learnt:
         fitter = study.fitter
         told = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
         return cls(
-            scenes={
-                view.name: CameraScene(background=view.background, diameter_px=view.diameter_px)
-                for view in fitter.views
-            },
+            scenes={view.name: view.scene for view in fitter.views},
             light=fitter.light,
             limb_px=fitter.limb_px,
             lasting=study.lasting,
@@ -209,6 +206,7 @@ def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
     for name, scene in learnt.scenes.items():
         group, background = file.create_group(f"cameras/{name}"), scene.background
         group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
+        group.attrs["merit_min"] = scene.merit_min
         for part in ("mean", "noise", "shown"):
             if getattr(background, part) is not None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
@@ -260,14 +258,15 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
             full_scale=float(group.attrs["full_scale"]),
             shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
         )
-        scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
+        numbers = {part: float(group.attrs[part]) for part in ("diameter_px", "merit_min")}
+        scenes[name] = CameraScene(background=background, **numbers)
     return scenes
 
 
 def _scenes_of(group: h5py.Group, scenes: Mapping[str, CameraScene]) -> dict[str, CameraScene]:
     """Return the scenes with the diameters of one ball of several."""
     sizes = zip(scenes.items(), group.attrs["diameter_px"], strict=True)
-    return {name: CameraScene(background=scene.background, diameter_px=float(px)) for (name, scene), px in sizes}
+    return {name: replace(scene, diameter_px=float(px)) for (name, scene), px in sizes}
 
 
 def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:

@@ -1,6 +1,7 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import torch
 
@@ -9,8 +10,8 @@ from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Appearance, Following, estimate_appearance
 from sphereorient.follow.fixed_centre import find_fixed_centre
-from sphereorient.follow.follower import Follower, PerCameraTracker, frames_at, sample_frames
-from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.follower import Follower, PerCameraTracker, frames_at, frames_showing, sample_frames
+from sphereorient.follow.initialise import UNPROVEN, Initialiser
 from sphereorient.follow.poses import Poses, pose_table
 from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
@@ -26,18 +27,22 @@ def learn(job: Job, progress: Progress) -> Follower:
     recording, settings = job.recording, job.settings
     views, base, search = open_views(recording, settings, progress)
     progress("appearance", 0, 1)
-    frames, places = sample_frames(recording, views, settings.refine.appearance_frames)
-    # Only blurred pictures need blurred templates; sharp ones share one first guess.
-    blur_px = settings.refine.blur_px or estimate_blur_px(views, frames, settings.locate)
-    if settings.refine.blur_px is None and not defocus_radii(blur_px, search.diameter_px):
-        blur_px = FIRST_BLUR_PX
+    blur_px = settings.refine.blur_px or FIRST_BLUR_PX
     first = Initialiser(
         fitter=first_fitter(views, recording.experiment.radius_mm, base, blur_px),
         proposers=search.by_camera(views, blur_px),
         locating=settings.locate,
         candidates=settings.refine.candidates,
+        score_min=UNPROVEN,
         known={},
     )
+    frames, places = frames_showing(recording, views, settings.refine.appearance_frames, first.disks)
+    # Only blurred pictures need blurred templates; sharp ones share one first guess.
+    disks = [(shot.picture, disk) for shots in frames for shot, disk in zip(shots, first.disks(shots), strict=True)]
+    blur_px = estimate_blur_px((picture, disk) for picture, disk in disks if disk is not None)
+    if settings.refine.blur_px is None and defocus_radii(blur_px, search.diameter_px):
+        fitter = first_fitter(views, recording.experiment.radius_mm, base, blur_px)
+        first = replace(first, fitter=fitter, proposers=search.by_camera(views, blur_px))
     following = None
     if exposure_s(job) > 0 and len(recording.clock) > 1:
         beside = [place + 1 if place + 1 < len(recording.clock) else place - 1 for place in places]

@@ -1,7 +1,7 @@
 """How much pictures are blurred: a first guess from their edges, and the blur that explains them best."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import cache
 
 import cv2
@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.locate import Frame, LocateSettings
-from sphereorient.locate.outline import find_blobs
+from sphereorient.locate.outline import Outline
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import FINEST_PX, CameraView, Fitter, level_of, widest_px
+from sphereorient.pose.fitter import FINEST_PX, Fitter, level_of, widest_px
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -24,30 +23,19 @@ FINER, FINEST = 1.25, 1.07  # ratio of the blurs that are tried, at first and on
 WIDEST = 0.3  # of the radius: wider ones remove all paint
 
 
-def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
-    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
-    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
+def estimate_blur_px(disks: Iterable[tuple[NDArray[np.generic], Outline]]) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edges of disks in pictures: the median.
+    A first guess, biased by noise and paint without edges. 0 without disks.
     Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
     """
-    found = [
-        _steepest(shot.picture.astype(np.float32), view, locating)
-        for frame in shots
-        for view, shot in zip(views, frame, strict=True)
-        if shot.usable
-    ]
-    told = [blur for blur in found if blur is not None]
-    return float(np.median(told)) if told else 0.0
+    found = [steepest_blur_px(_about(*disk)) for disk in disks]
+    return float(np.median(found)) if found else 0.0
 
 
-def _steepest(picture: NDArray[np.float32], view: CameraView, locating: LocateSettings) -> float | None:
-    """Return the blur of the steepest edge about the likeliest blob, px; None without one."""
-    blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, locating)
-    if not blobs or blobs[0].merit <= 0:
-        return None
-    reach = round(AROUND * view.diameter_px / 2)
-    left, top = max(0, round(blobs[0].u_px) - reach), max(0, round(blobs[0].v_px) - reach)
-    window = picture[top : round(blobs[0].v_px) + reach + 1, left : round(blobs[0].u_px) + reach + 1]
-    return steepest_blur_px(window)
+def _about(picture: NDArray[np.generic], disk: Outline) -> NDArray[np.float32]:
+    reach = round(AROUND * disk.radius_px)
+    u, v = round(disk.u_px), round(disk.v_px)
+    return picture[max(0, v - reach) : v + reach + 1, max(0, u - reach) : u + reach + 1].astype(np.float32)
 
 
 def steepest_blur_px(picture: NDArray[np.float32]) -> float:

@@ -20,7 +20,7 @@ from sphereorient.locate import Background
 from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
 from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil
-from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, TUKEY
+from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY
 from sphereorient.pose.start import NearStart
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
@@ -55,7 +55,7 @@ class _Task(ctypes.Structure):
         *((name, _Table) for name in ("paint", "unseen")),
         *(
             (name, ctypes.c_float)
-            for name in ("unseen_most", "known_least", "cover_least", "sine_most", "noise_least", "tukey2")
+            for name in ("unseen_most", "known_least", "cover_least", "sine_most", "noise_least", "tukey2", "outliers")
         ),
         ("edge", ctypes.c_void_p),
         ("edges", ctypes.c_int64),
@@ -305,6 +305,7 @@ def _of_model(model: SphereModel) -> tuple[_Task, _Addresses]:
         sine_most=math.sqrt(1.0 - DEPTH_MIN**2),
         noise_least=NOISE_MIN,
         tukey2=TUKEY**2,
+        outliers=OUTLIERS,
         edge=at(_edge_table()),
         edges=EDGES,
         edge_most=EDGE_MOST,

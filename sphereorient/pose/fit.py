@@ -157,7 +157,7 @@ def refine(
         own_covariance=own_covariance,
         own_sigma_mm=(across.clamp_min(0) / 2).sqrt(),
         excess=(so3.trace(own_covariance) / so3.trace(own_bread).clamp_min(1e-30)).sqrt(),
-        score=by_pose(told.share, cameras),
+        score=by_pose(told.score, cameras),
         nll=(by_pose(told.loss, cameras) * seen).sum(1),
         step=step,
     )

@@ -67,12 +67,17 @@ class CameraView:
     background: Background
     diameter_px: float  # of the sphere in the middle of the volume
     sight: LinesOfSight
+    merit_min: float = 0.0  # see `CameraScene`
 
     @classmethod
     def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":
         """Return the view of a camera whose scene is known."""
-        background, diameter_px = scene.background, scene.diameter_px
-        return cls(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
+        return cls(name=name, camera=camera, sight=LinesOfSight(camera), **vars(scene))
+
+    @property
+    def scene(self) -> CameraScene:
+        """What is known of the camera's movie."""
+        return CameraScene(background=self.background, diameter_px=self.diameter_px, merit_min=self.merit_min)
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
         """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""

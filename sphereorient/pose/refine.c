@@ -15,6 +15,7 @@
 #define COLUMNS 36    /* 6 of the pose, and most coefficients of a frame's own light */
 #define HARMONICS 9
 #define EDGE_COLUMNS 12
+#define EVERY 4       /* n-th place that a score looks at */
 #define TWO_PI 6.283185307179586
 
 typedef struct {
@@ -36,7 +37,7 @@ typedef struct {
     /* the model */
     float radius_mm, blur_px;
     Table paint, unseen;
-    float unseen_most, known_least, cover_least, sine_most, noise_least, tukey2;
+    float unseen_most, known_least, cover_least, sine_most, noise_least, tukey2, outliers;
     const float *edge; /* (edges, EDGE_COLUMNS) from -edge_most to edge_most */
     int64_t edges;
     float edge_most;
@@ -602,50 +603,88 @@ static void gather(const Task *t, const Disk *at, Sums *of, const double *coeffi
     }
 }
 
-/* Tell how well the disk is explained: share of its variance, loss, median step from black to white paint. */
-static void tell(const Task *t, const Disk *at, Sums *of, float deviation) {
+/* Fit a disk of smooth grey levels to every fourth place; return how much better the painted sphere explains them than
+   that does, or the empty scene, as `scores_of`. */
+static double score_of(const Task *t, const Disk *at, const Sums *of) {
     const int64_t P = t->places;
-    const float *expected = of->expected;
-    const uint8_t *inside = of->kept;
-    double share = 0, cover = 0, mean = 0, spread = 0, left = 0, loss = 0;
-    float one[BLOCK], counted[BLOCK] = {0}, all[BLOCK] = {0}, part[BLOCK] = {0};
-    for (int i = 0; i < BLOCK; i++) one[i] = 1.0f;
-    const float scale = logf(most(deviation, 1.0f)), sixth = t->tukey2 / 6.0f, limit = t->tukey2;
+    double matrix[TINTS * TINTS], smooth[TINTS], (*sums)[LANES] = at->sums;
+    double cover = 0, share = 0, some = 0, mean = 0, spread = 0, left[3] = {0};
+    float tints[TINTS][BLOCK], weighted[BLOCK], by[TINTS];
+    float covered[BLOCK], counted[BLOCK], grey[BLOCK], disk[BLOCK], beside[BLOCK], residual[BLOCK], x[BLOCK], y[BLOCK];
+    memset(sums, 0, sizeof(double) * LANES * (TINTS * (TINTS + 3) / 2));
+    for (int64_t p = 0; p < P; p++) cover += at->cover[p], share += at->counts[p] ? at->cover[p] : 0.0f;
     for (int pass = 0; pass < 3; pass++) { /* each needs the sums of the one before */
-        for (int64_t from = 0; from < P; from += BLOCK) {
-            const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
-            const float *residual = at->residual + from, *variance = at->variance + from, *wanted = expected + from;
-            const float middle = (float)mean, most_left = 4.0f * (float)spread;
-            for (int i = 0; i < BLOCK; i++) counted[i] = all[i] = part[i] = 0.0f;
-            for (int i = 0; i < n; i++) all[i] = at->cover[from + i];
-            for (int i = 0; i < n; i++) counted[i] = at->counts[from + i] ? all[i] : 0.0f;
+        for (int64_t from = 0; from < P; from += EVERY * BLOCK) {
+            const int64_t rest = (P - from + EVERY - 1) / EVERY;
+            const int n = (int)(rest < BLOCK ? rest : BLOCK);
+            for (int i = 0; i < BLOCK; i++) covered[i] = counted[i] = grey[i] = disk[i] = beside[i] = residual[i] = x[i] = y[i] = 0;
+            for (int i = 0; i < n; i++) {
+                const int64_t p = from + EVERY * i;
+                covered[i] = at->cover[p], counted[i] = at->counts[p] ? at->cover[p] : 0.0f, residual[i] = at->residual[p];
+                grey[i] = of->expected[p] + residual[i], beside[i] = at->beside[p], x[i] = at->x[p], y[i] = at->y[p];
+                disk[i] = grey[i] - (1.0f - covered[i]) * beside[i];
+            }
+            monomials(x, y, BLOCK, TINTS, tints);
+            for (int a = 0; a < TINTS; a++)
+                for (int i = 0; i < BLOCK; i++) tints[a][i] *= covered[i];
             if (pass == 0) {
-                for (int i = 0; i < n; i++) part[i] = wanted[i] + residual[i];
-                share += product(counted, one), cover += product(all, one), mean += product(counted, part);
-            } else if (pass == 1) {
-                for (int i = 0; i < n; i++) part[i] = wanted[i] + residual[i] - middle;
-                for (int i = 0; i < n; i++) all[i] = counted[i] * part[i];
-                spread += product(all, part);
-            } else {
-                for (int i = 0; i < n; i++) part[i] = least(residual[i] * residual[i], most_left);
-                left += product(counted, part);
-                for (int i = 0; i < n; i++) {
-                    const float near = most(1.0f - residual[i] * residual[i] / (limit * variance[i]), 0.0f);
-                    part[i] = sixth * (1.0f - near * near * near) + scale;
+                for (int i = 0; i < BLOCK; i++) some += counted[i], mean += counted[i] * grey[i];
+                for (int a = 0, next = 0; a < TINTS; a++) {
+                    for (int i = 0; i < BLOCK; i++) weighted[i] = counted[i] * tints[a][i];
+                    for (int b = a; b < TINTS; b++) add_products(weighted, tints[b], sums[next++]);
+                    add_products(weighted, disk, sums[next++]);
                 }
-                for (int i = 0; i < n; i++)
-                    if (!at->known[from + i])
-                        part[i] = logf(most(at->lit[from + i] / sqrtf((float)TWO_PI * variance[i]), 1.0f));
-                for (int i = 0; i < n; i++) all[i] = inside[from + i] ? 1.0f : 0.0f;
-                loss += product(all, part);
+            } else if (pass == 1) {
+                for (int i = 0; i < BLOCK; i++) spread += counted[i] * (grey[i] - mean) * (grey[i] - mean);
+            } else {
+                const float limit = (float)(t->outliers * spread);
+                for (int a = 0; a < TINTS; a++)
+                    for (int i = 0; i < BLOCK; i++) disk[i] -= by[a] * tints[a][i];
+                for (int i = 0; i < BLOCK; i++) {
+                    const float other = grey[i] - beside[i];
+                    left[0] += counted[i] * least(residual[i] * residual[i], limit);
+                    left[1] += counted[i] * least(disk[i] * disk[i], limit);
+                    left[2] += counted[i] * least(other * other, limit);
+                }
             }
         }
-        if (pass == 0) mean /= share > 1e-6 ? share : 1e-6;
-        if (pass == 1) spread /= share > 1e-6 ? share : 1e-6;
+        some = some > 1e-6 ? some : 1e-6;
+        if (pass == 1) spread /= some;
+        if (pass) continue;
+        mean /= some;
+        for (int a = 0, next = 0; a < TINTS; a++) {
+            for (int b = a; b < TINTS; b++) matrix[a * TINTS + b] = matrix[b * TINTS + a] = total(sums[next++]);
+            smooth[a] = total(sums[next++]);
+        }
+        solve(matrix, smooth, TINTS, 1, 1e-7);
+        for (int a = 0; a < TINTS; a++) by[a] = (float)smooth[a];
     }
-    left /= share > 1e-6 ? share : 1e-6;
-    double *told = of->told;
-    told[0] = spread > 1e-6 && share > t->known_least * cover ? 1.0 - left / (spread > 1e-9 ? spread : 1e-9) : 0.0;
+    if (!(spread > 1e-6 && share > t->known_least * cover)) return 0.0;
+    const double other = (left[1] < left[2] ? left[1] : left[2]) / some, painted = left[0] / some;
+    const double score = 1.0 - painted / (other > 1e-9 ? other : 1e-9);
+    return score > -1.0 ? score : -1.0;
+}
+
+/* Tell how well the disk is explained: score, loss, median step from black to white paint. */
+static void tell(const Task *t, const Disk *at, Sums *of, float deviation) {
+    const int64_t P = t->places;
+    const float scale = logf(most(deviation, 1.0f)), sixth = t->tukey2 / 6.0f, limit = t->tukey2;
+    double *told = of->told, loss = 0;
+    float part[BLOCK], all[BLOCK];
+    for (int64_t from = 0; from < P; from += BLOCK) {
+        const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
+        const float *residual = at->residual + from, *variance = at->variance + from;
+        for (int i = 0; i < BLOCK; i++) part[i] = all[i] = 0.0f;
+        for (int i = 0; i < n; i++) {
+            const float near = most(1.0f - residual[i] * residual[i] / (limit * variance[i]), 0.0f);
+            part[i] = sixth * (1.0f - near * near * near) + scale;
+        }
+        for (int i = 0; i < n; i++)
+            if (!at->known[from + i]) part[i] = logf(most(at->lit[from + i] / sqrtf((float)TWO_PI * variance[i]), 1.0f));
+        for (int i = 0; i < n; i++) all[i] = of->kept[from + i] ? 1.0f : 0.0f;
+        loss += product(all, part);
+    }
+    told[0] = score_of(t, at, of);
     told[1] = loss;
     for (int64_t p = 0; p < t->inner; p++) at->sorted[p] = most(at->lit[p], 0.0f); /* below 1 all count alike */
     told[2] = t->inner ? ranked(at->sorted, t->inner, (t->inner - 1) / 2) : 0.0;
@@ -972,7 +1011,8 @@ static void close_work(Work *work) { free(work->floats), free(work->bytes), free
 /* Return 0, or 1 without memory; to be closed in both cases. */
 static int open_work(const Task *t, Work *work) {
     const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK, n = 6 + t->n_difference + t->n_black;
-    const int64_t grids = t->most_hidden > 0 ? 4 : 0, pairs = LANES * (n * (n + 3) / 2);
+    const int64_t grids = t->most_hidden > 0 ? 4 : 0, columns = n > TINTS ? n : TINTS;
+    const int64_t pairs = LANES * (columns * (columns + 3) / 2);
     memset(work, 0, sizeof *work);
     Disk *at = &work->at;
     if (grids) square_about(t, at);

@@ -13,6 +13,9 @@ from sphereorient.so3 import solve_damped
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 KNOWN = 0.3  # least share of a disk that shows known paint
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
+SMOOTH = 4  # order of the light and reflections that a disk without paint shows; as those of a first fit
+EVERY = 4  # n-th place that is looked at: they are in order of distance
+OUTLIERS = 4.0  # times the variance of the disk, beyond which a square counts alike
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -30,6 +33,7 @@ class Residuals:
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
     lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
     over: Tensor  # (L, P), grey levels of the sphere above the background
+    beside: Tensor  # (L, P), grey levels of the scene without the sphere
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,7 +51,7 @@ class Told:
     """How well L disks are explained."""
 
     scores: Tensor  # (L, 6, T) float64, of the tiles of the disk, summed
-    share: Tensor  # (L,), of the picture's variance that is explained; 0 of hardly any known paint
+    score: Tensor  # (L,), see `scores_of`
     loss: Tensor  # (L,), nats
     step: Tensor  # (L,), grey levels from black to white paint, median
 
@@ -74,7 +78,7 @@ def torch_sums(
     if tell:
         told = Told(
             scores=_tile_scores(at, precision, mixed, pixels.tile),
-            share=_score(at).double(),
+            score=scores_of(at).double(),
             loss=_loss(at, pixels.inside),
             step=at.lit[:, : pixels.inner].double().median(-1).values,
         )
@@ -132,6 +136,7 @@ def residuals(
         deviation=deviation,
         lit=lit,
         over=over,
+        beside=beside,
     )
 
 
@@ -190,15 +195,25 @@ def _loss(at: Residuals, inside: Tensor) -> Tensor:
     return (loss * inside).sum(-1).double()
 
 
-def _score(at: Residuals) -> Tensor:
-    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit.
-    0 for a disk that shows hardly any known paint.
+def scores_of(at: Residuals) -> Tensor:
+    """Return how much better the painted sphere explains L disks than what has no paint does, (L,), -1 .. 1.
+    1 - painted / min(smooth, scene), of the mean squares that three models leave in every fourth pixel: the sphere at
+    this pose; a disk whose grey level is a polynomial of order `SMOOTH`; the empty scene. An outlier counts up to a
+    limit. 0 of a disk that shows hardly any known paint.
     """
-    share = at.view.coverage * at.inside
-    known = share.sum(-1) > KNOWN * at.view.coverage.sum(-1)
+    cover, counted = at.view.coverage, at.inside
+    known = (cover * counted).sum(-1) > KNOWN * cover.sum(-1)
+    some = slice(None, None, EVERY)
+    cover, share, residual = cover[:, some], (cover * counted)[:, some], at.residual[:, some]
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
-    grey = at.model + at.residual
+    grey = at.model[:, some] + residual
+    disk, beside = grey - (1.0 - cover) * at.beside[:, some], at.beside[:, some]
+    columns = cover[:, None] * polynomials(at.view.across[..., some], SMOOTH)
+    weighted = columns * share[:, None]
+    normal, right = (weighted @ columns.mT).double(), (weighted @ disk[..., None])[..., 0].double()
+    smooth = (solve_damped(normal, right, ridge=1e-7).to(columns.dtype)[:, None] @ columns)[:, 0]
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
-    left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
-    explained = 1.0 - left / spread.clamp_min(1e-9)
-    return torch.where((spread > 1e-6) & known, explained, torch.zeros_like(explained))
+    models = torch.stack([residual, disk - smooth, grey - beside])
+    painted, *others = (share * torch.minimum(models.square(), OUTLIERS * spread[:, None])).sum(-1)
+    score = 1.0 - painted / torch.minimum(*others).clamp_min(1e-9)
+    return torch.where((spread > 1e-6) & known, score.clamp_min(-1.0), torch.zeros_like(score))
