@@ -33,7 +33,7 @@ from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_columns, light_sums, noise_curves, solved_light
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, first_fitter, widest_px
 from sphereorient.pose.lab_light import LabLight
-from sphereorient.pose.model import Light, light_basis, no_stray
+from sphereorient.pose.model import Light, light_basis, no_glints, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
@@ -245,7 +245,8 @@ def _with_light(state: State) -> State:
     difference, black = solved_light(normal, right).chunk(2, dim=-1)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
     noise = noise_curves(model, residual, inside, cameras)
-    light = Light(difference=difference, black=black, noise=noise, stray=no_stray(cameras), known=True)
+    none = {"glints": no_glints(cameras), "stray": no_stray(cameras)}
+    light = Light(difference=difference, black=black, noise=noise, **none, known=True)
     return replace(state, fitter=replace(state.fitter, light=light))
 
 

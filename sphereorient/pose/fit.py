@@ -14,11 +14,14 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.pose.compiled import pose_arrays, refined
 from sphereorient.pose.model import (
+    GLINTS,
     Light,
     Shading,
     SphereModel,
     SphereView,
+    glints_at,
     light_basis,
+    no_glints,
     no_stray,
     scene_beside,
     stray_basis,
@@ -32,6 +35,7 @@ from sphereorient.so3 import inverse_damped, solve_damped
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
 STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
+WHOLE = 0.99  # coverage of a pixel that the limb does not cut
 RIDGE = 1e-5  # of light maps, relative to the diagonal
 
 
@@ -204,7 +208,9 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     cameras = use.shape[1]
     at = settled(pixels, fit, model, cameras)
     stray = learn_stray(at, pixels, use, model.light.stray)
-    lit = replace(pixels, behind=scene_beside(at.view, pixels, stray))
+    glints = learn_glints(at, use, getattr(model.light, "glints", no_glints(cameras)))
+    mirrored = at.view.coverage * glints_at(glints.repeat(len(use), 1, 1), at.view.across.mT)
+    lit = replace(pixels, behind=scene_beside(at.view, pixels, stray), grey=pixels.grey - mirrored)
     columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
     normal, right = light_sums(columns, at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
     normal, right = by_pose(normal, cameras), by_pose(right, cameras)
@@ -216,7 +222,32 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     difference, black = solved_light(whole, force).reshape(cameras, -1).chunk(2, dim=-1)
     counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
     noise = noise_curves(at.model, at.residual, counted, cameras)
-    return Light(difference=difference, black=black, noise=noise, stray=stray, known=True)
+    return Light(difference=difference, black=black, noise=noise, stray=stray, glints=glints, known=True)
+
+
+def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
+    """Estimate what the surface mirrors, (C, G, G), see `Light`, from what B * C disks, those of `use` (B, C), leave
+    in the same cell of the disk, but for its limb. `known` (C, G, G) is the one that the residuals hold. By how much a
+    cell's mean is drawn to 0 follows from the scatter over the disks: of a mat ball all are.
+    Source: empirical Bayes, James and Stein 1961.
+    """
+    cameras, cells = use.shape[1], GLINTS**2
+    column, row = ((at.view.across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
+    precision = (at.weight / at.variance * (at.view.coverage > WHOLE) * use.reshape(-1, 1)).double()
+    sums = precision.new_zeros(2, len(precision), cells)
+    sums[0].scatter_add_(1, row * GLINTS + column, precision)
+    sums[1].scatter_add_(1, row * GLINTS + column, precision * at.residual)
+    weight, pull = (by_pose(part, cameras) for part in sums)  # (B, C, cells)
+    whole = weight.sum(0).clamp_min(1e-30)
+    mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
+    off = pull - weight * mean
+    error2 = off.square().sum(0) / whole.square() * number / (number - 1)
+    told = number > 1
+    signal2 = torch.where(told, mean.square() - error2, 0.0).sum(1, keepdim=True) / told.sum(1, keepdim=True).clamp_min(
+        1
+    )
+    share = torch.where(told, signal2.clamp_min(0.0) / (signal2.clamp_min(0.0) + error2), 0.0).nan_to_num()
+    return known + (share * mean).reshape(known.shape).float()
 
 
 def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Tensor:

@@ -44,7 +44,11 @@ FINER_SIDES = 2  # of the usual table, for disks of over 100 px: 16 MB
 FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
 
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
-MORE_EXPLAINED = 0.05  # share of the variance by which it must leave less
+CLEARLY_MORE = 2.0  # standard errors of the gain by which it must leave less
+MORE_EXPLAINED, HOPELESS = (
+    0.05,
+    0.2,
+)  # share of the variance by which it may leave more, and by which it never gets less
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
@@ -208,9 +212,9 @@ class Fitter:
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, preferred: bool = False
     ) -> tuple["Fitter", FittedPoses, Rivals]:
         """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
-        Both are learnt from every other row of `use` (B, C); what counts is what they leave in the rows between.
-        Return the fits of these rows by both where neither explains clearly more. `preferred`: where it does not
-        explain clearly less.
+        Both are learnt from every other row of `use` (B, C); what counts is what they leave in the pictures of the rows
+        between, beside its standard error. Return the fits of these rows by both where neither explains clearly more.
+        `preferred`: where it does not explain clearly less.
         """
         fine = self.optics.fine
         if len(use) < FEWEST_LIT:
@@ -219,13 +223,15 @@ class Fitter:
         every = torch.arange(len(use))
         learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
         maps, lit = self.with_light_of(*learning), self
-        maps_leave = maps.left(*held)
-        # What leaves more half-way does not get there; of a glossy ball before one camera it leaves 2 % less, then 5 %.
-        for light, more in zip(lab_lights(*learning, self.model(fine)), (0.0, MORE_EXPLAINED), strict=True):
+        maps_leave = maps.logs_left(*held)
+        for light in lab_lights(*learning, self.model(fine)):
             lit = replace(self, light=light)
-            gain = maps_leave - lit.left(*held)
-            if gain < (-MORE_EXPLAINED if preferred else more):
-                return self, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
+            gains = maps_leave - lit.logs_left(*held)
+            gain, error = float(gains.mean()), float(gains.std()) / math.sqrt(len(gains))
+            if gain < -HOPELESS:  # half-way, too
+                return self, fit, None
+        if gain < (-MORE_EXPLAINED if preferred else CLEARLY_MORE * error):
+            return self, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
         for _ in range(4):  # the poses, too, were found with the maps
             lit = lit.lit_again(pixels, fit, use)
             fit = lit.again(pixels, fit, use)
@@ -240,12 +246,16 @@ class Fitter:
     def left(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
     ) -> float:
-        """Return the mean logarithm of the share of variance that poses fitted anew leave in pictures of `use`.
-        Of all pictures together: those of one may be left ten times as much as those of another.
-        """
+        """Return the mean of `logs_left`: the pictures of one camera may be left ten times as much as of another."""
+        return float(self.logs_left(pixels, fit, use, level, iterations).mean())
+
+    def logs_left(
+        self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
+    ) -> Tensor:
+        """Return the logarithm of what poses fitted anew leave in each picture of `use`, (n,), see `scores_of`."""
         level = level or self.optics.fine
         score = self.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, iterations).score
-        return float((1.0 - score)[use].clamp_min(LEAST_LEFT).log().mean())
+        return (1.0 - score)[use].clamp_min(LEAST_LEFT).log()
 
     def on(self, device: torch.device) -> "Fitter":
         """Return a fitter that computes on another device."""

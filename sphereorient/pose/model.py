@@ -27,6 +27,7 @@ DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of
 COVER_MIN = 1e-4  # of a pixel, so that paint beyond the limb has a value
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
+GLINTS = 32  # cells across the disk
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
 
 
@@ -87,6 +88,19 @@ def scene_beside(view: "SphereView", pixels: Pixels, stray: Tensor) -> Tensor:
 def no_stray(cameras: int) -> Tensor:
     """Return the coefficients of no stray light."""
     return torch.zeros(cameras, 1 + 2 * STRAY_ORDER)
+
+
+def no_glints(cameras: int) -> Tensor:
+    """Return the glints of a surface that mirrors no lamp."""
+    return torch.zeros(cameras, GLINTS, GLINTS)
+
+
+def glints_at(glints: Tensor, across: Tensor) -> Tensor:
+    """Return the glints (L, G, G) of L disks at places (L, P, 2), radii: grey levels (L, P), linear between cells."""
+    sampled = torch.nn.functional.grid_sample(
+        glints[:, None], across[:, None].to(glints), padding_mode="border", align_corners=False
+    )
+    return sampled[:, 0, 0]
 
 
 class Lighting(Protocol):
@@ -167,8 +181,9 @@ class Light:
     difference: Tensor  # (C, K), white less black paint, grey levels
     black: Tensor  # (C, K)
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
+    glints: Tensor  # (C, G, G), more of black, over the square about the disk: lamps that the surface mirrors
     stray: Tensor  # (C, K), see `Lighting`
-    known: bool  # False: difference is 1 everywhere and black 0
+    known: bool  # False: difference is 1 everywhere, black and glints 0
 
     @cached_property
     def _map(self) -> Tensor:
@@ -179,7 +194,8 @@ class Light:
         # Cells that the limb cuts take their value on the disk.
         across = across / across.norm(dim=0).clamp_min(1.0)
         basis = light_basis(across)
-        return torch.stack([self.difference @ basis, self.black @ basis], dim=-1).reshape(-1, 2)
+        black = self.black @ basis + glints_at(self.glints, across.mT.expand(len(self.glints), -1, -1))
+        return torch.stack([self.difference @ basis, black], dim=-1).reshape(-1, 2)
 
     @property
     def tables(self) -> LightTables:
@@ -209,8 +225,8 @@ class Light:
         count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
         difference = torch.zeros(cameras, count)
         difference[:, 0] = 1.0
-        black, stray = torch.zeros(cameras, count), no_stray(cameras)
-        return cls(difference=difference, black=black, noise=noise, stray=stray, known=False)
+        black, glints, stray = torch.zeros(cameras, count), no_glints(cameras), no_stray(cameras)
+        return cls(difference=difference, black=black, glints=glints, noise=noise, stray=stray, known=False)
 
 
 LIGHT_PARTS = tuple(field.name for field in fields(Light) if field.name != "known")
