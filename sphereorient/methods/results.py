@@ -21,7 +21,7 @@ from sphereorient.calibration.consistency import (
     gaps_between,
     limits_of,
 )
-from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.cameras import Camera, ParameterCovariance, centre_lab_mm
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
 from sphereorient.follow.poses import PoseTable
@@ -32,7 +32,7 @@ from sphereorient.pose.fitter import CameraView
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
-from sphereorient.so3 import exp, geodesic_distance, log, solve_damped, trace
+from sphereorient.so3 import exp, geodesic_distance, hat, log, solve_damped
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 TWO_BALLS = (
@@ -344,13 +344,13 @@ def with_contradictions(
     places = torch.cat([pair.apart[pair.both & ~wrong] for pair in pairs])
     turn_scale, place_scale = _excess(turns, 3), _excess(places, 1)
     unit = torch.eye(3, dtype=torch.float64)
+    rolls = _rolls_by_move(track, cameras, diameter_mm / 2)
     scaled: dict[str, Tensor] = {}
     for kind in ("_cov", "_smooth_cov"):
         place, turn = (torch.from_numpy(getattr(track, name + kind)) for name in ("position", "orientation"))
-        # Where the place is off, the same paint is seen with the sphere turned by as much.
-        rolled = (place_scale**2 - 1) * trace(place) / 3 / (diameter_mm / 2) ** 2
+        rolled = (place_scale**2 - 1) * (rolls @ place[:, None] @ rolls.mT).sum(1)
         scaled["position" + kind] = place_scale**2 * place
-        scaled["orientation" + kind] = turn_scale**2 * turn + rolled.nan_to_num()[:, None, None] * unit
+        scaled["orientation" + kind] = turn_scale**2 * turn + rolled.nan_to_num()
     place_cov, turn_cov = scaled["position_cov"], scaled["orientation_cov"]
     share = 1 / torch.from_numpy(believed).clamp_min(2).to(torch.float64)
     for pair in pairs:
@@ -368,6 +368,16 @@ def with_contradictions(
     flags = track.flags | np.where(wrong.numpy() & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
     stated: dict[str, Any] = {name: whole.numpy() for name, whole in scaled.items()}
     return replace(track, flags=flags, **stated), compare_cameras(seen, limits)
+
+
+def _rolls_by_move(track: Trajectory, cameras: Mapping[str, Camera], radius_mm: float) -> Tensor:
+    """Return the turn (N, C, 3, 3), rad/mm, by which a sphere that is moved shows each camera the same paint, weighted
+    so that squares add up to their mean over the cameras that count. A move along the line of sight turns nothing.
+    """
+    X, count = torch.from_numpy(track.position), torch.from_numpy(_believed(track))
+    sight = torch.stack([X - centre_lab_mm(camera) for camera in cameras.values()], 1)
+    weight = (count / count.sum(1, keepdim=True).clamp_min(1)).sqrt()
+    return weight[..., None, None] * hat(torch.nn.functional.normalize(sight, dim=-1)) / radius_mm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
