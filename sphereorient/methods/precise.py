@@ -16,9 +16,9 @@ from sphereorient.follow.poses import Poses, pose_table
 from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Joined, Learnt, Measured
-from sphereorient.methods.proposers import BlurMatchedSearch, open_views
+from sphereorient.methods.proposers import BlurMatchedSearch, open_views, sizes_of
 from sphereorient.pose.blur import estimate_blur_px
-from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter
 from sphereorient.trajectory import Trajectory
 
 
@@ -58,7 +58,7 @@ def learn(job: Job, progress: Progress) -> Follower:
 def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:
     """Return the follower of `learn`, from what another run or process learnt."""
     appearance = learnt[""].appearance(job.recording)
-    search = BlurMatchedSearch(job.recording.texture, job.settings, widest_px(appearance.fitter.views))
+    search = BlurMatchedSearch(job.recording.texture, job.settings, sizes_of(appearance.fitter.views))
     return follower(job, appearance, search)
 
 

@@ -1,5 +1,6 @@
 """The choice of proposer: the only place that knows both the template searches and the trained network."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sphereorient.cameras import Camera
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.files.cache import cached
@@ -22,6 +24,7 @@ from sphereorient.search import FallbackProposer, GreySearch, Proposer, Template
 from sphereorient.search.settings import ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable
 
+NEAR_RADII = 8.0  # of a ball that is farther, the bank's perspective errs by less than half a step of its grid
 DEFAULT = "default"  # the checkpoint that comes along
 Search = TypeVar("Search", GreySearch, TemplateBank)
 
@@ -58,10 +61,16 @@ def finest_table(texture: Tensor, diameter_px: float, unseen: Tensor | None) -> 
 
 
 class BlurMatchedSearch:
-    """Proposers by blur for a map (H, 2 H): one template bank for sharp pictures, others made on demand."""
+    """Proposers by blur for a map (H, 2 H): one template bank for sharp pictures, others made on demand.
+    `diameters_px`: expected diameter of the sphere, px, in each camera. The bank shows what a near camera sees.
+    """
 
-    def __init__(self, texture: Tensor, settings: Settings, diameter_px: float) -> None:
-        self.diameter_px = diameter_px
+    def __init__(self, texture: Tensor, settings: Settings, diameters_px: Sequence[tuple[Camera, float]]) -> None:
+        camera, self.diameter_px = max(diameters_px, key=lambda pair: pair[1])
+        if settings.search.distance_radii is None:
+            near = _distance_radii(camera, self.diameter_px)
+            search = settings.search.model_copy(update={"distance_radii": near})
+            settings = settings.model_copy(update={"search": search})
         self._texture, self._settings = texture, settings
         self._made: dict[float, Proposer] = {}
 
@@ -77,6 +86,23 @@ class BlurMatchedSearch:
         return dict.fromkeys((view.name for view in views), self.of(blur_px))
 
 
+def sizes_of(views: Sequence[CameraView]) -> list[tuple[Camera, float]]:
+    """Return the cameras of views, each with the expected diameter of the sphere, px."""
+    return [(view.camera, view.diameter_px) for view in views]
+
+
+def _distance_radii(camera: Camera, diameter_px: float) -> float | None:
+    """Return how far a camera is from a ball of this diameter in the middle of its picture, radii; None where that is
+    so far that perspective is nothing.
+    """
+    middle = (torch.tensor(camera.image_size, dtype=torch.float64) - 1) / 2
+    aside = torch.tensor([diameter_px / 2, 0.0], dtype=torch.float64)
+    rim = camera.rays(torch.stack([middle - aside, middle + aside])).direction_lab
+    half_rad = 0.5 * float(torch.linalg.cross(*rim).norm().clamp(max=1.0).asin())
+    distance = 1 / max(math.sin(half_rad), 1e-9)
+    return round(distance, 1) if distance < NEAR_RADII else None
+
+
 def open_views(
     recording: Recording, settings: Settings, progress: Progress
 ) -> tuple[list[CameraView], TextureTable, BlurMatchedSearch]:
@@ -84,8 +110,10 @@ def open_views(
     with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
         opening = [pool.submit(open_view, recording, stream, settings, progress) for stream in recording.streams]
         known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
-        widest = max(px or view.result().diameter_px for px, view in zip(known, opening, strict=True))
-        search = BlurMatchedSearch(recording.texture, settings, widest)
+        cameras = [recording.cameras[stream.name] for stream in recording.streams]
+        sizes = [px or view.result().diameter_px for px, view in zip(known, opening, strict=True)]
+        widest = max(sizes)
+        search = BlurMatchedSearch(recording.texture, settings, list(zip(cameras, sizes, strict=True)))
         base = pool.submit(finest_table, recording.texture, widest, recording.unseen)
         sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
         views = [view.result() for view in opening]

@@ -22,7 +22,7 @@ from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.locate import Frame
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
-from sphereorient.methods.proposers import BlurMatchedSearch, finest_table, open_scene
+from sphereorient.methods.proposers import BlurMatchedSearch, finest_table, open_scene, sizes_of
 from sphereorient.pose import CameraView
 from sphereorient.pose.fitter import FIRST_BLUR_PX, Fitter, first_fitter, widest_px
 from sphereorient.pose.neighbours import spoilt
@@ -100,7 +100,7 @@ def follower(job: Job, appearances: Mapping[str, Appearance]) -> Follower:
     begin: dict[str, Initialiser] = {}
     for names in alike(job):
         one = appearances[names[0]]
-        search = BlurMatchedSearch(job.recording.of(names[0]).texture, settings, widest_px(one.fitter.views))
+        search = BlurMatchedSearch(job.recording.of(names[0]).texture, settings, sizes_of(one.fitter.views))
         begin |= {
             name: Initialiser(
                 fitter=appearances[name].still,
@@ -196,7 +196,7 @@ class _Paint:
         blur_px = settings.refine.blur_px or FIRST_BLUR_PX
         first = Initialiser(
             fitter=first_fitter(views, one.experiment.radius_mm, base, blur_px),
-            proposers=BlurMatchedSearch(one.texture, settings, diameter_px).by_camera(views, blur_px),
+            proposers=BlurMatchedSearch(one.texture, settings, sizes_of(views)).by_camera(views, blur_px),
             locating=settings.locate,
             candidates=settings.refine.candidates,
         )
