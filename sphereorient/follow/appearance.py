@@ -234,13 +234,8 @@ def estimate_appearance(
         score_min = min(score_min, _clear_of(right))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine))
-    claimed = (
-        0
-        if among is not None
-        else sum(
-            count > 1 for count in side_by_side(first.claimants, [frames[k] for k in proven(looked[: len(frames)])])
-        )
-    )
+    sure = [] if among is not None else [frames[k] for k in proven(found)]
+    claimed = sum(count > 1 for count in side_by_side(first.claimants, sure))
     return Appearance(
         fitter=fitter,
         still=still,
@@ -332,7 +327,7 @@ def _with_least_merit(
     views = []
     for camera, view in enumerate(search.fitter.views):
         shown = [frames[k][camera].picture for k in proven(found) if bool(found[k].use[camera])]
-        merits = list(side_by_side(lambda picture, view=view: search.merit(picture, view), shown))
+        merits = [search.merit(picture, view) for picture in shown]
         views.append(replace(view, merit_min=FAINT * min(merits) if merits else 0.0))
     return views
 

@@ -201,7 +201,7 @@ def frames_showing(
         return (np.array([disk is not None for disk in found]) for found in side_by_side(disks, some))
 
     seen = dict(zip(places, zip(frames, shown(frames), strict=True), strict=True))
-    while times < MOST and sum(by for _, by in seen.values()).min() < SHOWN * count:
+    while times < MOST and np.sum([by for _, by in seen.values()], axis=0).min() < SHOWN * count:
         times *= 2
         more = sorted(set(spread_frames(range(total), times * count)) - set(looked))
         looked += more
