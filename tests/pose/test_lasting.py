@@ -13,6 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.pose.fit import FittedPoses, learn_light, refine
 from sphereorient.pose.lasting import Lasting, _of_left_out, lasting_errors
+from sphereorient.pose.model import no_glints
 from sphereorient.pose.start import PoseStart
 
 COUNT, SIGMA = 24, 4.0
@@ -21,8 +22,10 @@ RIG = rig_of()
 
 
 @cache
-def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
-    """Errors (B, 6), rad and mm, of fits to pictures with a reflection that no model knows, and what lasts of them."""
+def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, FittedPoses, Lasting]:
+    """Errors (B, 6), rad and mm, of fits to pictures with a reflection, and what lasts of them; without `glints` no
+    model knows it.
+    """
     X, R = balls(count, 4)
     pictures = pictures_of(RIG, "patches", X, R)
     row, column = torch.meshgrid(*(torch.arange(size) for size in pictures.shape[-2:]), indexing="ij")
@@ -35,7 +38,8 @@ def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
     fit = fitted(RIG, "patches", pixels, X, R, SIGMA)
     model, use = model_of(RIG.table("patches"), SIGMA), torch.ones(count, 2, dtype=torch.bool)
     for _ in range(2):
-        model = replace(model, light=learn_light(pixels, fit, use, model))
+        light = learn_light(pixels, fit, use, model)
+        model = replace(model, light=light if glints else replace(light, glints=no_glints(2)))
         begin = PoseStart(position_lab_mm=fit.position_lab_mm, R_lab_body=fit.R_lab_body, use=use)
         fit = refine(pixels, begin, model, 3)
     found = lasting_errors(pixels, fit, use, model)
@@ -58,6 +62,19 @@ def test_what_a_reflection_does_to_all_poses_is_stated():
     mean = off.mean(0)
     distance2 = mean @ torch.linalg.solve(found.covariance, mean)
     assert 0.3 < float((distance2 / 6).sqrt()) < 3.0
+
+
+def test_a_reflection_is_learnt_as_a_glint():
+    off, _, found = measured(COUNT, LOBE, glints=True)
+    unknown, _, lasting = measured(COUNT, LOBE)
+    assert off.square().mean(0).sum() < 0.5 * unknown.square().mean(0).sum()
+    assert so3.trace(found.covariance[:3, :3]) < 0.5 * so3.trace(lasting.covariance[:3, :3])
+
+
+def test_a_mat_ball_has_no_glints():
+    calm, fit, _ = measured(COUNT, 0.0)
+    _, learnt, _ = measured(COUNT, 0.0, glints=True)
+    assert so3.geodesic_distance(fit.R_lab_body, learnt.R_lab_body).max() < 0.1 * calm[:, :3].norm(dim=1).mean()
 
 
 def test_of_one_frame_more_may_last_than_of_many():

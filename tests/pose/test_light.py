@@ -31,6 +31,7 @@ from sphereorient.pose.model import (
     Lighting,
     SphereView,
     light_basis,
+    no_glints,
     no_stray,
     polynomials,
     sphere_view,
@@ -99,6 +100,7 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
         difference=50 * torch.randn(2, 25, generator=rng),
         black=20 * torch.randn(2, 25, generator=rng),
         noise=NOISE.repeat(2, 1),
+        glints=no_glints(2),
         stray=no_stray(2),
         known=True,
     )
@@ -117,7 +119,8 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
 def test_a_lamp_is_looked_up_to_a_grey_level():
     across = disk_places(5000, 0.98)
     difference, black = maps_of(*lamp_coefficients())
-    light = Light(difference=difference[None], black=black[None], noise=NOISE, stray=no_stray(1), known=True)
+    none = {"glints": no_glints(1), "stray": no_stray(1)}
+    light = Light(difference=difference[None], black=black[None], noise=NOISE, **none, known=True)
     for got, expected in zip(looked_up(light, across), lamp(across, 0), strict=True):
         assert (got - expected)[across.norm(dim=1) < 0.9].abs().max() < 1.0
         assert (got - expected).square().mean().sqrt() < 0.4
