@@ -128,8 +128,8 @@ def make(out: Path, number: int, stage: str, frames: int, key: str) -> None:
     print(f"movie {number:03d}: {stage:8} {wall_s:5.0f} s, {cpu_s:5.0f} s of CPU", file=sys.stderr, flush=True)
 
 
-def make_movies(out: Path, plan: Plan) -> None:
-    """Film all movies, then track them, both methods side by side on all cores.
+def make_movies(out: Path, plan: Plan, methods: Sequence[str] = METHODS) -> None:
+    """Film all movies, then track them, the methods side by side on all cores.
 
     What is there and made by the code as it is stays.
     """
@@ -139,7 +139,7 @@ def make_movies(out: Path, plan: Plan) -> None:
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     context = multiprocessing.get_context("spawn")  # forked children of a process that used torch's threads hang
     with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=context, initializer=end_with_parent) as pool:
-        for stages in (("film",), METHODS):
+        for stages in (("film",), methods):
             missing, begin = todo(out, plan, stages), time.perf_counter()
             jobs = [(out, number, stage, plan.frames, key_of(number, stage, plan.frames)) for number, stage in missing]
             making = [pool.submit(make, *job) for job in jobs]

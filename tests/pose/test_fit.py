@@ -289,6 +289,23 @@ def test_a_bubble_before_part_of_the_disk_does_not_move_the_pose():
     assert (fit.score > 0.5).all()
 
 
+def test_the_score_tells_paint_from_a_smooth_disk_and_from_the_empty_scene():
+    """A blob that is lit from one side is explained to 90 % by shades alone: that is no evidence for the paint."""
+    X, R = truth()
+    _, ball = shares()
+    slope = torch.linspace(-1.0, 1.0, ball.shape[-1])
+    lit = BEHIND + (0.5 * (WHITE + BLACK) + 80.0 * slope - BEHIND) * ball
+    empty = torch.full_like(ball, BEHIND)
+    right = from_truth().score
+    for shown, most in ((lit, 0.3), (empty, 0.05)):  # 0 but for noise
+        pixels = cut(rig(), noisy(shown, SIGMA, 3), X)
+        assert fitted(rig(), "patches", pixels, X, R, SIGMA).score.max() < most
+    assert right.min() > 0.8
+    # Nor is another pose of the same paint.
+    wrong = fitted(rig(), "patches", disks(), X, turned(R, 70.0, 2), SIGMA).score.amin(1)
+    assert wrong.max() < 0.5
+
+
 def test_masked_pixels_do_not_count():
     X, R = truth()
     pixels = disks()
