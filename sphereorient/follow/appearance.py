@@ -105,6 +105,16 @@ class Appearance:
         return ALWAYS if self.soft else self.score_min
 
     @property
+    def usual_score(self) -> float:
+        """Score that right poses usually reach."""
+        return max(self.poor_score, _clear_of(self.right_score))
+
+    @property
+    def poor_score(self) -> float:
+        """Score halfway between the least and the usual one of a right pose."""
+        return 0.5 * (self.score_min + self.right_score)
+
+    @property
     def soft(self) -> bool:
         """Whether the pictures are out of focus; the model of blur then errs by more than noise, and is not stated."""
         return defocus_radii(self.fitter.optics.blur_px, widest_px(self.fitter.views)) > 0

@@ -56,6 +56,7 @@ class ChunkTracker:
         self.fitter: Fitter = appearance.fitter
         self.search = replace(search, fitter=appearance.still, score_min=appearance.clear_score)
         self.score_min = appearance.score_min
+        self.usual_score = appearance.usual_score
         self.usual_apart_rad = appearance.usual_apart_rad
         self.settings = settings
         self.exposure_s = exposure_s
@@ -159,6 +160,11 @@ class ChunkTracker:
         start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
         fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
         fit = fitted(X, R, use, disks_px)
+        if visible is None and bool((poor := self._poor(fit, use)).any()):
+            # A sharp picture holds the fit where it began: once more, from coarse to fine.
+            again = fitted(*self._approached(frames, X, R, use, precision, poor, None), use)
+            better = (again.score * use).sum(1) > (fit.score * use).sum(1)
+            fit = again.where(poor & better, fit)
         good = supported(fit, use)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.
@@ -224,6 +230,10 @@ class ChunkTracker:
         ]
         good = good & within
         return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
+
+    def _poor(self, fit: FittedPoses, use: Tensor) -> Tensor:
+        """Return which poses (B,) leave much more of a picture in use than right ones usually do."""
+        return ((fit.score < self.usual_score) & use).any(1)
 
     def _approached(
         self,

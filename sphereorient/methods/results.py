@@ -275,13 +275,11 @@ def _fit_flags(
     """
     found = choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
-    # Halfway between the least and the usual score of a right pose.
-    poor = 0.5 * (learnt.score_min + learnt.right_score)
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
     excess = torch.where(table.use, picked["excess"], torch.inf).amin(-1)
     outvoted = torch.from_numpy((missed > 0) & (missed >= table.use.sum(-1).numpy()))
-    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.in_doubt | outvoted)
+    doubtful = found & ((best < learnt.poor_score) | (excess > EXCESS) | learnt.in_doubt | outvoted)
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
     return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 
