@@ -165,6 +165,9 @@ def estimate_appearance(
     pictures = [[shot.picture for shot in frame] for frame in frames]
     if among is None:
         found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
+        if not proven(found):  # outlines that miss the ball: the texture locates it
+            first = replace(first, score_min=ALWAYS)
+            found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
     else:
         found = list(among.found)
     if not proven(found):
