@@ -568,22 +568,26 @@ def _without_worn(
     """
     if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
         return fitter, fit, None
-    if worn_share(worn_cells(pixels, fit, use, fitter.model(fitter.optics.fine))) < WORN_SEEN:
+    # Of a ball that turns little glints take the place of worn paint.
+    bare = fitter.with_light_of(pixels, fit, use, glints=False)
+    if worn_share(worn_cells(pixels, fit, use, bare.model(bare.optics.fine))) < WORN_SEEN:
         return fitter, fit, None
 
     def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor | None]:
-        now, worn = fitter, None
+        now, worn = bare, None
         for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
             worn = worn_cells(pixels, fit, use, now.model(now.optics.fine), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
             optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
-            now, fit = _with_light(replace(now, optics=optics), pixels, fit, use)
+            now = replace(now, optics=optics).with_light_of(pixels, fit, use, glints=False)
+            fit = now.again(pixels, fit, use)
         return now, fit, worn
 
     every, middle = torch.arange(len(use)), len(use) // 2
     halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
     gain = [
-        fitter.with_light_of(*half).left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)
+        bare.with_light_of(*half, glints=False).left(*held) - found(*half)[0].left(*held)
+        for half, held in permutations(halves, 2)
     ]
     if sum(gain) / 2 < WORN_GAIN:
         return fitter, fit, None

@@ -201,15 +201,17 @@ def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:
     return few * (tiles @ tiles.mT)
 
 
-def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
+def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True) -> Light:
     """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool.
-    Each pose may change with the light: a light at given poses favours them, however wrong they are.
+    Each pose may change with the light: a light at given poses favours them, however wrong they are. Without `glints`
+    it has none.
     """
     cameras = use.shape[1]
     at = settled(pixels, fit, model, cameras)
     stray = learn_stray(at, pixels, use, model.light.stray)
-    glints = learn_glints(at, use, getattr(model.light, "glints", no_glints(cameras)))
-    mirrored = at.view.coverage * glints_at(glints.repeat(len(use), 1, 1), at.view.across.mT)
+    known = getattr(model.light, "glints", no_glints(cameras))
+    found = learn_glints(at, use, known) if glints else no_glints(cameras)
+    mirrored = at.view.coverage * glints_at(found.repeat(len(use), 1, 1), at.view.across.mT)
     lit = replace(pixels, behind=scene_beside(at.view, pixels, stray), grey=pixels.grey - mirrored)
     columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
     normal, right = light_sums(columns, at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
@@ -222,7 +224,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     difference, black = solved_light(whole, force).reshape(cameras, -1).chunk(2, dim=-1)
     counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
     noise = noise_curves(at.model, at.residual, counted, cameras)
-    return Light(difference=difference, black=black, noise=noise, stray=stray, glints=glints, known=True)
+    return Light(difference=difference, black=black, noise=noise, stray=stray, glints=found, known=True)
 
 
 def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:

@@ -204,9 +204,9 @@ class Fitter:
             limb_px=self.limb_px,
         )
 
-    def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
+    def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, glints: bool = True) -> "Fitter":
         """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
-        return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
+        return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine), glints=glints))
 
     def lit_in_the_lab(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, preferred: bool = False
