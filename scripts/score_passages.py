@@ -22,15 +22,15 @@ import torch
 from numpy.typing import NDArray
 from reproduce_paper import FULL, made_by, make_movies
 
-from sphereorient import so3
 from sphereorient.cameras import load_cameras, sphere_disk_px
+from sphereorient.evaluate.score import AXES, score_track
 from sphereorient.experiment import load_experiment
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Flag, Trajectory
 
 CLASSES = ("both", "one", "part", "rim", "absent")
-MARKED = 16 | 32 | 512
-WRONG_DEG, WRONG_SIGMAS, WRONG_MM = 1.0, 5.0, {"both": 0.5}
-MOST_MM = 3.0  # of other classes
+MARKED = Flag.AMBIGUOUS | Flag.DOUBTFUL_FIT | Flag.CONTRADICTION
+WRONG_DEG, WRONG_SIGMAS = 1.0, 5.0
+WRONG_MM = dict.fromkeys(CLASSES, 3.0) | {"both": 0.5}
 ACROSS = 81  # places over the disk by which the share in a picture is counted
 
 
@@ -43,7 +43,7 @@ class Scored:
     marked: NDArray[np.bool_]
     deg: NDArray[np.float64]
     mm: NDArray[np.float64]
-    turn_sigmas: NDArray[np.float64]
+    turn_sigmas: NDArray[np.float64]  # of an axis: rms over the three
     place_sigmas: NDArray[np.float64]
 
     @property
@@ -60,7 +60,7 @@ class Scored:
     @property
     def right(self) -> NDArray[np.bool_]:
         """Whether a frame is valid, right and not marked."""
-        near = self.mm < np.array([WRONG_MM.get(kind, MOST_MM) for kind in self.kind])
+        near = self.mm < np.array([WRONG_MM[kind] for kind in self.kind])
         return self.valid & ~self.marked & ~self.off & near
 
 
@@ -82,27 +82,20 @@ def seen_in(folder: Path, position_mm: torch.Tensor) -> NDArray[np.str_]:
     return np.select(kinds, CLASSES[:-1], CLASSES[-1])
 
 
-def in_sigmas(error: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return errors (N, 3) over the stated ones, rms over the axes, (N,)."""
-    solved = np.linalg.solve(np.nan_to_num(covariance) + 1e-18 * np.eye(3), error[..., None])[..., 0]
-    return np.sqrt((error * solved).sum(-1) / 3)
-
-
-def scored(folder: Path, track: Path) -> Scored:
+def scored(folder: Path, path: Path) -> Scored:
     """Compare a track with the truth of a movie."""
-    with h5py.File(folder / "truth.h5") as truth:
-        position, orientation = truth["position"][()], truth["orientation"][()]
-    found = Trajectory.load(track)
-    turn = so3.log(torch.from_numpy(found.orientation @ np.swapaxes(orientation, 1, 2))).numpy()
-    move = found.position - position
+    track, truth = Trajectory.load(path), folder / "truth.h5"
+    score = score_track(track, truth)
+    with h5py.File(truth) as file:
+        kind = seen_in(folder, torch.from_numpy(file["position"][()]))
     return Scored(
-        kind=seen_in(folder, torch.from_numpy(position)),
-        valid=found.valid.astype(bool),
-        marked=(found.flags & MARKED) != 0,
-        deg=np.degrees(np.linalg.norm(turn, axis=1)),
-        mm=np.linalg.norm(move, axis=1),
-        turn_sigmas=in_sigmas(turn, found.orientation_cov),
-        place_sigmas=in_sigmas(move, found.position_cov),
+        kind=kind,
+        valid=score.valid,
+        marked=(track.flags & MARKED) != 0,
+        deg=score.orientation_deg,
+        mm=score.position_mm,
+        turn_sigmas=score.orientation_sigmas / np.sqrt(AXES),
+        place_sigmas=score.position_sigmas / np.sqrt(AXES),
     )
 
 
@@ -115,20 +108,11 @@ def row(name: str, movie: Scored, kind: str) -> str:
     """Return the line of one class of frames."""
     own = movie.kind == kind
     told = own & movie.valid & np.isfinite(movie.deg)
-    numbers = [
-        own.sum(),
-        (own & movie.valid).sum(),
-        (own & movie.marked & movie.valid).sum(),
-        (own & movie.right).sum(),
-    ]
-    cells = [*map(str, numbers), str((own & movie.silent).sum())]
+    each = (own, own & movie.valid, own & movie.valid & movie.marked, own & movie.right, own & movie.silent)
+    cells = [str(one.sum()) for one in each]
     for values in (movie.deg, movie.mm):
         cells.append(" / ".join(f"{np.quantile(values[told], q):.3f}" for q in (0.5, 0.95, 1)) if told.any() else "")
-    sigmas = (
-        [np.sqrt(np.mean(values[told] ** 2)) for values in (movie.turn_sigmas, movie.place_sigmas)]
-        if told.any()
-        else []
-    )
+    sigmas = [np.sqrt(np.mean(one[told] ** 2)) for one in (movie.turn_sigmas, movie.place_sigmas) if told.any()]
     return " | ".join(["", name, *cells, " / ".join(f"{one:.2f}" for one in sigmas), ""]).strip()
 
 
@@ -144,7 +128,7 @@ def main() -> None:
     records = {number: kept.known(made_by(options.out, number, "precise")) for number in numbers}
     refused = [one["failed"] for one in records.values() if one.get("failed")]
     movies = {
-        number: scored(made_by(options.out, number, "film"), made_by(options.out, number, "precise"))
+        number: scored(*(made_by(options.out, number, stage) for stage in ("film", "precise")))
         for number in numbers
         if not records[number].get("failed")
     }

@@ -164,13 +164,14 @@ def estimate_appearance(
 
     pictures = [[shot.picture for shot in frame] for frame in frames]
     if among is None:
-        found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
-        if not proven(found):  # outlines that miss the ball: the texture locates it
+        found = _poses_of_all(first, frames)
+        if not proven(found) and first.score_min < ALWAYS:  # outlines that miss the ball: the texture locates it
             first = replace(first, score_min=ALWAYS)
-            found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
+            found = _poses_of_all(first, frames)
     else:
         found = list(among.found)
-    if not proven(found):
+    rows = proven(found)
+    if not rows:
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found) if among is None else (1.0, 0.0)
     looked, seen, others = found, [], None
@@ -181,13 +182,15 @@ def estimate_appearance(
         looked = [poses for of_camera in each for poses in of_camera]
         _check_cameras(fitter, each)
         seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in proven(of_camera)]
+        if not seen:
+            raise _nothing(looked)
         X, R, _ = best_poses([each[camera][frame] for frame, camera in seen])
         use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in seen]), len(each)).bool()
         shown = [pictures[frame] for frame, _ in seen]
     else:
-        X, R, use = best_poses([found[k] for k in proven(found)])
-        shown = [pictures[k] for k in proven(found)]
-        others = None if among is None else among.neighbours.of(proven(found))
+        X, R, use = best_poses([found[k] for k in rows])
+        shown = [pictures[k] for k in rows]
+        others = None if among is None else among.neighbours.of(rows)
     whole = fitter.pixels(shown, X, fitter.optics.fine, neighbours=others)
     thin = max(1, round(whole.grey.shape[1] / ENOUGH))
     pixels = whole.thinned(thin)
@@ -214,7 +217,7 @@ def estimate_appearance(
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
     blurred, moved, sharper = fitter.optics, None, False
     if following is not None and looked is found:
-        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, proven(found), following, others)
+        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, rows, following, others)
     if moved is not None:
         smeared, known = open_.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         open_, there = _light_and_blur(open_, paint, smeared, fit, known, given=False)
@@ -239,7 +242,9 @@ def estimate_appearance(
         # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
     limb_px = _limb_px(fitter, fit, use)
-    views = _with_least_merit(first, frames, looked) if among is None and looked is found else fitter.views
+    views = fitter.views
+    if among is None and looked is found:
+        views = _with_least_merit(first, [frames[k] for k in rows], torch.stack([found[k].use for k in rows]))
     fitter, still = (replace(one, views=views, widest_px=widest, limb_px=limb_px) for one in (fitter, still))
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
@@ -247,7 +252,7 @@ def estimate_appearance(
         score_min = min(score_min, _clear_of(right))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine))
-    sure = [] if among is not None else [frames[k] for k in proven(found)]
+    sure = [] if among is not None else [frames[k] for k in rows]
     claimed = sum(count > 1 for count in side_by_side(first.claimants, sure))
     return Appearance(
         fitter=fitter,
@@ -333,14 +338,14 @@ def _limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     return found
 
 
-def _with_least_merit(
-    search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]
-) -> list[CameraView]:
-    """Return the views with the least merit of a blob in which the sphere is looked for."""
+def _with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use: Tensor) -> list[CameraView]:
+    """Return the views with the least merit of a blob in which the sphere is looked for; `use` (n, C): which cameras
+    show it in n frames.
+    """
     views = []
     for camera, view in enumerate(search.fitter.views):
-        shown = [frames[k][camera].picture for k in proven(found) if bool(found[k].use[camera])]
-        merits = [search.merit(picture, view) for picture in shown]
+        seeing = zip(frames, use[:, camera].tolist(), strict=True)
+        merits = [search.merit(frame[camera].picture, view) for frame, used in seeing if used]
         views.append(replace(view, merit_min=FAINT * min(merits) if merits else 0.0))
     return views
 
@@ -399,6 +404,11 @@ def _torn(fitter: Fitter, poses: Poses) -> bool:
         why in TORN and bool(view.shows_whole(view.camera.project(X), view.radius_px(X, fitter.radius_mm)).all())
         for view, why in zip(fitter.views, poses.reason, strict=True)
     )
+
+
+def _poses_of_all(search: Initialiser, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
+    """Find the poses of n frames, with cameras that see the sphere without an outline."""
+    return [_seen_by_all(search.fitter, *one) for one in zip(frames, search.all_poses(frames), strict=True)]
 
 
 def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
@@ -81,8 +82,13 @@ class Initialiser:
 
     def merit(self, picture: Picture, view: CameraView) -> float:
         """Return the merit of the best blob of a picture, 0 without one."""
-        blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, self.locating)
+        _, blobs = self._blobs(picture, view)
         return blobs[0].merit if blobs else 0.0
+
+    def _blobs(self, picture: Picture, view: CameraView) -> tuple[NDArray[np.float32], list[Blob]]:
+        """Return by how much a picture differs from the empty scene, and its blobs of the sphere's size."""
+        difference = view.background.difference(picture)
+        return difference, find_blobs(difference, view.background.noise, view.diameter_px, self.locating)
 
     def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
         found = self._found(shots, replace(self, locating=locating).outline)
@@ -119,8 +125,7 @@ class Initialiser:
 
     def _relocalised(self, picture: Picture, view: CameraView) -> Found:
         proposer = self.proposers[view.name]
-        difference = view.background.difference(picture)
-        blobs = find_blobs(difference, view.background.noise, view.diameter_px, self.locating)
+        _, blobs = self._blobs(picture, view)
         if not blobs:
             return None, Reason.NOT_FOUND
         radius = view.diameter_px / 2
@@ -140,8 +145,7 @@ class Initialiser:
         return max((self._claimants(shot.picture, view) for view, shot in pairs if shot.usable), default=0)
 
     def _claimants(self, picture: Picture, view: CameraView) -> int:
-        difference, scene, settings = view.background.difference(picture), view.background, self.locating
-        blobs = find_blobs(difference, scene.noise, view.diameter_px, settings)
+        (difference, blobs), scene, settings = self._blobs(picture, view), view.background, self.locating
         blobs = _distinct_places(
             [blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit], view.diameter_px / 2
         )

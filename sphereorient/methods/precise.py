@@ -37,12 +37,13 @@ def learn(job: Job, progress: Progress) -> Follower:
         known={},
     )
     frames, places = frames_showing(recording, views, settings.refine.appearance_frames, first.disks)
-    # Only blurred pictures need blurred templates; sharp ones share one first guess.
-    disks = [(shot.picture, disk) for shots in frames for shot, disk in zip(shots, first.disks(shots), strict=True)]
-    blur_px = estimate_blur_px((picture, disk) for picture, disk in disks if disk is not None)
-    if settings.refine.blur_px is None and defocus_radii(blur_px, search.diameter_px):
-        fitter = first_fitter(views, recording.experiment.radius_mm, base, blur_px)
-        first = replace(first, fitter=fitter, proposers=search.by_camera(views, blur_px))
+    if settings.refine.blur_px is None:
+        pairs = (pair for shots in frames for pair in zip(shots, first.disks(shots), strict=True))
+        blur_px = estimate_blur_px((shot.picture, disk) for shot, disk in pairs if disk is not None)
+        # Only blurred pictures need blurred templates; sharp ones share one first guess.
+        if defocus_radii(blur_px, search.diameter_px):
+            fitter = first_fitter(views, recording.experiment.radius_mm, base, blur_px)
+            first = replace(first, fitter=fitter, proposers=search.by_camera(views, blur_px))
     following = None
     if exposure_s(job) > 0 and len(recording.clock) > 1:
         beside = [place + 1 if place + 1 < len(recording.clock) else place - 1 for place in places]

@@ -112,9 +112,8 @@ def open_views(
         known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
         cameras = [recording.cameras[stream.name] for stream in recording.streams]
         sizes = [px or view.result().diameter_px for px, view in zip(known, opening, strict=True)]
-        widest = max(sizes)
         search = BlurMatchedSearch(recording.texture, settings, list(zip(cameras, sizes, strict=True)))
-        base = pool.submit(finest_table, recording.texture, widest, recording.unseen)
+        base = pool.submit(finest_table, recording.texture, search.diameter_px, recording.unseen)
         sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
         views = [view.result() for view in opening]
         sharp.result()

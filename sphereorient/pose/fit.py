@@ -245,10 +245,9 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     off = pull - weight * mean
     error2 = off.square().sum(0) / whole.square() * number / (number - 1)
     told = number > 1
-    signal2 = torch.where(told, mean.square() - error2, 0.0).sum(1, keepdim=True) / told.sum(1, keepdim=True).clamp_min(
-        1
-    )
-    share = torch.where(told, signal2.clamp_min(0.0) / (signal2.clamp_min(0.0) + error2), 0.0).nan_to_num()
+    signal2 = torch.where(told, mean.square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
+    signal2 = signal2.clamp_min(0.0)[:, None]
+    share = torch.where(told, signal2 / (signal2 + error2), 0.0).nan_to_num()
     return known + (share * mean).reshape(known.shape).float()
 
 

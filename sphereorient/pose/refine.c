@@ -15,7 +15,7 @@
 #define COLUMNS 36    /* 6 of the pose, and most coefficients of a frame's own light */
 #define HARMONICS 9
 #define EDGE_COLUMNS 12
-#define EVERY 4       /* n-th place that a score looks at */
+#define EVERY 4       /* n-th place suffices for numbers of a whole disk: they are in order of distance */
 #define TWO_PI 6.283185307179586
 
 typedef struct {
@@ -523,7 +523,7 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
             weight[from + i] = (float)(inside[from + i] & !silent);
         }
     }
-    for (int64_t p = 0; p < P; p += 4) /* a quarter of the places suffices: they are in order of distance */
+    for (int64_t p = 0; p < P; p += EVERY)
         if (inside[p]) {
             const float square = at->residual[p] * at->residual[p] / at->variance[p];
             if (square == square) at->sorted[told++] = square;
@@ -624,9 +624,11 @@ static double score_of(const Task *t, const Disk *at, const Sums *of) {
                 grey[i] = of->expected[p] + residual[i], beside[i] = at->beside[p], x[i] = at->x[p], y[i] = at->y[p];
                 disk[i] = grey[i] - (1.0f - covered[i]) * beside[i];
             }
-            monomials(x, y, BLOCK, TINTS, tints);
-            for (int a = 0; a < TINTS; a++)
-                for (int i = 0; i < BLOCK; i++) tints[a][i] *= covered[i];
+            if (pass != 1) {
+                monomials(x, y, BLOCK, TINTS, tints);
+                for (int a = 0; a < TINTS; a++)
+                    for (int i = 0; i < BLOCK; i++) tints[a][i] *= covered[i];
+            }
             if (pass == 0) {
                 for (int i = 0; i < BLOCK; i++) some += counted[i], mean += counted[i] * grey[i];
                 for (int a = 0, next = 0; a < TINTS; a++) {
@@ -755,7 +757,7 @@ static int uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
         const float residual = grey[p] - expected[p];
         squares[p] = residual * residual / noise_variance(own, expected[p], floor_);
     }
-    for (int64_t p = 0; p < P; p += 4)
+    for (int64_t p = 0; p < P; p += EVERY)
         if (at->counts[p] && !clipped[p] && squares[p] == squares[p]) at->sorted[told++] = squares[p];
     const float deviation = told ? 1.4826f * sqrtf(ranked(at->sorted, told, (told - 1) / 2)) : 0.0f;
     const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);

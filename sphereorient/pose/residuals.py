@@ -14,7 +14,7 @@ TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfi
 KNOWN = 0.3  # least share of a disk that shows known paint
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 SMOOTH = 4  # order of the light and reflections that a disk without paint shows; as those of a first fit
-EVERY = 4  # n-th place that is looked at: they are in order of distance
+EVERY = 4  # n-th place suffices for numbers of a whole disk: they are in order of distance from its middle
 OUTLIERS = 4.0  # times the variance of the disk, beyond which a square counts alike
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
@@ -180,8 +180,7 @@ def noise_variance(grey: Tensor, noise: Tensor) -> Tensor:
 
 def robust_deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
     """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
-    # A quarter of the places suffices: they are in order of distance from the middle.
-    residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
+    residual, variance, inside = (part[:, ::EVERY] for part in (residual, variance, inside))
     scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
     return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
 
