@@ -103,6 +103,7 @@ class JsonLines:
             "sigma_omega_rad_s": omega.sigma.tolist(),
             "sigma_velocity_mm_s": velocity.sigma.tolist(),
             "map": now.map_number,
+            "flags": now.flags,
             "found": now.found,
             "dropped": now.dropped,
             "reason": [str(why) for why in now.reason],

@@ -13,6 +13,7 @@ from sphereorient.follow import Appearance
 from sphereorient.follow.poses import Poses, supported
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
+from sphereorient.methods.results import fit_flags, missed_by
 from sphereorient.pose import CameraView
 from sphereorient.trajectory import Reason
 
@@ -32,6 +33,7 @@ class Measured:
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
     poses: Poses  # all that the fit says
     map_number: int  # of the map that it was measured with; 0: none, the orientation is relative
+    flags: int  # bits of `Flag` that its fit has; 0 without a map
     found: bool  # whether it was searched for: the first one, found again, or not where it was expected
     dropped: int  # frames since the one before that came too late
     latency_s: float  # from the picture's arrival to here
@@ -70,7 +72,7 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
             for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
         ]
         poses, searched = tracker.next(arrival.time_s, shots)
-        yield _told(arrival, poses, searched, arrival.number - number - 1, tracker.number)
+        yield _told(arrival, poses, searched, arrival.number - number - 1, tracker)
         tracker.between()
         before, number = shots, arrival.number
 
@@ -82,7 +84,7 @@ def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: Camer
     return screened(picture, None if before is None else before.shown, view.background)
 
 
-def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, map_number: int) -> Measured:
+def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: LiveTracker) -> Measured:
     there = supported(poses)
     return Measured(
         number=arrival.number,
@@ -92,8 +94,16 @@ def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, map_number:
         covariance=poses.covariance[0].numpy() if there else LOST_COVARIANCE,
         reason=poses.reason,
         poses=poses,
-        map_number=map_number,
+        map_number=tracker.number,
+        flags=_flags(poses, tracker.appearance) if there and tracker.number else 0,
         found=found and there,
         dropped=dropped,
         latency_s=time.perf_counter() - arrival.arrived_s,
     )
+
+
+def _flags(poses: Poses, learnt: Appearance) -> int:
+    X, seen = poses.position_lab_mm[:1], zip(learnt.fitter.views, poses.reason, strict=True)
+    disks = ((view, [why], view.camera.project(X), view.radius_px(X, learnt.fitter.radius_mm)) for view, why in seen)
+    missed = sum(missed_by(*one) for one in disks if one[1] != [Reason.OK])
+    return int(fit_flags(learnt, poses.use[None], poses.score[:1], poses.excess[:1], np.asarray(missed))[0])

@@ -1,6 +1,6 @@
 """From the stages' results to the trajectory, one function for each method."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import Any
@@ -145,8 +145,13 @@ def measured_track(
     covariance = picked["covariance"]
     margin, angle = _margin(table, choice)
     cameras = {view.name: precise_camera(k, table, picked, learnt) for k, view in enumerate(learnt.fitter.views)}
-    missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
-    flags = _fit_flags(table, choice, picked, learnt, np.sum(missed, axis=0))
+    shown = ((view, cameras[view.name]) for view in learnt.fitter.views)
+    disks = (
+        (view, one.reason, torch.from_numpy(one.centre_px), torch.from_numpy(one.radius_px)) for view, one in shown
+    )
+    missed = [missed_by(*one) for one in disks]
+    seeing = table.use & (choice >= 0)[:, None]
+    flags = fit_flags(learnt, seeing, picked["score"], picked["excess"], np.sum(missed, axis=0))
     return replace(
         _empty(experiment, clock, cameras),
         valid=(choice >= 0).numpy(),
@@ -154,7 +159,7 @@ def measured_track(
         position_cov=covariance[:, 3:, 3:].numpy(),
         orientation=picked["R_lab_body"].numpy(),
         orientation_cov=covariance[:, :3, :3].numpy(),
-        flags=flags.numpy().astype(np.uint32),
+        flags=flags,
         margin=margin.numpy(),
         margin_angle=angle.numpy(),
         cameras=cameras,
@@ -253,35 +258,36 @@ def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(there, best - table.nll[frame, place], torch.nan), torch.where(there, angle, torch.nan)
 
 
-def _missed(view: CameraView, track: CameraTrack) -> NDArray[np.bool_]:
-    """Return in which frames, (N,), a camera should show the whole sphere where the others see it, and does not."""
-    whole = view.shows_whole(torch.from_numpy(track.centre_px), torch.from_numpy(track.radius_px)).numpy()
-    missed: NDArray[np.bool_] = np.isin(track.reason, MISSED) & whole
+def missed_by(view: CameraView, reason: Sequence[str], centre_px: Tensor, radius_px: Tensor) -> NDArray[np.bool_]:
+    """Return in which frames, (N,), a camera does not show the sphere whose whole disk, centre (N, 2) and radius (N,),
+    px, it should show where the others see it; `reason` says what became of it there.
+    """
+    missed: NDArray[np.bool_] = np.isin(reason, MISSED) & view.shows_whole(centre_px, radius_px).numpy()
     if view.background.shown is not None:
-        u, v = track.centre_px[missed].round().astype(int).T
+        u, v = centre_px.numpy()[missed].round().astype(int).T
         missed[missed] = view.background.shown[v, u]
     return missed
 
 
-def _fit_flags(
-    table: PoseTable,
-    choice: Tensor,
-    picked: Mapping[str, Tensor],
-    learnt: Appearance,
-    missed: NDArray[np.int64],
-) -> Tensor:
-    """Return flags (N,) int64 of frames that one camera alone measured, of poor fits, and of a movie of two balls.
+def fit_flags(
+    learnt: Appearance, use: Tensor, score: Tensor, excess: Tensor, missed: NDArray[np.integer]
+) -> NDArray[np.uint32]:
+    """Return flags (N,) of frames that one camera alone measured, of poor fits, and of a movie of two balls, from the
+    use, score and excess (N, C) of each picture; frames without a picture in use have none.
     Where as many other cameras should see the sphere and do not (`missed`, a number), half of the poses are wrong.
     """
-    found = choice >= 0
-    one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
-    best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
+    count = use.sum(-1).numpy()
+    best = torch.where(use, score, -torch.inf).amax(-1).numpy()
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
-    excess = torch.where(table.use, picked["excess"], torch.inf).amin(-1)
-    outvoted = torch.from_numpy((missed > 0) & (missed >= table.use.sum(-1).numpy()))
-    doubtful = found & ((best < learnt.poor_score) | (excess > EXCESS) | learnt.in_doubt | outvoted)
-    bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
-    return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
+    least = torch.where(use, excess, torch.inf).amin(-1).numpy()
+    outvoted = (missed > 0) & (missed >= count)
+    doubtful = (best < learnt.poor_score) | (least > EXCESS) | learnt.in_doubt | outvoted
+    one = (count == 1) & (use.shape[-1] > 1)
+    bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: np.full(len(use), learnt.second_ball)}
+    flags: NDArray[np.uint32] = np.sum(
+        [where * np.uint32(flag) for flag, where in bits.items()], axis=0, dtype=np.uint32
+    )
+    return flags * (count > 0).astype(np.uint32)
 
 
 def with_systematic_errors(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.experiment.recording import open_recording
 from sphereorient.live.feed import movie_frames
+from sphereorient.live.lines import JsonLines
 from sphereorient.live.live import measured
 from sphereorient.live.prepare import open_live
 from sphereorient.live.track import REMARK, TrackBlocks, TrackOutput, whole_track
@@ -28,6 +30,7 @@ from sphereorient.trajectory import Flag, Reason, Trajectory, journal
 from sphereorient.trajectory.datasets import stored_fields
 
 HIDDEN, DROPPED = range(15, 18), range(24, 26)
+OF_FIT = Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT | Flag.AMBIGUOUS
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +44,21 @@ def run(tmp_path_factory):
         ]
         found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
         yield opened.recording, opened.tracker, found
+
+
+def test_a_frame_that_one_camera_measured_is_flagged_at_once_and_doubtful_if_the_other_should_see_the_ball():
+    def seen(k, picture):
+        return np.zeros_like(picture) if k == 5 else np.roll(picture, 200, 1) if k == 7 else picture
+
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+        frames = [
+            replace(one, pictures=[one.pictures[0], seen(k, one.pictures[1])])
+            for k, one in zip(range(9), movie_frames(opened.recording, paced=False), strict=False)
+        ]
+        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
+    expected = [0, 0, 0, 0, 0, Flag.ONE_CAMERA, 0, Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT, 0]
+    assert [now.flags for now in found] == expected
+    assert [json.loads(JsonLines(fixed=False).line(now))["flags"] for now in found] == expected
 
 
 def blocks_of(run) -> TrackBlocks:
@@ -63,6 +81,7 @@ def test_the_track_says_of_each_frame_what_was_measured(run, tmp_path):
         k = now.number
         np.testing.assert_array_equal(track.orientation[k], now.R_lab_body)
         np.testing.assert_array_equal(track.position[k], now.position_lab_mm)
+        assert now.flags == track.flags[k] & OF_FIT
         if now.valid:  # the errors that all frames share are added
             assert np.trace(track.orientation_cov[k]) >= np.trace(now.covariance[:3, :3])
             assert np.trace(track.orientation_cov[k]) < 4 * np.trace(now.covariance[:3, :3])

@@ -12,12 +12,12 @@ import torch
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, sphere_radius_px
-from sphereorient.methods.results import _missed, with_contradictions, with_lasting_errors
+from sphereorient.methods.results import missed_by, with_contradictions, with_lasting_errors
 from sphereorient.pose.fitter import CameraView
 from sphereorient.pose.lasting import Lasting
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
-from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+from sphereorient.trajectory import Flag, Reason, Trajectory
 
 CAMERAS = default_cameras(SynthSettings())
 NOTHING = Lasting.none(len(CAMERAS))
@@ -187,15 +187,10 @@ def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
 def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_noticed(why, u_px, shown, missed):
     camera = next(iter(CAMERAS.values()))
     scene = SimpleNamespace(shown=shown)
-    track = replace(
-        CameraTrack.empty(2),
-        centre_px=np.array([[u_px, 250.0], [300.0, 250.0]]),
-        radius_px=np.full(2, 40.0),
-        reason=(str(why), str(Reason.OK)),
-    )
+    centre_px, radius_px = torch.tensor([[u_px, 250.0], [300.0, 250.0]]), torch.full((2,), 40.0)
     assert camera.image_size == (650, 650)
     view = CameraView(name="cam1", camera=camera, background=scene, diameter_px=80.0, sight=None)
-    assert _missed(view, track).tolist() == [missed, False]
+    assert missed_by(view, (why, Reason.OK), centre_px, radius_px).tolist() == [missed, False]
 
 
 THREE = default_cameras(SynthSettings(cameras=3))
