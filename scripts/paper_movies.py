@@ -87,15 +87,20 @@ def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.f
     return of_blades.T @ along + 20 * band.sum(0)
 
 
-def disturb(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]) -> None:
+def disturb(
+    light: NDArray[np.float32], behind: Floats, exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]
+) -> None:
     """Put what real pictures have on the sphere in grey levels (H, W): lamps of the tank, and bubbles of each frame.
 
-    `seeds` are camera, movie and frame.
+    `behind` (H, W) is what the sphere hides; `seeds` are camera, movie and frame.
     """
     part = exposure.within(round(0.5 * float(disk.radius_px)))
     rows, columns = part.window
     corner = torch.tensor([columns.start, rows.start])
-    inside = replace(disk, centre_px=disk.centre_px - corner, cover=torch.from_numpy(part.cover))
+    cover, scene = (
+        torch.from_numpy(np.ascontiguousarray(one, np.float32)) for one in (part.cover, behind[part.window])
+    )
+    inside = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=scene)
     static, moving = (seeded(TEXTURE_SEED, *seeds[:count]) for count in (1, 3))
     number = float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))
     lit = degrade(torch.from_numpy(light[part.window]), inside, LAMPS, static)
@@ -125,7 +130,7 @@ def film(folder: Path, number: int, frames: int) -> None:
             lit = exposure.before(behind)
             if near[k]:
                 disk = Disk(centre_px=disks.centre_px[place[k]], radius_px=disks.radius_px[place[k]])
-                disturb(lit, exposure, disk, (index, number, k))
+                disturb(lit, behind, exposure, disk, (index, number, k))
             yield digitise(lit, settings, rng)
 
     for index, (name, camera) in enumerate(cameras.items()):

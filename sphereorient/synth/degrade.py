@@ -28,6 +28,7 @@ class Disk:
     centre_px: Tensor  # (..., 2) as (u, v)
     radius_px: Tensor  # (...)
     cover: Tensor | None = None  # (..., H, W), coverage of each pixel; None: of a round disk
+    behind: Tensor | None = None  # grey levels behind it, as the pictures; None: as bright as it
 
     def __post_init__(self) -> None:
         check_tail("centre_px", self.centre_px, 2)
@@ -81,12 +82,13 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
 
 
 def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Dim the sphere across the disk, to 1 / ratio at one limb."""
+    """Dim the sphere across the disk, to 1 / ratio at one limb; not what is behind it."""
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
     right, down = disk.offset(pictures)
     across = ((right * angle.cos() + down * angle.sin()) / disk.radius(pictures)).clamp(-1, 1)
     left = torch.exp(0.5 * math.log(ratio) * (across - 1))
-    return pictures * (1 + disk.covered(pictures) * (left - 1))
+    behind = pictures if disk.behind is None else disk.behind.to(pictures)
+    return pictures + (left - 1) * (pictures - (1 - disk.covered(pictures)) * behind)
 
 
 def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) -> Tensor:

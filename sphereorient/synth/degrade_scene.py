@@ -161,8 +161,9 @@ class Filming:
         wider = part.within(self._spread)
         (rows, columns), height, width = wider.window, *part.light.shape
         corner = disk.centre_px.new_tensor([columns.start, rows.start])
-        disk = replace(disk, centre_px=disk.centre_px - corner, cover=torch.from_numpy(wider.cover))
-        light = torch.from_numpy(wider.light + (1 - wider.cover) * np.float32(self.settings.background))
+        behind, cover = torch.tensor(float(self.settings.background)), torch.from_numpy(wider.cover)
+        disk = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=behind)
+        light = torch.from_numpy(wider.light) + (1 - cover) * behind
         for what in optics:
             moves = DEGRADATIONS[what].where == "frame"
             if what in FIELDS:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from pydantic import BaseModel, Field
@@ -67,9 +68,10 @@ def film_disks(
     side = 2 * math.ceil(radius * (1 + MARGIN)) + 2
     middle = side / 2 - 0.5 + torch.rand((count, 2), generator=rng) - 0.5
     disk = Disk(centre_px=middle, radius_px=torch.full((count,), radius))
-    grey = _lit(texture, R_view_body.float(), values, disk, side, rng)
+    grey, behind = _lit(texture, R_view_body.float(), values, disk, side, rng)
     within = {name: value * (scale if name in IN_PX else 1.0) for name, value in values.items() if name in OPERATIONS}
-    grey = degrade(blurred(grey, max(BLUR_PX * scale, 0.3)), disk, within, rng)  # coarse pixels blur by themselves
+    before = replace(disk, behind=behind)
+    grey = degrade(blurred(grey, max(BLUR_PX * scale, 0.3)), before, within, rng)  # coarse pixels blur by themselves
     noise = (READ_NOISE**2 + SHOT_NOISE**2 * grey.clamp_min(0)).sqrt()
     grey = (grey + noise * torch.randn(grey.shape, generator=rng)).round().clamp(0, 255)
     return _cropped(grey, _outline(disk, values, scale, rng, settings), settings.size_px)
@@ -85,7 +87,8 @@ def _check(values: Mapping[str, float]) -> None:
 
 def _lit(
     texture: Tensor, R: Tensor, values: Mapping[str, float], disk: Disk, side: int, rng: torch.Generator
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
+    """Return pictures (F, S, S) without degradations, and the grey levels behind their balls, (F, 1, 1)."""
     count, radius = len(R), float(disk.radius_px.amax()) if len(R) else 1.0
     right, down = disk.offset(torch.empty(count, side, side))
     origin = torch.nn.functional.pad(
@@ -95,8 +98,8 @@ def _lit(
     seen = see_sphere(rays, torch.zeros(3), _instants(R, values, rng), reduced_texture(texture, 2 * radius), radius)
     white, black, behind = (low + (high - low) * torch.rand((count, 1), generator=rng) for low, high in LEVELS)
     grey = (black + (white - black) * seen.paint.mean(0)) * _light(seen.normal, rng)
-    grey = grey.reshape(count, side, side)
-    return behind[..., None] + disk.covered(grey) * (grey - behind[..., None])
+    grey, behind = grey.reshape(count, side, side), behind[..., None]
+    return behind + disk.covered(grey) * (grey - behind), behind
 
 
 def _instants(R: Tensor, values: Mapping[str, float], rng: torch.Generator) -> Tensor:

@@ -68,7 +68,7 @@ def test_lamps_stand_still_and_bubbles_change():
     window = slice(20, 80), slice(30, 90)
     exposure = paper_movies.Exposure(size=(100, 120), window=window, light=90 * cover, cover=cover)
     for light, frame in zip(lit, (1, 1, 2, 3), strict=True):
-        paper_movies.disturb(light, exposure, disk, (0, 5, frame))
+        paper_movies.disturb(light, np.zeros_like(light), exposure, disk, (0, 5, frame))
     np.testing.assert_array_equal(lit[0], lit[1])
     assert np.abs(lit[0] - 90).max() > 10
     unlike = [np.abs(lit[0] - other).mean() for other in lit[2:]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -271,6 +272,16 @@ def test_uneven_light_has_its_ratio_from_limb_to_limb_and_leaves_the_ground(seed
         for f in (np.nanargmax, np.nanargmin)
     )
     assert np.linalg.norm(bright - dark) > 1.8 * RADIUS
+
+
+def test_uneven_light_dims_the_share_of_a_rim_pixel_that_the_ball_covers():
+    where = disk(dtype=torch.float64)
+    cover, ground = where.covered(flat(0.0, torch.float64)), torch.tensor(60.0, dtype=torch.float64)
+    everywhere = replace(where, cover=torch.ones_like(cover))
+    left = degrade(flat(1.0, torch.float64), everywhere, {"uneven_light": 4.0}, seeded())
+    got = degrade(cover * 100 + (1 - cover) * ground, replace(where, behind=ground), {"uneven_light": 4.0}, seeded())
+    assert ((cover > 0.1) & (cover < 0.9)).sum() > 100
+    assert_close(got, cover * 100 * left + (1 - cover) * ground)
 
 
 def test_highlights_have_their_peak_and_width_and_stay_on_the_ball():
