@@ -564,7 +564,7 @@ def pictures(
                     film=filmed,
                 )
             )
-        yield digitise(lit, settings, rng)
+        yield digitise(lit.astype(np.float32), settings, rng)
 
 
 @dataclass(frozen=True, kw_only=True)
