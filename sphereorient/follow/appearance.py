@@ -171,7 +171,7 @@ def estimate_appearance(
     else:
         found = list(among.found)
     rows = proven(found)
-    if not rows:
+    if not rows and (among is not None or len(fitter.views) == 1):
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found) if among is None else (1.0, 0.0)
     looked, seen, others = found, [], None
@@ -196,6 +196,7 @@ def estimate_appearance(
     pixels = whole.thinned(thin)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
+    _check_light(fitter)
     blur_px = fitter.optics.blur_px
     if settings.blur_px is None and abs(blur_px / first.fitter.optics.blur_px - 1) > BLUR_FAR_OFF:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
@@ -338,6 +339,15 @@ def _limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     return found
 
 
+def _check_light(fitter: Fitter) -> None:
+    """Raise ExperimentError where what the map calls white is darker than what it calls black."""
+    contrast = fitter.light.tables.cells[:, 0].reshape(len(fitter.views), -1).mean(1)
+    if bool((contrast < 0).any()):
+        got = f"white paint darker than black in {fitter.views[int(contrast.argmin())].name}"
+        do = "exchange black and white of the map"
+        raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
+
+
 def _with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use: Tensor) -> list[CameraView]:
     """Return the views with the least merit of a blob in which the sphere is looked for; `use` (n, C): which cameras
     show it in n frames.
@@ -359,6 +369,8 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     """
     cameras = len(fitter.views)
     sure = proven(found)
+    if not sure:  # wrong cameras spoil every pose of all pictures
+        return math.inf, math.inf
     whole = [k for k in sure if bool(found[k].use.all())]
     if len(whole) < sum(_torn(fitter, found[k]) for k in sure):
         return math.inf, math.inf  # outlines that miss each other already
@@ -520,7 +532,7 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
     """Return the error of a movie without the sphere, or without a pose that fits."""
     reasons = {str(why) for poses in found for why in poses.reason}
     got = f"none ({', '.join(sorted(reasons))})"
-    if Reason.LOW_SCORE in reasons:
+    if Reason.LOW_SCORE in reasons or any(len(poses) for poses in found):
         expected, do = "frames that the map explains", "check sphere.texture, and the cameras: are they swapped?"
     else:
         expected, do = "the sphere in some frame", "check sphere.diameter and the cameras, or set locate.diameter_px"

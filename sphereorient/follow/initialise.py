@@ -62,9 +62,9 @@ class Initialiser:
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
         explained well, outlines nearer to the usual size are tried, and the texture locates the disk.
         """
-        if not any(self._may_show(shot, view) for shot, view in zip(shots, self.fitter.views, strict=True)):
-            reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
-            return no_pose(len(shots), reason)
+        shots = [self._looked_at(shot, view) for shot, view in zip(shots, self.fitter.views, strict=True)]
+        if not any(shot.usable for shot in shots):
+            return no_pose(len(shots), [shot.reason for shot in shots])
         poses = self._with_outlines(shots, self.locating)
         for tolerance in NARROWER:
             if _best_score(poses) >= self.score_min:
@@ -76,9 +76,11 @@ class Initialiser:
             poses = max(poses, self._search(shots, self._found(shots, self.relocalise)), key=_best_score)
         return poses
 
-    def _may_show(self, shot: Frame, view: CameraView) -> bool:
-        """Return whether a picture may show the sphere: a look at its blobs."""
-        return shot.usable and (view.merit_min == 0.0 or self.merit(shot.picture, view) >= view.merit_min)
+    def _looked_at(self, shot: Frame, view: CameraView) -> Frame:
+        """Return a frame that is not used further where it shows no blob like the sphere's."""
+        if not shot.usable or view.merit_min == 0.0 or self.merit(shot.picture, view) >= view.merit_min:
+            return shot
+        return Frame(shown=shot.shown, read=Reason.NOT_FOUND)
 
     def merit(self, picture: Picture, view: CameraView) -> float:
         """Return the merit of the best blob of a picture, 0 without one."""
@@ -131,11 +133,10 @@ class Initialiser:
         radius = view.diameter_px / 2
         steps = [STEP * radius * k for k in range(-REACH, REACH + 1)]
         places = [(blobs[0].u_px + right, blobs[0].v_px + down) for down in steps for right in steps]
-        disks = [torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places]
-        proposals = proposer.propose(torch.stack(disks))
-        if not len(proposals.score):
+        disks = torch.stack([torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places])
+        best = int(proposer.likeness(disks).argmax())
+        if not len(proposer.propose(disks[best : best + 1]).score):
             return None, Reason.LOW_SCORE
-        best = int(torch.searchsorted(proposals.offset, int(proposals.score.argmax()), right=True)) - 1
         u, v = places[best]
         return Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0), Reason.OK
 
@@ -161,8 +162,8 @@ class Initialiser:
             return 1
         proposer = self.proposers[view.name]
         disks = [crop_disk(picture, one.u_px, one.v_px, one.radius_px, proposer.size_px) for one in outlines]
-        best = [float(own.score[:1].sum()) for own in proposer.propose(torch.from_numpy(np.stack(disks))).each()]
-        return sum(score > RIVAL_SCORE * max(best) for score in best)
+        best = proposer.propose(torch.from_numpy(np.stack(disks))).best_score
+        return int((best > RIVAL_SCORE * best.max()).sum())
 
     def _once(self, picture: Picture, key: Hashable, find: Callable[[], Any]) -> Any:
         """Return what `find` does, or did when the same picture was looked at with this key."""

@@ -246,6 +246,10 @@ class LearnedProposer:
         """Side of the disks, px."""
         return self._network.settings.size_px
 
+    def likeness(self, disks: Tensor) -> Tensor:
+        """Return the best score of each disk, (F,)."""
+        return self.propose(disks).best_score
+
     @torch.inference_mode()
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations in the view frames of disks, with `score_of` their probability.

@@ -117,6 +117,11 @@ class Candidates:
         return R, score, mask
 
     @property
+    def best_score(self) -> Tensor:
+        """Score of each frame's best candidate, (N,) float64, 0 without one."""
+        return torch.tensor([float(own.score[:1].sum()) for own in self.each()], dtype=torch.float64)
+
+    @property
     def _places(self) -> Tensor:
         """Which of C places of each frame hold a candidate, (N, C) bool."""
         return torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
@@ -131,6 +136,9 @@ class Proposer(Protocol):
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk."""
+
+    def likeness(self, disks: Tensor) -> Tensor:
+        """Return how much disks (F, S, S) look like the ball in its best orientation, (F,); cheaper than `propose`."""
 
 
 def check_disks(disks: Tensor, height: int, width: int) -> None:
@@ -148,6 +156,10 @@ class DiskSearch(nn.Module, ABC):
     @abstractmethod
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
+
+    def likeness(self, disks: Tensor) -> Tensor:
+        """Return how much disks (F, S, S) look like the ball in its best orientation, (F,)."""
+        return self.propose(disks).best_score
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (..., M, 3, 3) and score (..., M) float64 of the candidates, best first, padded with NaN.
@@ -170,13 +182,17 @@ class FallbackProposer:
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
-        found = self._first.propose(disks).each()
-        doubt = [f for f, own in enumerate(found) if own.score[:1].sum() < self._sure]
+        first = self._first.propose(disks)
+        found, doubt = first.each(), torch.nonzero(first.best_score < self._sure)[:, 0].tolist()
         if doubt:
             more = self._second.propose(resized(disks[doubt], self._second.size_px))
             for f, other in zip(doubt, more.each(), strict=True):
                 found[f] = interleaved(other, found[f])
         return Candidates.joined(found)
+
+    def likeness(self, disks: Tensor) -> Tensor:
+        """Return what the first proposer says."""
+        return self._first.likeness(disks)
 
 
 def resized(disks: Tensor, size_px: int) -> Tensor:

@@ -103,6 +103,10 @@ class GreySearch(DiskSearch):
                 parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
         return Candidates.joined(parts)
 
+    def likeness(self, disks: Tensor) -> Tensor:
+        """Return the correlation of disks (F, S, S) with the template most like each, (F,)."""
+        return self.score(disks).amax(-1)
+
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
         All scores of the disks (F, S, S) float32 are held at once, 36 kB each.

@@ -107,6 +107,10 @@ class DotSearch:
         """Side of the disks, px."""
         return self._search.size_px
 
+    def likeness(self, disks: Tensor) -> Tensor:
+        """Return the best score of each disk, (F,)."""
+        return self.propose(disks).best_score
+
     def propose(self, disks: Tensor) -> Candidates:
         """Propose attitudes; see `GreySearch.propose`.
 
