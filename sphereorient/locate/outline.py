@@ -19,6 +19,7 @@ PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
 PROFILES = 180  # radial profiles; more sample the same pixels again
+ALL_AROUND = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +105,7 @@ class Outline:
     radius_px: float
     rms_px: float  # distance of supporting edges from the circle
     coverage: float  # share of the visible directions with a supporting edge
+    spread: tuple[tuple[float, ...], ...] = ALL_AROUND  # covariance of (u, v, radius), (3, 3), over rms_px^2
     stretch: float = math.nan  # by how much it is wider than high, relative
     painted: bool = True  # more than one grey inside
 
@@ -318,6 +320,8 @@ def _fit_circle(
             residual = offset - design @ move
         circle = circle + move
     used = weight > 0
+    # Light, paint and blur move neighbouring edges together: more of them do not help, but an arc tells less.
+    information = 2 / PROFILES * design[used].T @ design[used]
     ellipse = np.column_stack([design, outward[:, 0] ** 2 - outward[:, 1] ** 2, 2 * outward[:, 0] * outward[:, 1]])
     wider = np.linalg.lstsq(ellipse * root[:, None], offset * root, rcond=None)[0][3]
     rms = float(np.sqrt((residual[used] ** 2).mean()))
@@ -330,6 +334,7 @@ def _fit_circle(
         radius_px=float(circle[2]),
         rms_px=rms,
         coverage=coverage,
+        spread=tuple(map(tuple, np.linalg.inv(information).tolist())),
         stretch=float(2 * wider / circle[2]),
     )
 
