@@ -18,6 +18,7 @@ NEAR_HIDDEN_PX = 3  # edges this near to the mask do not belong to the rim
 PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
+ROUGH = 2 / 3  # of the tolerance: largest rms of a circle; of the coverage of this where edges are not all around
 PROFILES = 180  # radial profiles; more sample the same pixels again
 ALL_AROUND = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -347,7 +348,8 @@ def fit_outline(
     settings: LocateSettings,
     shown: NDArray[np.bool_] | None = None,
 ) -> Outline | None:
-    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported.
+    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported. The fewer edges
+    support a circle, the better they must fit: those of paint and of glints at the border scatter.
 
     `difference` (H, W) is |frame - background| and `noise` its sigma, grey levels; `shown` (H, W) is False where
     something hides the sphere. Robust to texture edges, bubbles and black paint on a dark background.
@@ -379,5 +381,7 @@ def fit_outline(
         return None
     fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
     if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
+        return None
+    if fit.rms_px > ROUGH * settings.edge_tolerance_px * fit.coverage:
         return None
     return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top, painted=painted)

@@ -169,6 +169,23 @@ def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_says(u, paint):
     assert sigma[0] > 1.5 * sigma[1]  # along the border it is known well
 
 
+def wrinkled(depth, share):
+    """A rim with nine waves, which shows in a share of its directions."""
+
+    def paint(x, y):
+        angle = np.arctan2(y, x)
+        inside = np.hypot(x, y) < 1 - depth * (1 + np.sin(9 * angle))
+        return np.where(inside & (np.abs(angle) < share * np.pi), WHITE, BACK).astype(np.float32)
+
+    return paint
+
+
+@pytest.mark.parametrize(("depth", "share", "counts"), [(0.025, 1, True), (0.025, 0.5, False), (0.005, 0.5, True)])
+def test_edges_that_scatter_are_a_rim_only_if_they_are_all_around(depth, share, counts):
+    outline = outline_of(filmed(plant(wrinkled(depth, share), *PLACES[1])), *PLACES[1])
+    assert (outline is not None) == counts
+
+
 def test_the_borders_of_the_picture_are_no_rim():
     """A picture that is bright all over has edges nowhere."""
     frame = filmed(np.full(SHAPE, WHITE, np.float32))
