@@ -18,7 +18,9 @@ NEAR_HIDDEN_PX = 3  # edges this near to the mask do not belong to the rim
 PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
+ROUGH = 2 / 3  # of the tolerance: largest rms of a circle; of the coverage of this where edges are not all around
 PROFILES = 180  # radial profiles; more sample the same pixels again
+ALL_AROUND = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +106,7 @@ class Outline:
     radius_px: float
     rms_px: float  # distance of supporting edges from the circle
     coverage: float  # share of the visible directions with a supporting edge
+    spread: tuple[tuple[float, ...], ...] = ALL_AROUND  # covariance of (u, v, radius), (3, 3), over rms_px^2
     stretch: float = math.nan  # by how much it is wider than high, relative
     painted: bool = True  # more than one grey inside
 
@@ -318,6 +321,8 @@ def _fit_circle(
             residual = offset - design @ move
         circle = circle + move
     used = weight > 0
+    # Light, paint and blur move neighbouring edges together: more of them do not help, but an arc tells less.
+    information = 2 / PROFILES * design[used].T @ design[used]
     ellipse = np.column_stack([design, outward[:, 0] ** 2 - outward[:, 1] ** 2, 2 * outward[:, 0] * outward[:, 1]])
     wider = np.linalg.lstsq(ellipse * root[:, None], offset * root, rcond=None)[0][3]
     rms = float(np.sqrt((residual[used] ** 2).mean()))
@@ -330,6 +335,7 @@ def _fit_circle(
         radius_px=float(circle[2]),
         rms_px=rms,
         coverage=coverage,
+        spread=tuple(map(tuple, np.linalg.inv(information).tolist())),
         stretch=float(2 * wider / circle[2]),
     )
 
@@ -342,7 +348,8 @@ def fit_outline(
     settings: LocateSettings,
     shown: NDArray[np.bool_] | None = None,
 ) -> Outline | None:
-    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported.
+    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported. The fewer edges
+    support a circle, the better they must fit: those of paint and of glints at the border scatter.
 
     `difference` (H, W) is |frame - background| and `noise` its sigma, grey levels; `shown` (H, W) is False where
     something hides the sphere. Robust to texture edges, bubbles and black paint on a dark background.
@@ -374,5 +381,7 @@ def fit_outline(
         return None
     fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
     if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
+        return None
+    if fit.rms_px > ROUGH * settings.edge_tolerance_px * fit.coverage:
         return None
     return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top, painted=painted)

@@ -39,7 +39,8 @@ def find_positions(
 ) -> Positions:
     """Return the sphere's positions in N frames from the outlines of the cameras; in radii without a diameter.
 
-    A centre's sigma is its outline's rms. With one outline the distance comes from its radius: flag `ONE_CAMERA`.
+    Lines of sight count by the covariance of the centres. With one outline the distance comes from its radius: flag
+    `ONE_CAMERA`.
 
     Raises:
         ExperimentError: several cameras and an unknown diameter.
@@ -52,28 +53,27 @@ def find_positions(
     radius_mm = 1.0 if diameter_mm is None else diameter_mm / 2
     views = [_view(seen, cameras[name], radius_mm) for name, seen in sightings.items()]
     placed = torch.stack([seen.placed for seen in sightings.values()])
-    position, gap = views[-1].from_size_mm, torch.full_like(views[-1].from_size_mm[:, 0], torch.nan)
-    for view, ok in reversed(list(zip(views, placed, strict=True))):
-        position = torch.where(ok[:, None], view.from_size_mm, position)
-    if len(views) > 1:
-        crossing, gap = nearest_point([view.rays for view in views])
-        position = torch.where((placed.sum(0) > 1)[:, None], crossing, position)
     one = placed.sum(0) == 1
     flags = torch.where(one, int(Flag.ONE_CAMERA), 0)
-    information = torch.zeros(len(position), 3, 3, dtype=position.dtype)
+    information, toward = torch.zeros(len(one), 3, 3).double(), torch.zeros(len(one), 3, 1).double()
     for view, seen, ok in zip(views, sightings.values(), placed, strict=True):
-        known = view.across + torch.where(one[:, None, None], view.along, 0.0)
+        known = torch.where(one[:, None, None], view.whole, view.across)
         information = information + torch.where(ok[:, None, None], known, 0.0)
+        toward = toward + torch.where(ok[:, None, None], known @ view.from_size_mm[:, :, None], 0.0)
         flags = flags | torch.where(ok, seen.flags, 0)
-    return Positions(position_lab_mm=position, covariance_mm2=_inverse(information), gap_mm=gap, flags=flags)
+    covariance = _inverse(information)
+    position = (covariance @ toward)[:, :, 0]
+    gap = nearest_point([view.rays for view in views])[1] if len(views) > 1 else position[:, 0] * torch.nan
+    covariance = torch.where((flags & NOT_MEASURED == 0)[:, None, None], covariance, torch.nan)
+    return Positions(position_lab_mm=position, covariance_mm2=covariance, gap_mm=gap, flags=flags)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
     rays: Rays  # (N), to the centre of the outline
     from_size_mm: Tensor  # (N, 3), on the ray, at the distance from the radius
-    across: Tensor  # (N, 3, 3), information across the ray, 1/mm^2
-    along: Tensor  # (N, 3, 3), information along the ray, from the radius
+    across: Tensor  # (N, 3, 3), information across the ray, of the centre alone, 1/mm^2; 1 px where not measured
+    whole: Tensor  # (N, 3, 3), of centre and radius
 
 
 def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
@@ -87,16 +87,18 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     # Behind a port the rays start apart: subtract this part of the distance.
     begun = torch.linalg.cross(rays.origin_lab_mm[:, None] - limb.origin_lab_mm, limb.direction_lab)
     before = (begun * away).sum(-1).mean(1) / sine.square()
-    per_px = distance * sine / seen.radius_px  # mm per px at the sphere
-    sigma = seen.outline_rms_px * per_px
-    outer = rays.direction_lab[:, :, None] * rays.direction_lab[:, None, :]
-    view = torch.eye(3, dtype=outer.dtype)
-    sigma_along = distance * seen.outline_rms_px / seen.radius_px
+    along = (distance - before)[:, None]
+    edge = limb.origin_lab_mm + along[:, None] * limb.direction_lab
+    right, down = ((edge[:, k] - edge[:, k + 1]) / 2 for k in (0, 2))
+    mm_px = torch.stack([right, down, -distance[:, None] * rays.direction_lab], -1) / seen.radius_px[:, None, None]
+    unit = torch.eye(3).double()
+    px_mm = torch.linalg.inv(torch.where(seen.placed[:, None, None], mm_px, unit))  # (u, v, radius) by position
+    covariance = torch.where(torch.isfinite(seen.covariance_px2), seen.covariance_px2, unit)
     return _View(
         rays=rays,
-        from_size_mm=rays.origin_lab_mm + (distance - before)[:, None] * rays.direction_lab,
-        across=(view - outer) / sigma[:, None, None].square(),
-        along=outer / sigma_along[:, None, None].square(),
+        from_size_mm=rays.origin_lab_mm + along * rays.direction_lab,
+        across=px_mm[:, :2].mT @ torch.linalg.inv(covariance[:, :2, :2]) @ px_mm[:, :2],
+        whole=px_mm.mT @ torch.linalg.inv(covariance) @ px_mm,
     )
 
 

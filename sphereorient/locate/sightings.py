@@ -27,11 +27,13 @@ class Sightings:
     radius_px: Tensor  # (N,) float64
     outline_rms_px: Tensor  # (N,) float64, distance of edges from the circle, NaN if not measured in the frame
     coverage: Tensor  # (N,) float64, share of directions with an edge
+    covariance_px2: Tensor  # (N, 3, 3) float64, of (u, v, radius), NaN if not measured in the frame
     flags: Tensor  # (N,) int64, POSITION_INTERPOLATED and POSITION_OUTLIER_REPLACED
     reason: tuple[Reason, ...]  # N; Reason.OK if measured
 
     def __post_init__(self) -> None:
-        lengths = {len(part) for part in (self.centre_px, self.radius_px, self.outline_rms_px, self.coverage)}
+        parts = (self.centre_px, self.radius_px, self.outline_rms_px, self.coverage, self.covariance_px2)
+        lengths = {len(part) for part in parts}
         if lengths | {len(self.flags), len(self.reason)} != {len(self.reason)}:
             got = f"parts of {sorted(lengths)}, {len(self.flags)} flags, {len(self.reason)} reasons"
             raise ShapeError(refusal("Sightings", expected="one row a frame", got=got, do="pass equal lengths"))
@@ -107,11 +109,13 @@ def sightings_of(found: Iterable[Found]) -> Sightings:
     names = ("u_px", "v_px", "radius_px", "rms_px", "coverage")
     values = [[getattr(outline, name, torch.nan) for name in names] for outline, _ in rows]
     table = torch.tensor(values, dtype=torch.float64).reshape(-1, len(names))
+    spread = [np.full((3, 3), np.nan) if outline is None else outline.spread for outline, _ in rows]
     return Sightings(
         centre_px=table[:, :2],
         radius_px=table[:, 2],
         outline_rms_px=table[:, 3],
         coverage=table[:, 4],
+        covariance_px2=torch.tensor(np.array(spread).reshape(-1, 3, 3)) * table[:, 3, None, None].square(),
         flags=torch.zeros(len(rows), dtype=torch.int64),
         reason=tuple(reason for _, reason in rows),
     )
@@ -124,13 +128,13 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
     """
     track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
     flags = sightings.flags.clone()
-    rms = sightings.outline_rms_px.clone()
+    rms, covariance = sightings.outline_rms_px.clone(), sightings.covariance_px2.clone()
     for stretch in known_stretches(np.isfinite(track[:, 2]), settings.gap_frames_max):
         known = stretch[np.isfinite(track[stretch, 2])]
         spline, outlier = robust_spline(known, track[known], settings)
         track[known[outlier]] = spline[outlier]
         flags[known[outlier]] |= int(Flag.POSITION_OUTLIER_REPLACED)
-        rms[known[outlier]] = torch.nan
+        rms[known[outlier]] = covariance[known[outlier]] = torch.nan
         missing = np.setdiff1d(stretch, known)
         if len(missing):
             track[missing] = PchipInterpolator(known, track[known], axis=0)(missing)
@@ -144,6 +148,7 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
         centre_px=torch.from_numpy(track[:, :2].copy()),
         radius_px=torch.from_numpy(track[:, 2].copy()),
         outline_rms_px=rms,
+        covariance_px2=covariance,
         flags=flags,
         reason=reason,
     )

@@ -108,6 +108,7 @@ def sightings(
         radius_px=column(radius_px),
         outline_rms_px=column(rms_px),
         coverage=column(0.9),
+        covariance_px2=column(rms_px)[:, None, None].square() * torch.eye(3).double(),
         flags=torch.as_tensor(flags, dtype=torch.int64).expand(len(lost)).clone(),
         reason=tuple(Reason.NOT_FOUND if gone else Reason.OK for gone in lost.tolist()),
     )

@@ -143,13 +143,16 @@ def test_no_frames_are_no_rows():
     assert seen.placed.shape == (0,)
 
 
-@pytest.mark.parametrize("part", ["centre_px", "radius_px", "outline_rms_px", "coverage", "flags", "reason"])
+@pytest.mark.parametrize(
+    "part", ["centre_px", "radius_px", "outline_rms_px", "coverage", "covariance_px2", "flags", "reason"]
+)
 def test_sightings_of_unequal_lengths_are_refused(part):
     parts = {
         "centre_px": torch.zeros(3, 2, dtype=torch.float64),
         "radius_px": torch.zeros(3, dtype=torch.float64),
         "outline_rms_px": torch.zeros(3, dtype=torch.float64),
         "coverage": torch.zeros(3, dtype=torch.float64),
+        "covariance_px2": torch.zeros(3, 3, 3, dtype=torch.float64),
         "flags": torch.zeros(3, dtype=torch.int64),
         "reason": (Reason.OK,) * 3,
     }

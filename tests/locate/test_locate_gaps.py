@@ -48,6 +48,7 @@ def test_outliers_are_replaced_and_flagged(by):
     assert (fixed.flags[wrong] == REPLACED).all()
     assert ((fixed.centre_px - path(noise_px=0.0)).norm(dim=1)[wrong] < 0.6).all()
     assert fixed.outline_rms_px[wrong].isnan().all()
+    assert fixed.covariance_px2[wrong].isnan().all()
     assert all(fixed.reason[k] is Reason.OUTLINE for k in wrong)
 
 
@@ -62,13 +63,13 @@ def test_an_outlier_of_the_radius_is_one():
 def test_measured_values_stay_to_the_last_bit():
     wrong, lost = [30, 70], [50, 51]
     seen = sightings(without(with_outliers(path(), *wrong), *lost), radius_px=39 + 0.1 * torch.rand(N).double())
-    before = [part.clone() for part in (seen.centre_px, seen.radius_px, seen.outline_rms_px, seen.flags)]
+    before = [part.clone() for part in (seen.centre_px, seen.radius_px, seen.covariance_px2, seen.flags)]
     fixed = fill_gaps(seen, SETTINGS)
     kept = [k for k in range(N) if k not in wrong + lost]
-    for name in ("centre_px", "radius_px", "outline_rms_px", "coverage", "flags"):
+    for name in ("centre_px", "radius_px", "outline_rms_px", "coverage", "covariance_px2", "flags"):
         assert torch.equal(getattr(fixed, name)[kept], getattr(seen, name)[kept]), name
     assert [fixed.reason[k] for k in kept] == [Reason.OK] * len(kept)
-    after = [seen.centre_px, seen.radius_px, seen.outline_rms_px, seen.flags]
+    after = [seen.centre_px, seen.radius_px, seen.covariance_px2, seen.flags]
     for old, new in zip(before, after, strict=True):  # the input is not written into
         torch.testing.assert_close(new, old, rtol=0, atol=0, equal_nan=True)
 

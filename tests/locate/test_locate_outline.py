@@ -146,6 +146,46 @@ def test_a_disk_that_the_border_cuts_is_measured_by_what_is_left(place, paint):
     assert 0.45 < outline.coverage < 0.7
 
 
+def test_the_spread_of_half_a_rim_is_that_of_its_geometry():
+    """By hand: over half a rim cos^2 is 1/2 and cos 2/pi in the mean, so that u and radius are told apart badly; the
+    gap of half a direction at either end is within the tolerance.
+    """
+    det = 0.5 - (2 / np.pi) ** 2
+    expected = [[1 / det, 0, -2 / np.pi / det], [0, 2, 0], [-2 / np.pi / det, 0, 0.5 / det]]
+    half = outline_of(filmed(plant(half_gone, *PLACES[0])), *PLACES[0])
+    np.testing.assert_allclose(half.spread, expected, rtol=0.1, atol=1e-6)
+    whole = outline_of(filmed(plant(white, *PLACES[0])), *PLACES[0])
+    np.testing.assert_allclose(whole.spread, np.diag([1, 1, 0.5]), atol=1e-6)
+
+
+@pytest.mark.parametrize("paint", [white, blobs])
+@pytest.mark.parametrize("u", [-14.0, -7.0, 0.0, 12.0])
+def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_says(u, paint):
+    outline = outline_of(filmed(plant(paint, u, 80.0)), u, 80.0, LocateSettings(coverage_min=0.2))
+    error = np.array([outline.u_px - u, outline.v_px - 80.0, outline.radius_px - DIAMETER / 2])
+    scale = max(outline.rms_px, 0.2)  # the known error of the radius is no scatter
+    assert error @ np.linalg.inv(outline.spread) @ error < 3 * (3 * scale) ** 2
+    sigma = np.sqrt(np.diag(outline.spread))
+    assert sigma[0] > 1.5 * sigma[1]  # along the border it is known well
+
+
+def wrinkled(depth, share):
+    """A rim with nine waves, which shows in a share of its directions."""
+
+    def paint(x, y):
+        angle = np.arctan2(y, x)
+        inside = np.hypot(x, y) < 1 - depth * (1 + np.sin(9 * angle))
+        return np.where(inside & (np.abs(angle) < share * np.pi), WHITE, BACK).astype(np.float32)
+
+    return paint
+
+
+@pytest.mark.parametrize(("depth", "share", "counts"), [(0.025, 1, True), (0.025, 0.5, False), (0.005, 0.5, True)])
+def test_edges_that_scatter_are_a_rim_only_if_they_are_all_around(depth, share, counts):
+    outline = outline_of(filmed(plant(wrinkled(depth, share), *PLACES[1])), *PLACES[1])
+    assert (outline is not None) == counts
+
+
 def test_the_borders_of_the_picture_are_no_rim():
     """A picture that is bright all over has edges nowhere."""
     frame = filmed(np.full(SHAPE, WHITE, np.float32))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from conftest import assert_close
@@ -188,6 +190,29 @@ def test_the_covariance_of_one_camera_is_that_of_many_noisy_trials(camera, rng):
     seen = {"cam1": sightings(noisy(camera.project(place), sigma_px, rng), radius + noise, sigma_px)}
     found = find_positions(seen, {"cam1": camera}, DIAMETER_MM)
     agree(found.position_lab_mm, found.covariance_mm2.mean(0))
+
+
+@pytest.mark.parametrize("camera", [looking_along_y(), tilted()])
+def test_a_radius_that_is_wrong_with_its_centre_moves_the_place_as_the_covariance_says(camera, rng):
+    """Half a rim: centre and radius are told apart badly, and their errors go together."""
+    covariance = 0.04 * torch.tensor([[10.5, 0.0, -6.7], [0.0, 2.0, 0.0], [-6.7, 0.0, 5.3]], dtype=torch.float64)
+    place = PLACES[1].expand(2000, 3)
+    error = torch.randn(2000, 3, dtype=torch.float64, generator=rng) @ torch.linalg.cholesky(covariance).mT
+    seen = sightings(camera.project(place) + error[:, :2], exact_radius_px(camera, place) + error[:, 2])
+    seen = replace(seen, covariance_px2=covariance.expand(2000, 3, 3))
+    found = find_positions({"cam1": seen}, {"cam1": camera}, DIAMETER_MM)
+    agree(found.position_lab_mm, found.covariance_mm2.mean(0))
+
+
+def test_of_two_cameras_the_surer_one_counts_more():
+    """By hand: both see lab x, 9 mm on 39 px; with sigmas of 0.1 and 0.3 px the weights are 9 to 1."""
+    cameras = {"cam1": looking_along_y(), "cam2": looking_down()}
+    middle = torch.tensor([[324.5, 324.5]], dtype=torch.float64)
+    off = middle + torch.tensor([10.0, 0.0])
+    seen = {"cam1": sightings(middle, 39.0, 0.1), "cam2": sightings(off, 39.0, 0.3)}
+    found = find_positions(seen, cameras, DIAMETER_MM)
+    expected = torch.tensor([[10 * 9 / 39 / 10, 0.0, 0.0]], dtype=torch.float64)
+    assert_close(found.position_lab_mm, expected, atol=0.005)
 
 
 def noisy(centre_px: Tensor, sigma_px: float, rng: torch.Generator) -> Tensor:
