@@ -52,6 +52,7 @@ NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses
 TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
 ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
+LOOK_ALIKE = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
 ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the sphere
 
 BLUR_ROUNDS = 4
@@ -182,8 +183,8 @@ def estimate_appearance(
         looked = [poses for of_camera in each for poses in of_camera]
         _check_cameras(fitter, each)
         seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in proven(of_camera)]
-        if not seen:
-            raise _nothing(looked)
+        if not seen or not rows:
+            raise _nothing(found)
         X, R, _ = best_poses([each[camera][frame] for frame, camera in seen])
         use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in seen]), len(each)).bool()
         shown = [pictures[frame] for frame, _ in seen]
@@ -207,9 +208,8 @@ def estimate_appearance(
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, highest = _scores(looked)
     if best < highest + NO_BETTER and _times_better(looked) < TELLING:
-        do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
         got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
-        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
+        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
     worn, paint = None, base
     if settings.learn_paint:
         fitter, fit, worn = _without_worn(fitter, pixels, fit, use)
@@ -531,9 +531,9 @@ def _times_better(found: Sequence[Poses]) -> float:
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
     """Return the error of a movie without the sphere, or without a pose that fits."""
     reasons = {str(why) for poses in found for why in poses.reason}
-    got = f"none ({', '.join(sorted(reasons))})"
+    got = f"none in {len(found)} frames looked at ({', '.join(sorted(reasons - {Reason.OK}))})"
     if Reason.LOW_SCORE in reasons or any(len(poses) for poses in found):
-        expected, do = "frames that the map explains", "check sphere.texture, and the cameras: are they swapped?"
+        expected, do = "frames that the map explains", LOOK_ALIKE
     else:
         expected, do = "the sphere in some frame", "check sphere.diameter and the cameras, or set locate.diameter_px"
     return ExperimentError(refusal("movies", expected=expected, got=got, do=do))
