@@ -197,7 +197,6 @@ def estimate_appearance(
     pixels = whole.thinned(thin)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
-    _check_light(fitter)
     blur_px = fitter.optics.blur_px
     if settings.blur_px is None and abs(blur_px / first.fitter.optics.blur_px - 1) > BLUR_FAR_OFF:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
@@ -205,6 +204,7 @@ def estimate_appearance(
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
             settings = settings.model_copy(update={"blur_px": blur_px})
             return estimate_appearance(matched, frames, base, settings, following, among)
+    _check_light(fitter)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, highest = _scores(looked)
     if best < highest + NO_BETTER and _times_better(looked) < TELLING:

@@ -281,8 +281,10 @@ def fit_flags(
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
     least = torch.where(use, excess, torch.inf).amin(-1).numpy()
     outvoted = (missed > 0) & (missed >= count)
-    doubtful = (best < learnt.poor_score) | (least > EXCESS) | learnt.in_doubt | outvoted
     one = (count == 1) & (use.shape[-1] > 1)
+    # No other camera stands by what one alone says, perhaps by a part of a disk: that must fit as right poses do.
+    poor = best < np.where(one, learnt.usual_score, learnt.poor_score)
+    doubtful = poor | (least > EXCESS) | learnt.in_doubt | outvoted
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: np.full(len(use), learnt.second_ball)}
     flags: NDArray[np.uint32] = np.sum(
         [where * np.uint32(flag) for flag, where in bits.items()], axis=0, dtype=np.uint32
