@@ -198,13 +198,13 @@ def estimate_appearance(
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
     blur_px = fitter.optics.blur_px
-    if settings.blur_px is None and abs(blur_px / first.fitter.optics.blur_px - 1) > BLUR_FAR_OFF:
+    far_off = settings.blur_px is None and abs(blur_px / first.fitter.optics.blur_px - 1) > BLUR_FAR_OFF
+    if far_off and _darkest_white(fitter) is None:  # else the motion while the shutter is open is taken for blur
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         matched = replace(first, fitter=replace(first.fitter, optics=Optics(base, blur_px, diameter_px)))
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
             settings = settings.model_copy(update={"blur_px": blur_px})
             return estimate_appearance(matched, frames, base, settings, following, among)
-    _check_light(fitter)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, highest = _scores(looked)
     if best < highest + NO_BETTER and _times_better(looked) < TELLING:
@@ -227,6 +227,9 @@ def estimate_appearance(
             fitter, fit, pixels, use = open_, there, smeared, known
         else:  # sharper than the exposure allows: it is not that of these pictures
             moved, sharper = None, more > MORE_LEFT
+    if (inverted := _darkest_white(fitter)) is not None:
+        got, do = f"white paint darker than black in {inverted}", "exchange black and white of the map"
+        raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
     fitter, fit, rivals = fitter.lit_in_the_lab(pixels, fit, use, preferred=among is not None)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
@@ -339,13 +342,10 @@ def _limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     return found
 
 
-def _check_light(fitter: Fitter) -> None:
-    """Raise ExperimentError where what the map calls white is darker than what it calls black."""
+def _darkest_white(fitter: Fitter) -> str | None:
+    """Return the camera that shows what the map calls white darkest, if it is darker than what it calls black."""
     contrast = fitter.light.tables.cells[:, 0].reshape(len(fitter.views), -1).mean(1)
-    if bool((contrast < 0).any()):
-        got = f"white paint darker than black in {fitter.views[int(contrast.argmin())].name}"
-        do = "exchange black and white of the map"
-        raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
+    return fitter.views[int(contrast.argmin())].name if bool((contrast < 0).any()) else None
 
 
 def _with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use: Tensor) -> list[CameraView]:
