@@ -216,7 +216,7 @@ def estimate_appearance(
         if worn is not None:  # the blur, too, was found with it
             given, paint = settings.blur_px is not None, without(base, worn)
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
-    blurred, moved, sharper = fitter.optics, None, False
+    blurred, moved, sharper, of_still = fitter.optics, None, False, float(fit.score[use].median())
     if following is not None and looked is found:
         open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, rows, following, others)
     if moved is not None:
@@ -251,7 +251,9 @@ def estimate_appearance(
         views = _with_least_merit(first, [frames[k] for k in rows], torch.stack([found[k].use for k in rows]))
     fitter, still = (replace(one, views=views, widest_px=widest, limb_px=limb_px) for one in (fitter, still))
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
-    score_min = 0.5 * (right + min(highest, right))
+    # Where the motion smears the paint, a pose without it explains less.
+    least = right if moved is None else min(right, of_still)
+    score_min = 0.5 * (least + min(highest, least))
     if defocus_radii(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
         score_min = min(score_min, _clear_of(right))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
