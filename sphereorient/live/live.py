@@ -103,7 +103,7 @@ def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: Li
 
 
 def _flags(poses: Poses, learnt: Appearance) -> int:
-    X, seen = poses.position_lab_mm[:1], zip(learnt.fitter.views, poses.reason, strict=True)
-    disks = ((view, [why], view.camera.project(X), view.radius_px(X, learnt.fitter.radius_mm)) for view, why in seen)
-    missed = sum(missed_by(*one) for one in disks if one[1] != [Reason.OK])
+    X, radius_mm = poses.position_lab_mm[:1], learnt.fitter.radius_mm
+    unseen = ((view, why) for view, why in zip(learnt.fitter.views, poses.reason, strict=True) if why is not Reason.OK)
+    missed = sum(missed_by(view, [why], view.camera.project(X), view.radius_px(X, radius_mm)) for view, why in unseen)
     return int(fit_flags(learnt, poses.use[None], poses.score[:1], poses.excess[:1], np.asarray(missed))[0])

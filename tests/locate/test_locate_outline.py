@@ -147,8 +147,8 @@ def test_a_disk_that_the_border_cuts_is_measured_by_what_is_left(place, paint):
 
 
 def test_the_spread_of_half_a_rim_is_that_of_its_geometry():
-    """By hand: over half a rim cos^2 is 1/2 and cos 2/pi in the mean, so that u and radius are told apart badly; the
-    gap of half a direction at either end is within the tolerance.
+    """By hand: over half a rim the mean of cos^2 is 1/2, that of cos 2/pi; so the errors of u and radius correlate.
+    The tolerance holds half a direction that is missing at either end.
     """
     det = 0.5 - (2 / np.pi) ** 2
     expected = [[1 / det, 0, -2 / np.pi / det], [0, 2, 0], [-2 / np.pi / det, 0, 0.5 / det]]

@@ -194,7 +194,7 @@ def test_the_covariance_of_one_camera_is_that_of_many_noisy_trials(camera, rng):
 
 @pytest.mark.parametrize("camera", [looking_along_y(), tilted()])
 def test_a_radius_that_is_wrong_with_its_centre_moves_the_place_as_the_covariance_says(camera, rng):
-    """Half a rim: centre and radius are told apart badly, and their errors go together."""
+    """Of half a rim the errors of centre and radius correlate."""
     covariance = 0.04 * torch.tensor([[10.5, 0.0, -6.7], [0.0, 2.0, 0.0], [-6.7, 0.0, 5.3]], dtype=torch.float64)
     place = PLACES[1].expand(2000, 3)
     error = torch.randn(2000, 3, dtype=torch.float64, generator=rng) @ torch.linalg.cholesky(covariance).mT
