@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,11 @@ class Chunk:
     time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
     turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
+
+    @property
+    def frames(self) -> range:
+        """The frames of the chunk."""
+        return range(self.first, self.last)
 
     def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> Expected | None:
         """Extrapolate position and rotation, to second order where three frames are known."""
@@ -105,3 +111,14 @@ class Chunk:
         """Forget all poses: what comes is another motion."""
         self.past.clear()
         self.turns.clear()
+
+
+def regained(seen: Sequence[bool]) -> bool:
+    """Return whether a ball is seen in a frame after one in which it is not."""
+    return any(now and not before for before, now in pairwise(seen))
+
+
+def mirrored(spans: Sequence[range], time_s: Sequence[float]) -> list[Chunk]:
+    """Return the chunks of some frames for the same motion from the last frame to the first: frame n is -n there."""
+    back_s = {-k: -time_s[k] for span in spans for k in span}
+    return [Chunk(1 - span.stop, 1 - span.start, back_s) for span in spans]

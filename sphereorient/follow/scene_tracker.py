@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
-from sphereorient.follow.chunk import MOVE_SHARE, Chunk, Expected, Floats
+from sphereorient.follow.chunk import MOVE_SHARE, Chunk, Expected, Floats, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import Ahead, SceneStart
@@ -75,10 +75,10 @@ class SceneTracker:
         Where it does not arrive at the pose from which it was lost, two balls may have been taken for one: then a frame
         between them stays without a pose.
         """
-        spans = [span for span in spans if any(_regained(name, span, found) for name in self.balls)]
-        # The same motion, from the last frame to the first.
-        mirrored = {-k: -time_s[k] for span in spans for k in span}
-        chunks = {name: [Chunk(1 - span.stop, 1 - span.start, mirrored) for span in spans] for name in self.balls}
+        spans = [
+            span for span in spans if any(regained([supported(found[k][name]) for k in span]) for name in self.balls)
+        ]
+        chunks = {name: mirrored(spans, time_s) for name in self.balls}
         lost: dict[tuple[str, int], Poses] = {}  # what was found at first, where that has changed
         for k in range(max(map(len, spans), default=0)):
             now = [n for n, span in enumerate(spans) if k < len(span)]
@@ -253,12 +253,6 @@ def _weights(time_s: Floats, at_s: float) -> Tensor:
     share = (at_s - time_s[None]) / apart
     np.fill_diagonal(share, 1.0)
     return torch.from_numpy(share.prod(1))
-
-
-def _regained(name: str, span: range, found: Mapping[int, Mapping[str, Poses]]) -> bool:
-    """Return whether a ball is found in a frame of a chunk after one in which it is not."""
-    seen = [supported(found[k][name]) for k in span]
-    return any(now and not before for before, now in pairwise(seen))
 
 
 def _same(one: Poses, other: Poses, tracker: ChunkTracker) -> bool:

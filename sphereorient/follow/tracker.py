@@ -1,6 +1,8 @@
 """Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import accumulate, combinations, pairwise
@@ -13,14 +15,14 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.chunk import Chunk, Expected
+from sphereorient.follow.chunk import Chunk, Expected, mirrored, regained
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
 from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import DisksPx, Fitter, Picture, Shown, Steps
+from sphereorient.pose.fitter import SIZES, DisksPx, Fitter, Picture, Shown, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.settle import settled
 from sphereorient.pose.start import NearStart
@@ -61,6 +63,7 @@ class ChunkTracker:
         self.settings = settings
         self.exposure_s = exposure_s
         self.centre = centre
+        self._of_size: dict[int, ChunkTracker] = {}
 
     def batches(self, frames: range) -> list[list[int]]:
         """Return the lengths of the chunks of each batch; chunks begin at multiples of `chunk_frames`."""
@@ -81,7 +84,27 @@ class ChunkTracker:
             for chunk, poses, turn in zip(now, here, self.turns(now, here), strict=True):
                 chunk.saw(chunk.first + k, poses, turn)
                 found[chunk.first + k] = poses
+        self._follow_back(shots, [chunk.frames for chunk in chunks], time_s, found)
         yield from (found[k] for k in range(sum(batch)))
+
+    def _follow_back(
+        self, shots: Sequence[Sequence[Frame]], spans: Sequence[range], time_s: Sequence[float], found: dict[int, Poses]
+    ) -> None:
+        """Follow the sphere back from where it was found to where it came into view, and put its poses into `found`."""
+        spans = [span for span in spans if regained([supported(found[k]) for k in span])]
+        chunks = mirrored(spans, time_s)
+        for k in range(max(map(len, spans), default=0)):
+            now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
+            frames = {chunk.first: -(chunk.first + k) for chunk in now}
+            lost = [chunk for chunk in now if not supported(found[frames[chunk.first]])]
+            ahead = {frames[chunk.first]: self.ahead(chunk, chunk.first + k) for chunk in lost}
+            known = {frame: expected for frame, expected in ahead.items() if expected is not None}
+            followed = self.follow(list(known.values()), [[movie[frame] for movie in shots] for frame in known])
+            pairs = zip(known, followed, strict=True)
+            found |= {frame: self.stated(poses) for frame, poses in pairs if poses is not None}
+            here = [found[frames[chunk.first]] for chunk in now]
+            for chunk, poses, turn in zip(now, here, self.turns(now, here), strict=True):
+                chunk.saw(chunk.first + k, poses, turn)
 
     def turns(self, chunks: Sequence[Chunk], found: Sequence[Poses]) -> Floats:
         """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
@@ -177,11 +200,11 @@ class ChunkTracker:
                 fit = fitted(X, R, use, disks_px).where(changed, fit)
                 good = torch.where(changed, supported(fit, use), good)
         first = good
-        within = disks_px.largest_px <= self.fitter.widest_px  # others are searched for, frame by frame
+        beyond = disks_px.largest_px > self.fitter.widest_px  # these have more pixels: see `_wider`
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: dict[int, FittedPoses] = {}
         for some in by_decreasing_size(range(use.shape[1])):
-            if bool((good | ~within).all()):
+            if bool((good | beyond).all()):
                 break
             # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
             # one size, which disagree, the one nearer to the prediction counts.
@@ -228,8 +251,19 @@ class ChunkTracker:
             [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
             for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
         ]
-        good = good & within
-        return [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
+        found = [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
+        for n in torch.nonzero(beyond[:asked])[:, 0].tolist():
+            (found[n],) = self._wider(float(disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
+        return found
+
+    def _wider(self, radius_px: float) -> "ChunkTracker":
+        """Return a tracker of single frames for a disk that is larger than those the movie was studied on."""
+        steps = math.ceil(math.log(radius_px / self.fitter.widest_px) / math.log(SIZES))
+        if steps not in self._of_size:
+            wider = self._of_size[steps] = copy(self)
+            wider.fitter = replace(self.fitter, widest_px=self.fitter.widest_px * SIZES**steps)
+            wider.settings, wider._of_size = self.settings.model_copy(update={"chunks": 1}), {}
+        return self._of_size[steps]
 
     def _poor(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Return which poses (B,) leave much more of a picture in use than right ones usually do."""

@@ -12,7 +12,7 @@ from refine_examples import f64
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.follow.chunk import Chunk
+from sphereorient.follow.chunk import Chunk, mirrored, regained
 from sphereorient.follow.follower import cameras_disagree
 from sphereorient.follow.initialise import by_decreasing_size
 from sphereorient.follow.poses import Poses, no_pose
@@ -103,6 +103,27 @@ def test_a_late_time_stamp_does_not_bend_the_motion(late):
 
 def test_after_a_frame_without_the_ball_nothing_is_expected():
     assert lane([0, 1], 0.0).expected(3, RADIUS_MM) is None
+
+
+@pytest.mark.parametrize("change", [0.0, 0.01])
+def test_a_ball_is_followed_back_to_where_it_came_into_view(change):
+    (back,) = mirrored([range(len(TIMES))], TIMES)
+    for frame in (3, 2, 1):
+        now = seen(TIMES[frame], change)
+        before = back.past[-1][1].R_lab_body[0] if back.past else now.R_lab_body[0]
+        back.saw(-frame, now, so3.log(now.R_lab_body[0] @ before.mT).numpy())
+    ahead = back.expected(0, RADIUS_MM)
+    assert ahead is not None
+    assert_close(torch.from_numpy(ahead.position_lab_mm), place(TIMES[0], change), atol=1e-9)
+    R = so3.exp(torch.from_numpy(ahead.turn)) @ torch.from_numpy(ahead.R_before)
+    assert_close(R, seen(TIMES[0], change).R_lab_body[0], atol=1e-9)
+
+
+def test_only_a_ball_that_comes_into_view_is_followed_back():
+    assert regained([False, True, True])
+    assert regained([True, False, True])
+    assert not regained([True, True, False])
+    assert not regained([False, False])
 
 
 def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and_by_more_than_their_errors():

@@ -1,0 +1,63 @@
+"""A ball that comes into view, and one that comes nearer than it was in the frames that were studied."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from run_examples import EXCERPT, SHORT
+
+from sphereorient import so3
+from sphereorient.follow.poses import no_pose
+from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.methods.method import Learnt
+from sphereorient.methods.settings import load_settings
+from sphereorient.run import MemoryStore, Request, run
+from sphereorient.trajectory import Reason
+
+SETTINGS = load_settings(None, [*SHORT[1:], "refine.chunk_frames=16"])
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    """The track of the excerpt, and the file of what was learnt."""
+    path = tmp_path_factory.mktemp("known") / "learnt.h5"
+    return run(Request(experiment=EXCERPT, settings=SETTINGS, save_learnt=path), MemoryStore()), path
+
+
+def assert_same_poses(track, other):
+    assert track.valid.all()
+    turn = so3.geodesic_distance(*(torch.from_numpy(one.orientation) for one in (track, other)))
+    assert float(turn.max()) < np.radians(0.02)
+    assert np.abs(track.position - other.position).max() < 0.005
+
+
+@pytest.mark.slow
+def test_frames_before_the_first_one_that_a_search_finds_are_followed_back(known, monkeypatch):
+    right, path = known
+    searches = []
+    found = ChunkTracker.searched
+
+    def searched(self, shots):
+        searches.append(shots)
+        # Nothing is found in the first frames of the chunks, which go side by side.
+        here = found(self, shots)
+        return no_pose(len(shots), [Reason.NOT_FOUND] * len(shots)) if len(searches) < 8 else here
+
+    monkeypatch.setattr(ChunkTracker, "searched", searched)
+    track = run(Request(experiment=EXCERPT, settings=SETTINGS, learnt=path), MemoryStore())
+    assert len(searches) >= 8
+    assert_same_poses(track, right)
+
+
+@pytest.mark.slow
+def test_a_disk_may_be_larger_than_those_that_were_studied(known):
+    right, path = known
+    learnt = Learnt.load(path)
+    track = run(
+        Request(experiment=EXCERPT, settings=SETTINGS, learnt=replace(learnt, widest_px=0.9 * learnt.widest_px)),
+        MemoryStore(),
+    )
+    assert_same_poses(track, right)
