@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sphereorient.trajectory.walk import Walk
 
 SCHEMA = "sphereorient-track/1"
+SCHEMA_MINOR = 1  # `score` of the precise method: evidence for the painted ball
 SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME each, see tracks.py
 SPHERES = "spheres"
 TEXTS = ("method", "settings", "experiment")
@@ -223,7 +224,7 @@ class Trajectory:
 
     def write(self, group: h5py.Group) -> None:
         """Write into an empty group: a file, or the group of one sphere of several."""
-        group.attrs["schema"] = SCHEMA
+        group.attrs["schema"], group.attrs["schema_minor"] = SCHEMA, SCHEMA_MINOR
         group.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
         for name in (*TEXTS, "frame_rate", "length_unit"):
             group.attrs[name] = getattr(self, name)
