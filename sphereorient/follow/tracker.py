@@ -31,6 +31,7 @@ from sphereorient.trajectory import Reason
 Floats = NDArray[np.float64]
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
+MORE_THAN_USUAL = 0.5  # of what a doubtful fit leaves: it may have stopped early, and is done once more
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
@@ -267,7 +268,7 @@ class ChunkTracker:
 
     def _poor(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Return which poses (B,) leave much more of a picture in use than right ones usually do."""
-        return ((fit.score < self.usual_score) & use).any(1)
+        return ((1.0 - fit.score > MORE_THAN_USUAL * (1.0 - self.usual_score)) & use).any(1)
 
     def _approached(
         self,
