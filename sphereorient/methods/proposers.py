@@ -21,7 +21,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.fitter import defocus_radii
 from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateBank
-from sphereorient.search.settings import ProposeSettings
+from sphereorient.search.settings import GreySearchSettings, ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable
 
 NEAR_RADII = 8.0  # of a ball that is farther, the bank's perspective errs by less than half a step of its grid
@@ -66,12 +66,9 @@ class BlurMatchedSearch:
     """
 
     def __init__(self, texture: Tensor, settings: Settings, diameters_px: Sequence[tuple[Camera, float]]) -> None:
-        camera, self.diameter_px = max(diameters_px, key=lambda pair: pair[1])
-        if settings.search.distance_radii is None:
-            near = _distance_radii(camera, self.diameter_px)
-            search = settings.search.model_copy(update={"distance_radii": near})
-            settings = settings.model_copy(update={"search": search})
-        self._texture, self._settings = texture, settings
+        self.diameter_px = max(diameter_px for _, diameter_px in diameters_px)
+        search = as_near(settings.search, diameters_px)
+        self._texture, self._settings = texture, settings.model_copy(update={"search": search})
         self._made: dict[float, Proposer] = {}
 
     def of(self, blur_px: float) -> Proposer:
@@ -89,6 +86,16 @@ class BlurMatchedSearch:
 def sizes_of(views: Sequence[CameraView]) -> list[tuple[Camera, float]]:
     """Return the cameras of views, each with the expected diameter of the sphere, px."""
     return [(view.camera, view.diameter_px) for view in views]
+
+
+def as_near(settings: GreySearchSettings, diameters_px: Sequence[tuple[Camera, float]]) -> GreySearchSettings:
+    """Return settings of a search whose bank shows what a camera as near as the nearest of these sees of the sphere,
+    each with the sphere's expected diameter, px; a given distance stays.
+    """
+    if settings.distance_radii is not None:
+        return settings
+    near = _distance_radii(*max(diameters_px, key=lambda pair: pair[1]))
+    return settings.model_copy(update={"distance_radii": near})
 
 
 def _distance_radii(camera: Camera, diameter_px: float) -> float | None:

@@ -180,7 +180,8 @@ def precise_track(
     )
     track = measured_track(experiment, clock, table, chosen.choice, learnt)
     flags = chosen.flags | torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
-    flags = flags | torch.where(smoothed.rejected, int(Flag.DOUBTFUL_FIT), 0)  # what all other frames say is far from it
+    # What all other frames say is far from it.
+    flags = flags | torch.where(smoothed.rejected, int(Flag.DOUBTFUL_FIT), 0)
     noticed = ((learnt.second_ball, TWO_BALLS), (learnt.sharper, SHARPER))
     told: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
     if learnt.worn is not None:
@@ -199,14 +200,14 @@ def precise_track(
         segment=chosen.segment.numpy(),
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
-        confidence=torch.where(_alone(chosen.segment), torch.nan, chosen.probability).numpy(),
+        confidence=np.where(_alone(chosen.segment.numpy()), np.nan, chosen.probability.numpy()),
     )
 
 
-def _alone(segment: Tensor) -> Tensor:
-    """Return which frames (N,) bool are the only ones of their segment: no other one confirms their pose."""
-    _, which, count = segment.unique(return_inverse=True, return_counts=True)
-    return (count[which] == 1) & (segment >= 0)
+def _alone(segment: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which frames (N,) are the only ones of their segment: no other one confirms their pose."""
+    number, count = np.unique(segment[segment >= 0], return_counts=True)
+    return np.isin(segment, number[count == 1])
 
 
 def map_track(

@@ -11,6 +11,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
+from sphereorient.methods.proposers import as_near
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import agreement, cameras, movies, texture_map
 from sphereorient.preflight.finding import FAULT, OK, Finding, Severity, judged, warning, worst
@@ -77,8 +78,9 @@ def preflight(
         ]
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
-        search = image is not None and pool.submit(GreySearch, image, settings.search)
         samples = tuple(one.result() for one in sampling)
+        near = as_near(settings.search, [(sample.camera, sample.diameter_px) for sample in samples])
+        search = image is not None and pool.submit(GreySearch, image, near)
         progress("frames", len(samples), len(samples))
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
