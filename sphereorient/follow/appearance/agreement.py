@@ -1,0 +1,215 @@
+"""Whether the cameras see one sphere at one position, and which views of it are studied."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.calibration.consistency import Seen, compare_cameras, limits_of, majority
+from sphereorient.cameras import centre_lab_mm, triangulate
+from sphereorient.errors import ExperimentError, refusal
+from sphereorient.follow.appearance.presence import nothing, proven
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses, best_poses, pose_table
+from sphereorient.locate import Frame
+from sphereorient.pose.fit import FittedPoses
+from sphereorient.pose.fitter import Fitter, Picture, widest_px
+from sphereorient.trajectory import Reason
+
+TRIED = 6  # frames
+APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one
+APART_PX = 0.4  # a larger distance of lines of sight: estimate light from each camera alone
+FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
+FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
+TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees the sphere elsewhere than the other
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ProvenPoses:
+    """The B poses that are studied, and whether the cameras agree; made by `agreeing_poses`."""
+
+    found: Sequence[Poses]  # of all frames: of all cameras together, or of each alone, one camera after the other
+    frame: list[int]  # of each of the B poses
+    poses: tuple[Tensor, Tensor, Tensor]  # positions (B, 3), lab, mm, rotations (B, 3, 3) and use (B, C)
+    camera: list[int] | None = None  # of each of the B poses, where each camera is studied alone
+    together: bool = True  # whether the cameras see the sphere at one position
+
+    def majority(self, fitter: Fitter, fit: FittedPoses) -> tuple[int, ...]:
+        """Return the cameras that agree where these are more than half of more than two; `fit`: of the B poses."""
+        if self.together or self.camera is None or len(fitter.views) < 3:
+            return ()
+        parts = []
+        for part in (fit.position_lab_mm, fit.R_lab_body, fit.covariance[:, :3, :3]):
+            whole = part.new_full((max(self.frame) + 1, len(fitter.views), *part.shape[1:]), torch.nan)
+            whole[torch.tensor(self.frame), torch.tensor(self.camera)] = part
+            parts.append(whole)
+        X, R, covariance = parts
+        seen = _seen_alone(fitter, X, R)
+        return majority(seen, limits_of(seen, covariance))
+
+
+def proven_poses(found: Sequence[Poses]) -> ProvenPoses:
+    """Return the proven poses of all cameras together.
+
+    Raises:
+        ExperimentError: no pose is proven.
+    """
+    rows = proven(found)
+    if not rows:
+        raise nothing(found)
+    return ProvenPoses(found=found, frame=rows, poses=best_poses([found[k] for k in rows]))
+
+
+def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]) -> ProvenPoses:
+    """Return the proven poses of n frames: of all cameras together, or of each alone where they disagree, since a pose
+    between those of disagreeing cameras would give a wrong light.
+
+    Raises:
+        ExperimentError: no pose is proven, or cameras contradict each other so that nothing can be measured.
+    """
+    fitter = search.fitter
+    if len(fitter.views) == 1 and not proven(found):
+        raise nothing(found)
+    gain, gap_px = _apart(fitter, [[shot.picture for shot in frame] for frame in frames], found)
+    if gain <= APART_GAIN and gap_px <= APART_PX:
+        return proven_poses(found)
+    alone = [replace(search, fitter=fitter.of(k)) for k in range(len(fitter.views))]
+    each = [one.all_poses([[frame[k]] for frame in frames]) for k, one in enumerate(alone)]
+    _check_cameras(fitter, each)
+    seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in proven(of_camera)]
+    if not seen or not proven(found):
+        raise nothing(found)
+    frame, camera = (list(one) for one in zip(*seen, strict=True))
+    X, R, _ = best_poses([each[c][k] for k, c in seen])
+    use = torch.nn.functional.one_hot(torch.tensor(camera), len(each)).bool()
+    return ProvenPoses(
+        found=[poses for of_camera in each for poses in of_camera],
+        frame=frame,
+        poses=(X, R, use),
+        camera=camera,
+        together=gain <= APART_GAIN and gap_px <= FAR_APART_PX,
+    )
+
+
+def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
+    """Raise ExperimentError if the cameras contradict each other in a way that nothing can be measured, and no majority
+    agrees; `alone`: poses by camera and frame.
+    """
+    parts = []
+    for of_camera in alone:
+        clear = torch.tensor([0 if k in proven(of_camera) else -1 for k in range(len(of_camera))])
+        best = pose_table([of_camera], 1).rows(clear)
+        parts.append((best["position_lab_mm"], best["R_lab_body"], best["covariance"][:, :3, :3]))
+    X, R, covariance = (torch.stack(part, 1) for part in zip(*parts, strict=True))
+    seen = _seen_alone(fitter, X, R)
+    limits = limits_of(seen, covariance)
+    found = compare_cameras(seen, limits)
+    if found.deadly and not (len(alone) > 2 and majority(seen, limits)):
+        expected = "cameras that agree"
+        raise ExperimentError(refusal("movies", expected=expected, got=str(found), do=found.advice))
+
+
+def _seen_alone(fitter: Fitter, position_lab_mm: Tensor, R_lab_body: Tensor) -> Seen:
+    """Return poses (N, C, 3), (N, C, 3, 3) of each camera alone as what they say of the pictures."""
+    views = list(enumerate(fitter.views))
+    return Seen(
+        cameras={view.name: view.camera for view in fitter.views},
+        centre_px=torch.stack([view.camera.project(position_lab_mm[:, k]) for k, view in views], 1),
+        radius_px=torch.stack([view.radius_px(position_lab_mm[:, k], fitter.radius_mm) for k, view in views], 1),
+        R_lab_body=R_lab_body,
+        diameter_mm=2 * fitter.radius_mm,
+    )
+
+
+def usual_apart_rad(fit: FittedPoses, use: Tensor) -> float:
+    """Return the median angle between the rotations of two cameras that see the sphere together; inf without any."""
+    angles = [
+        (fit.own_turn[:, k] - fit.own_turn[:, m]).norm(dim=-1)[use[:, k] & use[:, m]]
+        for k, m in combinations(range(use.shape[1]), 2)
+    ]
+    both = torch.cat([torch.zeros(0, dtype=torch.float64), *angles])
+    return float(both.median()) if len(both) >= FEWEST_BOTH else math.inf
+
+
+def limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
+    """Return by how much the limb lies outside of where all cameras together place it, (C,), px: the median of B poses.
+    A wrong diameter, glare, or glass that the cameras' model lacks. 0 where fewer than `FEWEST_BOTH` poses tell.
+    """
+    found = torch.zeros(len(fitter.views), dtype=torch.float64)
+    for k, view in enumerate(fitter.views):
+        told = use[:, k] & (use.sum(1) > 1)
+        to_centre = fit.position_lab_mm - centre_lab_mm(view.camera)
+        nearer = -(fit.own_move[:, k] * to_centre).sum(-1) / to_centre.square().sum(-1)
+        if int(told.sum()) >= FEWEST_BOTH:
+            found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[told].median()
+    return found
+
+
+def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
+    """Measure on a few frames whether the cameras see one sphere at one position.
+    Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
+    and the distance between the lines of sight, px. The first is 1 where the cameras differ by less than `APART_PX` in
+    lines of sight, rotation and size, px of the picture: alone, each camera fits what its model lacks as well.
+    Rotations that differ by less than their own errors do not count: a small disk shows little.
+    """
+    cameras = len(fitter.views)
+    sure = proven(found)
+    if not sure:  # wrong cameras spoil every pose of all pictures
+        return math.inf, math.inf
+    whole = [k for k in sure if bool(found[k].use.all())]
+    if len(whole) < sum(_torn(fitter, found[k]) for k in sure):
+        return math.inf, math.inf  # outlines that miss each other already
+    if cameras == 1 or not whole:
+        return 1.0, 0.0
+    whole = [k for k in whole if _in_view(fitter, found[k].position_lab_mm[:1])] or whole
+    tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
+    gains, rays, alone, covariance_rad2 = [], [], [], []
+    for camera, view in enumerate(fitter.views):
+        only = torch.zeros(len(tried), cameras, dtype=torch.bool)
+        only[:, camera] = True
+        X, R, _ = best_poses([found[k] for k in tried])
+        steps = ((fitter.optics.middle, 3, 3), (fitter.optics.fine, 4, 3))
+        fit = fitter.fit_through(steps, [pictures[k] for k in tried], X, R, only)
+        X, R = fit.position_lab_mm, fit.R_lab_body
+        joint = torch.cat([found[k].score[:1, camera] for k in tried])
+        gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
+        rays.append(view.camera.rays(view.camera.project(X)))
+        alone.append((view.camera, X, R))
+        covariance_rad2.append(so3.trace(fit.covariance[:, :3, :3]))
+    gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
+    radius_px = widest_px(fitter.views) / 2
+    gap_px = gap_mm * (radius_px / fitter.radius_mm)
+    others_px = []
+    for k, m in combinations(range(cameras), 2):
+        turn = so3.geodesic_distance(alone[k][2], alone[m][2])
+        told = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
+        others_px.append(turn * told * radius_px)
+    for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
+        centre = centre_lab_mm(one_camera)
+        sight = torch.nn.functional.normalize(X - centre, dim=-1)
+        # The other camera knows the distance by its line of sight; this one by the size of its picture.
+        others_px.append((((Y - X) * sight).sum(-1) / (X - centre).norm(dim=-1)).abs() * radius_px)
+    differ_px = float(torch.stack([gap_px, *others_px]).amax(0).quantile(0.75))
+    gain = float(torch.stack(gains).amax(0).quantile(0.75)) if differ_px > APART_PX else 1.0
+    return gain, float(gap_px.quantile(0.75))
+
+
+def _torn(fitter: Fitter, poses: Poses) -> bool:
+    """Return whether a camera that should show the whole sphere at the best pose sees it elsewhere, or nothing."""
+    X = poses.position_lab_mm[:1]
+    return any(
+        why in TORN and bool(view.shows_whole(view.camera.project(X), view.radius_px(X, fitter.radius_mm)).all())
+        for view, why in zip(fitter.views, poses.reason, strict=True)
+    )
+
+
+def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
+    """Return whether all cameras show the whole disk of a sphere at a position (1, 3), mm."""
+    X, radius_mm = position_lab_mm, fitter.radius_mm
+    return all(
+        bool(view.shows_whole(view.camera.project(X), view.radius_px(X, radius_mm)).all()) for view in fitter.views
+    )

@@ -1,0 +1,137 @@
+"""What is known of a movie's pictures before it is tracked: presence, agreement, light, blur, worn paint, exposure."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+from sphereorient.errors import ExperimentError
+from sphereorient.follow.appearance.agreement import agreeing_poses, limb_px, proven_poses, usual_apart_rad
+from sphereorient.follow.appearance.exposure import with_motion
+from sphereorient.follow.appearance.light import (
+    check_white,
+    darkest_white,
+    light_and_blur,
+    lit_in_the_lab,
+    without_occluders,
+)
+from sphereorient.follow.appearance.presence import (
+    NO_BETTER,
+    explained,
+    find_poses,
+    for_blur,
+    proven,
+    second_ball,
+    with_least_merit,
+)
+from sphereorient.follow.appearance.record import Among, Appearance, Following, Studied, clear_of
+from sphereorient.follow.appearance.worn import without_worn
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.settings import RefineSettings
+from sphereorient.locate import Frame
+from sphereorient.pose.fitter import CameraView, Fitter, Optics, defocus_radii, widest_px
+from sphereorient.pose.lasting import lasting_errors
+from sphereorient.sphere.texture_table import TextureTable
+
+BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
+WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
+
+
+def estimate_appearance(
+    first: Initialiser,
+    frames: Sequence[Sequence[Frame]],
+    base: TextureTable,
+    settings: RefineSettings,
+    following: Following | None = None,
+    among: Among | None = None,
+) -> Appearance:
+    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
+    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
+    the motion while the shutter is open counts as blur. `among`: of several balls, with poses that are known; then
+    cameras that see another ball do not disagree, and one light in the lab counts where it explains about as much.
+
+    Raises:
+        ExperimentError: no frame has a pose, or none is better than wrong poses.
+    """
+    search = for_blur(first)
+    if among is None:
+        search, found = find_poses(search, frames)
+        sample = agreeing_poses(search, frames, found)
+    else:
+        found = list(among.found)
+        sample = proven_poses(found)
+    fitter, given = search.fitter, settings.blur_px is not None
+    others = None if among is None else among.neighbours.of(sample.frame)
+    pictures = [[shot.picture for shot in frames[k]] for k in sample.frame]
+    whole = fitter.pixels(pictures, sample.poses[0], fitter.optics.fine, neighbours=others)
+    studied = light_and_blur(Studied.begun(fitter, base, whole, sample.poses), given=given)
+    if not given and (matched := _matched(search, studied)) is not None:
+        # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
+        with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
+            known = settings.model_copy(update={"blur_px": matched.fitter.optics.blur_px})
+            return estimate_appearance(matched, frames, base, known, following, among)
+    # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
+    best, wrong = explained(sample.found)
+    worn = None
+    if settings.learn_paint:
+        studied, worn = without_worn(studied)
+        if worn is not None:  # the blur, too, was found with it
+            studied = light_and_blur(studied, given=given)
+    still, sharper = studied, False
+    if following is not None and sample.camera is None:
+        studied, sharper = with_motion(studied, search, sample.frame, following, others)
+    check_white(studied.fitter)
+    moves = studied is not still
+    studied, rivals = lit_in_the_lab(studied, preferred=among is not None)
+    studied = without_occluders(studied)
+    score_min = _score_min(studied, still.right_score if moves else studied.right_score, best, wrong)
+    sure = [frames[k] for k in proven(found)] if among is None else []
+    with_merit = bool(sure) and sample.camera is None
+    views = with_least_merit(search, sure, sample.poses[2]) if with_merit else studied.fitter.views
+    fitter, fit, use = _as_followed(studied, views), studied.fit, studied.use
+    # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
+    lasting = lasting_errors(studied.pixels, fit, use, fitter.model(fitter.optics.fine))
+    return Appearance(
+        fitter=fitter,
+        still=replace(fitter, optics=still.fitter.optics, instants=1) if moves else fitter,
+        lasting=lasting if rivals is None else lasting.widened(*rivals),
+        score_min=score_min,
+        right_score=studied.right_score,
+        usual_apart_rad=usual_apart_rad(fit, use),
+        together=sample.together,
+        majority=sample.majority(fitter, fit),
+        sharper=sharper,
+        second_ball=second_ball(search, sure, len(frames)),
+        worn=worn,
+    )
+
+
+def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
+    """Return a search with the blur that was found where the first guess is far from it; None where it is not, or the
+    motion while the shutter is open is taken for blur.
+    """
+    fitter, blur_px = search.fitter, studied.fitter.optics.blur_px
+    if abs(blur_px / fitter.optics.blur_px - 1) <= BLUR_FAR_OFF or darkest_white(studied.fitter) is not None:
+        return None
+    optics = Optics(studied.paint, blur_px, widest_px(fitter.views))
+    return replace(search, fitter=replace(fitter, optics=optics))
+
+
+def _as_followed(studied: Studied, views: Sequence[CameraView]) -> Fitter:
+    """Return the fitter of frames that are followed, with the largest disk and the place of the limb."""
+    fitter = studied.fitter
+    widest = WIDER * float(fitter.largest_px(studied.fit.position_lab_mm).max())
+    return replace(fitter, views=views, widest_px=widest, limb_px=limb_px(fitter, studied.fit, studied.use))
+
+
+def _score_min(studied: Studied, still: float, best: float, wrong: float) -> float:
+    """Return the score between wrong and right poses. `still`: the typical one without the motion in the exposure, with
+    which frames are searched; `best` and `wrong`: what the map explained before the light was known.
+    """
+    right = studied.right_score
+    if right < wrong + NO_BETTER:
+        # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
+        wrong = right - (best - wrong)
+    least = min(right, still)
+    score_min = 0.5 * (least + min(wrong, least))
+    soft = defocus_radii(studied.fitter.optics.blur_px, widest_px(studied.fitter.views)) > 0
+    return min(score_min, clear_of(right)) if soft else score_min  # there wrong poses explain nearly as much

@@ -1,0 +1,99 @@
+"""How far the ball moves while the shutter is open, and the instants of it that are rendered."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.follow.appearance.agreement import TRIED
+from sphereorient.follow.appearance.light import light_and_blur
+from sphereorient.follow.appearance.record import CLEAR, Following, Studied
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import best_poses
+from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, widest_px
+from sphereorient.pose.neighbours import Neighbours
+
+LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
+MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured
+MORE_LEFT = 0.05  # of the variance: by as much more is left where the exposure is certainly another one
+APART_BLURS, MOST_INSTANTS = 3.0, 8  # between neighbouring instants of the exposure, and of these
+
+
+def with_motion(
+    studied: Studied, search: Initialiser, rows: Sequence[int], following: Following, others: Neighbours | None
+) -> tuple[Studied, bool]:
+    """Render the motion of B poses, those of frames `rows`, while the shutter is open, with the blur that is left,
+    where that explains more; return also whether the pictures are sharper than this motion allows.
+    """
+    open_, moved = _exposed(studied, search, rows, following, others)
+    if moved is None:
+        return studied, False
+    known = studied.use & moved.isfinite().all(1)[:, None]
+    whole, pixels = (open_.exposed(part, moved.nan_to_num()) for part in (studied.whole, studied.pixels))
+    opened = light_and_blur(replace(studied, fitter=open_, whole=whole, pixels=pixels, use=known), given=False)
+    more = opened.fitter.left(pixels, opened.fit, known) - studied.fitter.left(studied.pixels, studied.fit, known)
+    return (opened, False) if more < 0 else (studied, more > MORE_LEFT)
+
+
+def _exposed(
+    studied: Studied, search: Initialiser, rows: Sequence[int], following: Following, others: Neighbours | None
+) -> tuple[Fitter, Tensor | None]:
+    """Return a fitter that renders as many instants of the exposure as B poses need, with the blur that is left of the
+    paint, and their turn and move (B, 6) while the shutter is open, NaN where it is not known; None, and the same
+    fitter, where it hardly blurs the pictures. `others`: of the B poses, about where they are in the frames beside.
+    """
+    fitter, fit, use = studied.fitter, studied.fit, studied.use
+    search = replace(search, fitter=fitter)
+
+    def measured(some: Tensor) -> Tensor:
+        shots = following.shots([rows[k] for k in some.tolist()])
+        usable = torch.tensor([[shot.usable for shot in frame] for frame in shots])
+        before, seen = fit.of(some), use[some]
+        share = following.open_share[[rows[k] for k in some.tolist()]]
+
+        def from_poses(these: Tensor, X: Tensor, R: Tensor) -> Tensor:
+            pictures = [[shot.picture for shot in shots[k]] for k in these.tolist()]
+            known, shown, was = seen[these], usable[these], before.of(these)
+            beside = None if others is None else others.of(some[these])
+            there = fitter.fit_through(fitter.optics.steps, pictures, X, R, known & shown, neighbours=beside)
+            right = ((1 - there.score <= CLEAR * (1 - was.score)) | ~known).all(1) & (shown | ~known).all(1)
+            turn = so3.log(there.R_lab_body @ was.R_lab_body.mT)
+            way = torch.cat([turn, there.position_lab_mm - was.position_lab_mm], dim=-1)
+            return torch.where(right[:, None], share[these, None] * way, torch.nan)
+
+        way = from_poses(torch.arange(len(some)), before.position_lab_mm, before.R_lab_body)
+        # Of a ball that turns far between frames the next pose has to be searched for.
+        lost = [k for k in torch.nonzero(way.isnan().any(1))[:, 0].tolist() if others is None and bool(usable[k].all())]
+        found = dict(zip(lost, search.all_poses([shots[k] for k in lost]), strict=True))
+        again = torch.tensor([k for k in lost if len(found[k])], dtype=torch.int64)
+        if len(again):
+            X, R, _ = best_poses([found[k] for k in again.tolist()])
+            way[again] = from_poses(again, X, R)
+        return way
+
+    def smear_px(some: Tensor, moved: Tensor) -> Tensor:
+        return (
+            torch.stack([view.smear_px(fit.position_lab_mm[some], moved, fitter.radius_mm) for view in fitter.views])
+            .square()
+            .mean(0)
+            .sqrt()
+        )
+
+    tried = torch.linspace(0, len(rows) - 1, min(TRIED, len(rows))).round().long()
+    width_px = smear_px(tried, measured(tried))
+    blur_px = fitter.optics.blur_px
+    if not float(width_px.square().nanmean() / 12) > LITTLE_MOTION * blur_px**2:
+        return fitter, None
+    every = torch.arange(len(rows))
+    moved = measured(every)
+    width_px = smear_px(every, moved)
+    if float(width_px.isfinite().double().mean()) < MOST_KNOWN:
+        return fitter, None
+    # What is left of the blur once the motion is taken out sets how far apart instants may be.
+    left_px = math.sqrt(max(blur_px**2 - float(width_px.square().nanmean()) / 12, FINEST_PX**2))
+    instants = 1 + math.ceil(float(width_px.nanquantile(0.9)) / (APART_BLURS * left_px))
+    optics = Optics(studied.paint, left_px, widest_px(fitter.views))
+    return replace(fitter, optics=optics, instants=min(max(2, instants), MOST_INSTANTS)), moved

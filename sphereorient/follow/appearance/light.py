@@ -1,0 +1,67 @@
+"""Blur and light of the pictures, together: light estimated with a wrong blur favours that blur."""
+
+from dataclasses import replace
+
+from sphereorient.errors import ExperimentError, refusal
+from sphereorient.follow.appearance.record import Studied
+from sphereorient.pose.blur import FINER, FINEST, best_blur_px
+from sphereorient.pose.fitter import Fitter, Optics, Rivals, defocus_radii, widest_px
+from sphereorient.pose.occluders import USUALLY_HIDDEN
+
+BLUR_ROUNDS = 4
+BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
+
+
+def light_and_blur(studied: Studied, *, given: bool) -> Studied:
+    """Estimate light, then blur unless it is `given`, then light again, until the blur stays.
+    Where the first guess of the blur is far off, one round is not enough.
+    """
+    diameter_px = widest_px(studied.fitter.views)
+    studied = studied.lit()
+    soft = defocus_radii(studied.fitter.optics.blur_px, diameter_px) > 0  # there each round moves it by little
+    for done in range(1 if given else BLUR_ROUNDS):
+        before_px = studied.fitter.optics.blur_px
+        if not given:
+            fitter, fits = studied.fitter, (studied.pixels, studied.fit, studied.use)
+            blur_px = best_blur_px(fitter, studied.paint, *fits, FINEST if done else FINER)
+            studied = replace(studied, fitter=replace(fitter, optics=Optics(studied.paint, blur_px, diameter_px)))
+        studied = studied.lit()
+        if not soft and abs(studied.fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
+            break
+    return studied
+
+
+def darkest_white(fitter: Fitter) -> str | None:
+    """Return the camera that shows what the map calls white darkest, if it is darker than what it calls black."""
+    contrast = fitter.light.tables.cells[:, 0].reshape(len(fitter.views), -1).mean(1)
+    return fitter.views[int(contrast.argmin())].name if bool((contrast < 0).any()) else None
+
+
+def check_white(fitter: Fitter) -> None:
+    """Raise ExperimentError where a camera shows what the map calls white darker than what it calls black."""
+    if (inverted := darkest_white(fitter)) is not None:
+        got, do = f"white paint darker than black in {inverted}", "exchange black and white of the map"
+        raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
+
+
+def lit_in_the_lab(studied: Studied, *, preferred: bool) -> tuple[Studied, Rivals]:
+    """Let light be a function of directions in the lab where that explains more, or, if `preferred`, about as much;
+    return also the fits of two models that explain as much as each other.
+    """
+    fitter, fit, rivals = studied.fitter.lit_in_the_lab(studied.pixels, studied.fit, studied.use, preferred=preferred)
+    return replace(studied, fitter=fitter, fit=fit), rivals
+
+
+def without_occluders(studied: Studied) -> Studied:
+    """Estimate light and poses without what covers the ball, or let the fitter look for nothing that does where most of
+    the ball is hidden in most pictures.
+    """
+    fitter, fit, use = studied.fitter, studied.fit, studied.use
+    free = studied.thinned(fitter.unoccluded(studied.whole, fit.position_lab_mm, fit.R_lab_body))
+    hidden = 1.0 - free.inside.sum(-1) / studied.pixels.inside.sum(-1).clamp_min(1)
+    if float(hidden[use.flatten()].median()) > USUALLY_HIDDEN:
+        return replace(studied, fitter=replace(fitter, most_hidden=0.0))
+    if not bool(hidden.any()):
+        return studied
+    fitter = fitter.lit_again(free, fit, use)
+    return replace(studied, fitter=fitter, fit=fitter.again(free, fit, use))

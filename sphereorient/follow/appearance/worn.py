@@ -1,0 +1,59 @@
+"""Paint that differs from the map: found where the pictures say so in both halves of the movie, and not used."""
+
+from dataclasses import replace
+from itertools import permutations
+
+import torch
+from torch import Tensor
+
+from sphereorient.follow.appearance.record import Studied
+from sphereorient.pose.fit import FittedPoses
+from sphereorient.pose.fitter import FEWEST_LIT, Fitter, Optics, some_of, widest_px
+from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.worn import CHANGED, without, worn_cells, worn_share
+
+# By how much paint differs that is not used, round by round: while poses are wrong, so do the borders of right paint.
+WORN_ROUNDS = (0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2, CHANGED, CHANGED)
+FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.1 to 2.7; of a warped map 4.2
+# By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
+# 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
+WORN_GAIN = 1.2
+WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which it is not looked for
+WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
+
+
+def without_worn(studied: Studied) -> tuple[Studied, Tensor | None]:
+    """Do not use paint that differs from the map; return also where that is, None: nowhere.
+    Found in one half of the movie, it must leave less in the other half: what differs there, too, turns with the ball.
+    """
+    fitter, pixels, fit, use = studied.fitter, studied.pixels, studied.fit, studied.use
+    if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
+        return studied, None
+    # Of a ball that turns little glints take the place of worn paint.
+    bare = fitter.with_light_of(pixels, fit, use, glints=False)
+    if worn_share(worn_cells(pixels, fit, use, bare.model(bare.optics.fine))) < WORN_SEEN:
+        return studied, None
+
+    def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor | None]:
+        now, worn = bare, None
+        for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
+            worn = worn_cells(pixels, fit, use, now.model(now.optics.fine), changed)
+            paint = without(fitter.optics.fine.paint, worn)  # blurred already
+            optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
+            now = replace(now, optics=optics).with_light_of(pixels, fit, use, glints=False)
+            fit = now.again(pixels, fit, use)
+        return now, fit, worn
+
+    every, middle = torch.arange(len(use)), len(use) // 2
+    halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
+    gain = [
+        bare.with_light_of(*half, glints=False).left(*held) - found(*half)[0].left(*held)
+        for half, held in permutations(halves, 2)
+    ]
+    if sum(gain) / 2 < WORN_GAIN:
+        return studied, None
+    lit, fitted, worn = found(pixels, fit, use)
+    wrong = float(fitted.excess[use].median()) > FITS  # the paint that is left is not the map's either
+    if wrong or worn is None or worn_share(worn) < WORN_LEAST:
+        return studied, None
+    return replace(studied, fitter=lit, fit=fitted, paint=without(studied.paint, worn)), worn
