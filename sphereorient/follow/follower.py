@@ -24,7 +24,7 @@ from sphereorient.locate.outline import Outline
 from sphereorient.pose import CameraView
 from sphereorient.trajectory import Reason
 
-MOST = 8  # times the frames that are wanted: looked at
+MOST, KEPT = 8, 2  # times the frames that are wanted: looked at, and kept
 SHOWN = 0.75  # of the frames that are wanted, in which each camera is to show the ball
 FEWEST = 4  # frames that show it
 DECODING = 2  # threads in which parts of pictures are decoded
@@ -192,8 +192,8 @@ def frames_showing(
     """Return frames of all cameras that show the ball, spread over the movies, and their places among the frames in
     use. `disks` finds it in the C pictures of a frame. `count` frames are looked at, and more, up to `MOST` times as
     many, until each camera shows it in `SHOWN` of that count. Of these as many are returned as hold the pictures of
-    `count` frames of all cameras, those that most cameras show, evenly spread. Where hardly a frame shows it, the first
-    `count` are returned.
+    `KEPT` times `count` frames of all cameras, those that most cameras show, evenly spread. Where hardly a frame shows
+    it, the first `count` are returned.
     """
     frames, places = sample_frames(recording, views, count)
     looked, total, times = list(places), len(recording.timeline), 1
@@ -204,11 +204,11 @@ def frames_showing(
     seen = dict(zip(places, zip(frames, shown(frames), strict=True), strict=True))
     while times < MOST and np.sum([by for _, by in seen.values()], axis=0).min() < SHOWN * count:
         times *= 2
-        more = sorted(set(spread_frames(range(total), times * (count - 1) + 1)) - set(looked))
+        more = sorted(set(spread_frames(range(total), times * count)) - set(looked))
         looked += more
         new = frames_at(recording, views, more)
         seen |= {k: (shots, by) for k, shots, by in zip(more, new, shown(new), strict=True) if by.any()}
-    kept, room = [], count * len(views)
+    kept, room = [], KEPT * count * len(views)
     for cameras in range(len(views), 0, -1):
         alike = sorted(k for k, (_, by) in seen.items() if by.sum() == cameras)
         kept += [alike[k] for k in spread_frames(range(len(alike)), room // cameras)]
