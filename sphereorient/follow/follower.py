@@ -191,8 +191,9 @@ def frames_showing(
 ) -> tuple[list[tuple[Frame, ...]], list[int]]:
     """Return frames of all cameras that show the ball, spread over the movies, and their places among the frames in
     use. `disks` finds it in the C pictures of a frame. `count` frames are looked at, and more, up to `MOST` times as
-    many, until each camera shows it in `SHOWN` of that count; of these at most `KEPT` times as many are returned, those
-    that most cameras show. Where hardly a frame shows it, the first `count` are returned.
+    many, until each camera shows it in `SHOWN` of that count. Of these as many are returned as hold the pictures of
+    `KEPT` times `count` frames of all cameras, those that most cameras show, evenly spread. Where hardly a frame shows
+    it, the first `count` are returned.
     """
     frames, places = sample_frames(recording, views, count)
     looked, total, times = list(places), len(recording.timeline), 1
@@ -207,7 +208,11 @@ def frames_showing(
         looked += more
         new = frames_at(recording, views, more)
         seen |= {k: (shots, by) for k, shots, by in zip(more, new, shown(new), strict=True) if by.any()}
-    kept = sorted((k for k, (_, by) in seen.items() if by.any()), key=lambda k: -seen[k][1].sum())[: KEPT * count]
+    kept, room = [], KEPT * count * len(views)
+    for cameras in range(len(views), 0, -1):
+        alike = sorted(k for k, (_, by) in seen.items() if by.sum() == cameras)
+        kept += [alike[k] for k in spread_frames(range(len(alike)), room // cameras)]
+        room -= cameras * min(len(alike), room // cameras)
     if len(kept) < FEWEST:
         return frames, places
     return [seen[k][0] for k in sorted(kept)], sorted(kept)

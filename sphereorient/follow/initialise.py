@@ -10,13 +10,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
-from sphereorient.locate import Found, Frame, LocateSettings, Positions, find_ball, find_positions, sightings_of
+from sphereorient.locate import Found, Frame, LocateSettings, Positions, ball_at, find_positions, sightings_of
 from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
@@ -49,8 +48,8 @@ class Initialiser:
     candidates: int  # proposals of each camera that are fitted
     score_min: float = 0.0  # where no picture is explained this well, other outlines are tried
     finalists: int = 2  # poses that are fitted to all detail
-    # What was found in pictures looked at before, whatever the fitter; None: none of them is looked at again.
-    known: dict[Hashable, tuple[Picture, Any]] | None = None
+    # What was found in pictures looked at before, by id, whatever the fitter; None: none of them is looked at again.
+    known: dict[tuple[int, Hashable], tuple[Picture, Any]] | None = None
 
     def all_poses(self, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
         """Find the poses of n frames of C pictures; see `poses`."""
@@ -60,37 +59,47 @@ class Initialiser:
     def poses(self, shots: Sequence[Frame]) -> Poses:
         """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
-        explained well, outlines nearer to the usual size are tried, and the texture locates the disk.
+        explained well, outlines nearer to the usual size are tried, and the texture locates the disk. Where neither an
+        outline nor the texture is found, there is no ball.
         """
+        if self.known is None:
+            return replace(self, known={}).poses(shots)
         shots = [self._looked_at(shot, view) for shot, view in zip(shots, self.fitter.views, strict=True)]
         if not any(shot.usable for shot in shots):
             return no_pose(len(shots), [shot.reason for shot in shots])
         poses = self._with_outlines(shots, self.locating)
+        if _best_score(poses) >= self.score_min:
+            return poses
+        textured = self._found(shots, self.relocalise)
+        if not any(outline for outline, _ in [*textured, *self._found(shots, self.outline)]):
+            return poses
         for tolerance in NARROWER:
-            if _best_score(poses) >= self.score_min:
-                break
             tolerance = min(tolerance, self.locating.diameter_tolerance)
             narrower = self.locating.model_copy(update={"diameter_tolerance": tolerance})
             poses = max(poses, self._with_outlines(shots, narrower), key=_best_score)
-        if _best_score(poses) < self.score_min:
-            poses = max(poses, self._search(shots, self._found(shots, self.relocalise)), key=_best_score)
-        return poses
+            if _best_score(poses) >= self.score_min:
+                return poses
+        return max(poses, self._search(shots, textured), key=_best_score)
 
     def _looked_at(self, shot: Frame, view: CameraView) -> Frame:
         """Return a frame that is not used further where it shows no blob like the sphere's."""
-        if not shot.usable or view.merit_min == 0.0 or self.merit(shot.picture, view) >= view.merit_min:
+        if not shot.usable or view.merit_min == 0.0 or self._blobs(shot.picture, view):
             return shot
         return Frame(shown=shot.shown, read=Reason.NOT_FOUND)
 
     def merit(self, picture: Picture, view: CameraView) -> float:
         """Return the merit of the best blob of a picture, 0 without one."""
-        _, blobs = self._blobs(picture, view)
-        return blobs[0].merit if blobs else 0.0
+        return max((blob.merit for blob in self._blobs(picture, view)), default=0.0)
 
-    def _blobs(self, picture: Picture, view: CameraView) -> tuple[NDArray[np.float32], list[Blob]]:
-        """Return by how much a picture differs from the empty scene, and its blobs of the sphere's size."""
-        difference = view.background.difference(picture)
-        return difference, find_blobs(difference, view.background.noise, view.diameter_px, self.locating)
+    def _blobs(self, picture: Picture, view: CameraView) -> list[Blob]:
+        """Return the blobs of a picture that may be the sphere, best first."""
+        scene, size = view.background, view.diameter_px
+
+        def find() -> list[Blob]:
+            return find_blobs(scene.difference(picture), scene.noise, size, self.locating)
+
+        blobs: list[Blob] = self._once(picture, ("blobs", view.name, size), find)
+        return [blob for blob in blobs if blob.merit >= view.merit_min]
 
     def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
         found = self._found(shots, replace(self, locating=locating).outline)
@@ -111,8 +120,8 @@ class Initialiser:
     def outline(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of the sphere in a camera's picture, or None and the reason; see `find_ball`."""
         key = ("outline", view.name, view.diameter_px, self.locating)
-        there = view.background, view.diameter_px, self.locating
-        found: Found = self._once(picture, key, lambda: find_ball(picture, *there))
+        there = picture, view.background, view.diameter_px, self.locating
+        found: Found = self._once(picture, key, lambda: ball_at(self._blobs(picture, view), *there))
         return found
 
     def disks(self, shots: Sequence[Frame]) -> list[Outline | None]:
@@ -127,18 +136,18 @@ class Initialiser:
 
     def _relocalised(self, picture: Picture, view: CameraView) -> Found:
         proposer = self.proposers[view.name]
-        _, blobs = self._blobs(picture, view)
-        if not blobs:
+        places, radius = [(blob.u_px, blob.v_px) for blob in self._blobs(picture, view)], view.diameter_px / 2
+        if not places:
             return None, Reason.NOT_FOUND
-        radius = view.diameter_px / 2
         steps = [STEP * radius * k for k in range(-REACH, REACH + 1)]
-        places = [(blobs[0].u_px + right, blobs[0].v_px + down) for down in steps for right in steps]
-        disks = torch.stack([torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places])
-        best = int(proposer.likeness(disks).argmax())
-        if not len(proposer.propose(disks[best : best + 1]).score):
-            return None, Reason.LOW_SCORE
-        u, v = places[best]
-        return Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0), Reason.OK
+        for around in ([0.0], steps):  # the likeliest blob, then the likeliest place about it
+            places = [(u + right, v + down) for u, v in places for down in around for right in around]
+            disks = [torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places]
+            places = [places[int(proposer.likeness(torch.stack(disks)).argmax())]]
+        ((u, v),) = places
+        disk = Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0)
+        R, _ = self._proposed(self.fitter.views.index(view), picture, disk)
+        return (disk, Reason.OK) if len(R) else (None, Reason.LOW_SCORE)
 
     def claimants(self, shots: Sequence[Frame]) -> int:
         """Return how many disks wear the texture map about equally well, in the camera that shows most of them."""
@@ -146,12 +155,13 @@ class Initialiser:
         return max((self._claimants(shot.picture, view) for view, shot in pairs if shot.usable), default=0)
 
     def _claimants(self, picture: Picture, view: CameraView) -> int:
-        (difference, blobs), scene, settings = self._blobs(picture, view), view.background, self.locating
+        blobs, scene, settings = self._blobs(picture, view), view.background, self.locating
         blobs = _distinct_places(
             [blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit], view.diameter_px / 2
         )
         if len(blobs) < 2:
             return 1
+        difference = scene.difference(picture)
         fits = (
             fit_outline(difference, scene.typical_noise, blob, view.diameter_px, settings, scene.shown)
             for blob in blobs
@@ -207,11 +217,14 @@ class Initialiser:
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
-        keys = [(self.fitter.views[k].name, outline) for k, _, outline in seen]
-        # One by one: sums depend on how many are added.
-        looks = [self._once(one[1], key, partial(self.proposals, [one])) for one, key in zip(seen, keys, strict=True)]
         none = torch.zeros(0, 3, 3, dtype=torch.float64)
-        return self.fitted(shots, found, torch.cat([none, *(R for ((R, _),) in looks)]))
+        return self.fitted(shots, found, torch.cat([none, *(self._proposed(*one)[0] for one in seen)]))
+
+    def _proposed(self, k: int, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor]:
+        """Return the proposals of one disk of camera `k`, alone: sums depend on how many are added."""
+        key, look = (self.fitter.views[k].name, disk), partial(self.proposals, [(k, picture, disk)])
+        ((R, score),) = self._once(picture, key, look)
+        return R, score
 
     def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""

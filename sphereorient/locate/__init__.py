@@ -13,4 +13,13 @@ from sphereorient.locate.scene import (
     learn_background,
 )
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.locate.sightings import Found, Sightings, check_seen, fill_gaps, find_ball, sightings_of, size_of
+from sphereorient.locate.sightings import (
+    Found,
+    Sightings,
+    ball_at,
+    check_seen,
+    fill_gaps,
+    find_ball,
+    sightings_of,
+    size_of,
+)

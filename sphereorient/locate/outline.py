@@ -18,6 +18,7 @@ NEAR_HIDDEN_PX = 3  # edges this near to the mask do not belong to the rim
 PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
+THIN = 0.6  # of the least coverage: support of a circle below which it has no rim. Balls: 1.2 or more; blades: 0.4
 ROUGH = 2 / 3  # of the tolerance: largest rms of a circle; of the coverage of this where edges are not all around
 PROFILES = 180  # radial profiles; more sample the same pixels again
 ALL_AROUND = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -378,6 +379,9 @@ def fit_outline(
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
     circle, painted = _ball_circle(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px)
     if circle is None:
+        return None
+    least = THIN * settings.coverage_min * _rim_in_the_clear(circle, clear)
+    if float(support(circle[None], edges, settings.edge_tolerance_px)[0]) < least:
         return None
     fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
     if fit is None or not sizes[0] < fit.radius_px < sizes[1]:

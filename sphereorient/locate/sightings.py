@@ -1,6 +1,6 @@
 """The sphere in a frame, and along time: outliers are replaced by a spline, short gaps interpolated."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.locate.background import Background
-from sphereorient.locate.outline import Outline, find_blobs, fit_outline
+from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.trajectory import Flag, Reason
 
@@ -70,8 +70,19 @@ def find_ball(
 
     Source: paper section III A.
     """
+    blobs = find_blobs(background.difference(frame), background.noise, diameter_px, settings)
+    return ball_at(blobs, frame, background, diameter_px, settings)
+
+
+def ball_at(
+    blobs: Sequence[Blob],
+    frame: NDArray[np.generic],
+    background: Background,
+    diameter_px: float,
+    settings: LocateSettings,
+) -> Found:
+    """Return the outline of one of the blobs of a frame (H, W), best first; see `find_ball`."""
     difference = background.difference(frame)
-    blobs = find_blobs(difference, background.noise, diameter_px, settings)
     best: Outline | None = None
     likeliest = (False, 0.0)  # painted and supported ones first, then by coverage
     for blob in blobs:

@@ -36,7 +36,10 @@ def learn(job: Job, progress: Progress) -> Follower:
         score_min=UNPROVEN,
         known={},
     )
+    assert first.known is not None
     frames, places = frames_showing(recording, views, settings.refine.appearance_frames, first.disks)
+    shown = {id(shot.picture) for shots in frames for shot in shots}
+    first = replace(first, known={key: one for key, one in first.known.items() if key[0] in shown})
     if settings.refine.blur_px is None:
         pairs = (pair for shots in frames for pair in zip(shots, first.disks(shots), strict=True))
         blur_px = estimate_blur_px((shot.picture, disk) for shot, disk in pairs if disk is not None)

@@ -130,9 +130,9 @@ def _pixels(place: Rectangle) -> tuple[slice, slice]:
 class SlicedPicture(OnDemand):
     """Picture of which slices are decoded when a part that they hold is asked for, in another thread of `pool`."""
 
-    def __init__(self, decoder: SliceDecoder, packet: bytes, slices: Sequence[bytes], pool: Executor) -> None:
+    def __init__(self, decoder: SliceDecoder, slices: Sequence[bytes], pool: Executor) -> None:
         self.shape = decoder.shape
-        self._decoder, self._packet, self._slices, self._pool = decoder, packet, slices, pool
+        self._decoder, self._slices, self._pool = decoder, slices, pool
         self._asked: dict[int, Future[None]] = {}  # by number of the slice
         self.following: SlicedPicture | None = None  # what is asked of this picture is decoded ahead of the next one
 
@@ -141,8 +141,8 @@ class SlicedPicture(OnDemand):
         return np.zeros(self._decoder.shape, self._decoder.dtype)
 
     def equals(self, other: object) -> bool:
-        """Return whether the packets are the same: a frame that stands alone has no other content."""
-        return isinstance(other, SlicedPicture) and self._packet == other._packet
+        """Return whether the slices are the same: a frame that stands alone has no other content."""
+        return isinstance(other, SlicedPicture) and self._slices == other._slices
 
     def ask(self, left: int, top: int, right: int, bottom: int) -> None:
         """Begin to decode a part, right and bottom included, of this picture, and of the next one."""

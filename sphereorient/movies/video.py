@@ -85,9 +85,7 @@ class VideoMovie(Movie):
         before: SlicedPicture | None = None
         for _, packet in self._packets(self._range(first, last)):
             slices = None if packet is None else split_slices(packet)
-            picture = None
-            if packet is not None and slices is not None:
-                picture = SlicedPicture(self._slice_decoder, packet, slices, pool)
+            picture = None if slices is None else SlicedPicture(self._slice_decoder, slices, pool)
             if before is not None:
                 before.following = picture
             before = picture
