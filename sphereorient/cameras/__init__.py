@@ -7,6 +7,7 @@ from sphereorient.cameras.camera import (
     R_lab_view,
     Rays,
     centre_lab_mm,
+    holds_disk,
     nearest_point,
     sphere_disk_px,
     sphere_radius_px,

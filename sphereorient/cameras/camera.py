@@ -185,6 +185,12 @@ def sphere_radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) 
     return sphere_disk_px(camera, position_lab_mm, radius_mm)[1]
 
 
+def holds_disk(camera: Camera, centre_px: Tensor, radius_px: Tensor) -> Tensor:
+    """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
+    low, high = centre_px - radius_px[..., None], centre_px + radius_px[..., None]
+    return ((low >= 0) & (high < centre_px.new_tensor(camera.image_size))).all(-1)
+
+
 def _cross(a: Tensor, b: Tensor) -> Tensor:
     product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]
     return product

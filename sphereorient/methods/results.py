@@ -24,6 +24,7 @@ from sphereorient.calibration.consistency import (
 from sphereorient.cameras import Camera, ParameterCovariance, centre_lab_mm
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
+from sphereorient.follow.appearance import LOOK_ALIKE
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
@@ -208,6 +209,22 @@ def _alone(segment: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Return which frames (N,) are the only ones of their segment: no other one confirms their pose."""
     number, count = np.unique(segment[segment >= 0], return_counts=True)
     return np.isin(segment, number[count == 1])
+
+
+def missed_text(track: Trajectory) -> list[str]:
+    """Return remarks on cameras that measure the sphere in none of their frames, one for all that miss it alike."""
+    told: dict[str, list[str]] = {}
+    for name, lost in track.summary()["lost"].items():
+        pictures = len(track) - lost.pop(Reason.MISSING, 0)
+        usual = next(iter(lost), None)
+        if usual not in MISSED or sum(lost.values()) < pictures:
+            continue
+        text = f"no ball found in {pictures} frames looked at"
+        if usual == Reason.LOW_SCORE:
+            text = f"no pose of the map explains any of {pictures} frames looked at"
+            text += "" if track.valid.any() else f"; {LOOK_ALIKE}"
+        told.setdefault(text, []).append(name)
+    return [f"{', '.join(names)}: {text}" for text, names in told.items()]
 
 
 def map_track(

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_disk_px, sphere_radius_px
+from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, holds_disk, sphere_disk_px, sphere_radius_px
 from sphereorient.errors import CameraError, SettingsError, ShapeError, check_finite, check_tail, refusal, tensor_of
 from sphereorient.locate import Background, CameraScene
 from sphereorient.movies import OnDemand
@@ -99,8 +99,7 @@ class CameraView:
 
     def shows_whole(self, centre_px: Tensor, radius_px: Tensor) -> Tensor:
         """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
-        low, high = centre_px - radius_px[..., None], centre_px + radius_px[..., None]
-        return ((low >= 0) & (high < centre_px.new_tensor(self.camera.image_size))).all(-1)
+        return holds_disk(self.camera, centre_px, radius_px)
 
 
 def widest_px(views: Sequence[CameraView]) -> float:

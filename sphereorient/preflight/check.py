@@ -85,7 +85,7 @@ def preflight(
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
         tracked: tuple[Finding, ...] = ()
-        if learning is not None and closer:
+        if learning is not None and closer and any(sample.balls for sample in samples):
             first = int(recording.timeline.number[closer[0][0].frame[0]])
             tracked = tuple(agreement.cameras_agree(experiment, planned, learning, closer[0], first))
         checked = Preflight(
@@ -150,7 +150,7 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
 
 def _outline_findings(seen: Preflight) -> Iterator[Finding]:
     between, diameter_mm = [], seen.experiment.diameter_mm
-    if seen.scans:
+    if seen.scans and all(sample.balls for sample in seen.samples):  # else the finding on the ball tells enough
         shifted = any(scan.shift for scan in seen.scans)
         in_step_px = max(scan.in_step_px for scan in seen.scans) if shifted else None
         between.append(cameras.lines_of_sight(seen.samples, in_step_px))

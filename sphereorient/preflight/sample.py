@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
-from sphereorient.cameras import Camera
+from sphereorient.cameras import Camera, holds_disk
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.experiment.stream import CameraStream, given_scene, pictures_of, spread_frames, uniform
@@ -69,6 +70,11 @@ class MovieSample:
     def sightings(self) -> Sightings:
         """The outlines as arrays."""
         return sightings_of(self.found)
+
+    @cached_property
+    def whole(self) -> Tensor:
+        """Frames whose picture holds the whole disk of the ball, (n,) bool."""
+        return holds_disk(self.camera, self.sightings.centre_px, self.sightings.radius_px)
 
     @property
     def balls(self) -> list[tuple[Grey, Outline]]:

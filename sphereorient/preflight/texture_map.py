@@ -183,8 +183,10 @@ def look_alikes(pair: ViewPair) -> Finding:
 
 
 def match_texture(search: GreySearch, samples: Sequence[MovieSample]) -> list[TextureMatch]:
-    """Search the map in some frames in which every camera shows the ball."""
-    seen = torch.stack([sample.sightings.placed for sample in samples]).all(0).nonzero()[:, 0].tolist()
+    """Search the map in some frames in which every camera shows the ball, the whole of it if there are any."""
+    placed = torch.stack([sample.sightings.placed for sample in samples]).all(0)
+    whole = torch.stack([sample.whole for sample in samples]).all(0)
+    seen = (whole if bool(whole.any()) else placed).nonzero()[:, 0].tolist()
     chosen = [seen[k] for k in spread_frames(range(len(seen)), FRAMES)]
     return [_matched(search, sample, chosen) for sample in samples] if chosen else []
 
@@ -210,7 +212,7 @@ def _best(search: GreySearch, disks: Tensor) -> Tensor:
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
     """Judge the match of the map with one camera's pictures."""
-    score, mirrored = float(match.score.median()), float(match.mirrored.median())
+    score, mirrored = (float(each.quantile(0.5)) for each in (match.score, match.mirrored))
     measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
     flip = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
     if len(matches) > 1 and all(float((one.mirrored - one.score).median()) > CLEARLY for one in matches):

@@ -208,7 +208,7 @@ def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | N
     track = results.with_systematic_errors(
         track, recording.cameras, recording.covariance, recording.experiment.radius_mm
     )
-    remarks = [*recording.remarks, *track.provenance.get("remarks", ())]
+    remarks = [*recording.remarks, *track.provenance.get("remarks", ()), *results.missed_text(track)]
     if len(recording.cameras) > 1:
         diameter_mm, even = 2 * recording.experiment.radius_mm, recording.timeline.even
         track, found = results.with_contradictions(track, recording.cameras, diameter_mm, even, lasting)

@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sphereorient.calibration.consistency import gaps_between
-from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
+from sphereorient.cameras import PinholeCamera, Port, PortCamera, holds_disk, triangulate
 from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.experiment.stream import pictures_of
-from sphereorient.locate import Background
+from sphereorient.locate import Background, sightings_of
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
 from sphereorient.preflight.cameras import (
@@ -30,8 +30,10 @@ from sphereorient.preflight.cameras import (
     starts_in_step,
 )
 from sphereorient.preflight.finding import FAULT, OK, worst
-from sphereorient.preflight.movies import limb_blur_px
+from sphereorient.preflight.movies import limb_blur_px, motion_blur
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
+from sphereorient.preflight.texture_map import match_texture
+from sphereorient.trajectory import Reason
 
 
 def f64(value: object) -> torch.Tensor:
@@ -145,6 +147,51 @@ def test_the_blur_of_the_limb_is_that_of_the_lens(blur_px):
     outline = Outline(u_px=50.1, v_px=49.3, radius_px=30.0, rms_px=0.1, coverage=1.0)
     look = SimpleNamespace(balls=[(noisy, outline)] * 3, background=background)
     assert limb_blur_px(look) == pytest.approx(math.hypot(blur_px, 12**-0.5), rel=0.08)
+
+
+def sample_of(*u_px: float, v_px: float = 150.0, radius_px: float = 30.0) -> SimpleNamespace:
+    """Sample of consecutive frames with outlines in these columns; picture k is of grey k throughout."""
+    outlines = [Outline(u_px=u, v_px=v_px, radius_px=radius_px, rms_px=0.1, coverage=1.0) for u in u_px]
+    seen = sightings_of((one, Reason.OK) for one in outlines)
+    return SimpleNamespace(
+        name="cam1",
+        frame=np.arange(len(u_px)),
+        picture=[np.full((300, 300), k, np.uint8) for k in range(len(u_px))],
+        sightings=seen,
+        whole=holds_disk(ALONG_Y, seen.centre_px, seen.radius_px),
+    )
+
+
+def test_a_picture_holds_a_disk_that_touches_its_border_and_none_that_passes_it():
+    centre = f64([[30.0, 150.0], [29.9, 150.0], [150.0, 269.9], [150.0, 270.0], [math.nan, math.nan]])
+    assert holds_disk(ALONG_Y, centre, f64([30.0] * 5)).tolist() == [True, False, True, False, False]
+
+
+def test_disks_that_the_border_cuts_tell_nothing_of_motion_blur():
+    still = motion_blur(sample_of(150.0, 152.0, 5.0, 290.0, 100.0, 101.0), 0.5, 1.0)
+    assert still.severity is OK
+    assert "1.50 px a frame" in still.measured
+    fast = motion_blur(sample_of(150.0, 160.0), 0.5, 1.0)
+    assert fast.severity is Severity.WARNING
+    assert "unknown" in motion_blur(sample_of(5.0, 290.0), 0.5, 1.0).measured
+
+
+class Greys:
+    """A search that scores each disk by its grey."""
+
+    size_px = 8
+
+    def propose(self, disks: torch.Tensor) -> SimpleNamespace:
+        count = len(disks)
+        score = disks.mean((1, 2)).double()
+        return SimpleNamespace(counts=torch.ones(count).long(), offset=torch.arange(count + 1), score=score)
+
+
+def test_the_map_is_compared_with_whole_disks_where_there_are_any():
+    (match,) = match_texture(Greys(), [sample_of(5.0, 150.0, 290.0, 200.0)])
+    assert match.score.tolist() == [1, 3]
+    (cut,) = match_texture(Greys(), [sample_of(5.0, 290.0)])
+    assert cut.score.tolist() == [0, 1]
 
 
 @given(st.integers(0, 5000))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import REPO, SHARED
-from preflight_examples import Example, checked, clean_example, complaints, of, write
+from preflight_examples import PAINTED, Example, checked, clean_example, complaints, of, write
 
 from sphereorient.errors import MovieError
 from sphereorient.methods.settings import load_settings
@@ -52,6 +52,16 @@ def test_a_movie_wholly_white_is_a_fault_and_no_crash(clean, tmp_path):
 def test_a_dim_movie_is_told(clean, tmp_path):
     dim = clean.spoilt(lambda movie: np.rint(15 + (movie - 15.0) * 0.1))
     assert of(checked(dim, tmp_path), "exposure cam1").severity is WARNING
+
+
+@pytest.mark.slow
+def test_of_movies_without_a_ball_one_line_a_camera_is_told(clean, tmp_path):
+    def empty(movie: np.ndarray) -> np.ndarray:
+        return np.clip(np.random.default_rng(1).normal(15.0, 2.0, movie.shape).round(), 0, 255)
+
+    result = checked(clean.spoilt(empty), tmp_path, sphere=PAINTED)
+    assert {one.title for one in result.findings if one.severity is not OK} == {"ball cam1", "ball cam2"}
+    assert "found in 0 of" in of(result, "ball cam1").measured
 
 
 @pytest.mark.slow

@@ -80,8 +80,9 @@ def _times_better(found: Sequence[Poses]) -> float:
 
 def nothing(found: Sequence[Poses]) -> ExperimentError:
     """Return the error of a movie without the sphere, or without a pose that fits."""
-    reasons = {str(why) for poses in found for why in poses.reason}
-    got = f"none in {len(found)} frames looked at ({', '.join(sorted(reasons - {Reason.OK}))})"
+    reasons = {str(why) for poses in found for why in poses.reason} - {Reason.OK}
+    why = f" ({', '.join(sorted(reasons))})" if reasons else ""
+    got = f"none in {len(found)} frames looked at{why}"
     if Reason.LOW_SCORE in reasons or any(len(poses) for poses in found):
         expected, do = "frames that the map explains", LOOK_ALIKE
     else:
