@@ -35,11 +35,11 @@ from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.files.cache import WITHOUT as WITHOUT_CACHE
 from sphereorient.files.compiled import WITHOUT
-from sphereorient.follow import Appearance, ChunkTracker
+from sphereorient.follow import Appearance, Tracker
 from sphereorient.follow.appearance import estimate_appearance
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods import precise, several
 from sphereorient.methods.method import Job
@@ -235,14 +235,12 @@ def stages(bench: Bench) -> float:
 
 def steps(bench: Bench, lanes: int) -> tuple[float, float]:
     """CPU seconds a camera of a block's first two frames, and of a predicted one, as many blocks side by side."""
-    tracker = ChunkTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
-    short, each = steps_of(tracker, bench.shots, bench.times, lanes)
+    ball = BallTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
+    short, each = steps_of(Tracker({"": ball}, ball.start), bench.shots, bench.times, lanes)
     return short / lanes / len(bench.eyes), each / lanes / len(bench.eyes)
 
 
-def steps_of(
-    tracker: ChunkTracker | SceneTracker, shots: list[list[Frame]], times: list[float], lanes: int
-) -> tuple[float, float]:
+def steps_of(tracker: Tracker, shots: list[list[Frame]], times: list[float], lanes: int) -> tuple[float, float]:
     """CPU seconds of the first two frames of all blocks side by side, and of a predicted one, median."""
     at: list[float] = []
     real = tracker._step

@@ -2,4 +2,4 @@
 
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.follow.tracker import Tracker

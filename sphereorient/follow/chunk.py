@@ -37,6 +37,15 @@ class Expected:
     among: Neighbours | None = None  # of this one pose; None: no other sphere is in view
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ahead:
+    """What the frames before say of the pose of a ball."""
+
+    position_lab_mm: Tensor  # (3,)
+    R_lab_body: Tensor  # (3, 3)
+    covariance: Tensor  # (6, 6), of rotation (rad) and position (mm), lab
+
+
 @dataclass(eq=False)
 class Chunk:
     """One chunk in progress, with its last poses."""

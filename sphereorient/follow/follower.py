@@ -14,11 +14,11 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.ball import OWN, BallTracker
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.follow.scene_tracker import SceneTracker
 from sphereorient.follow.settings import RefineSettings
-from sphereorient.follow.tracker import OWN, ChunkTracker
+from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.locate.outline import Outline
 from sphereorient.pose import CameraView
@@ -35,22 +35,27 @@ class PerCameraTracker:
     the pose, the others contradict.
     """
 
-    def __init__(self, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
+    def __init__(self, name: str, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
         others = [(k,) for k in range(len(appearance.fitter.views)) if k not in appearance.majority]
         self.parts = [part for part in (appearance.majority, *others) if part]
-        self.trackers = [ChunkTracker(appearance.of(*part), search, settings) for part in self.parts]
+        balls = [BallTracker(appearance.of(*part), search, settings) for part in self.parts]
+        self.balls: dict[str, BallTracker] = {}  # that are followed in all cameras together
+        self.trackers = [Tracker({name: ball}, ball.start) for ball in balls]
 
     def batches(self, frames: range) -> list[list[int]]:
-        """Return the lengths of the chunks of each batch; see `ChunkTracker`."""
+        """Return the lengths of the chunks of each batch; see `Tracker`."""
         return self.trackers[0].batches(frames)
 
-    def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Track the chunks of one batch; see `ChunkTracker`."""
+    def track(
+        self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
+    ) -> Iterator[dict[str, Poses]]:
+        """Track the chunks of one batch; see `Tracker`."""
         each = [
             tracker.track([shots[k] for k in part], batch, time_s)
             for tracker, part in zip(self.trackers, self.parts, strict=True)
         ]
-        yield from (cameras_disagree(poses, self.parts) for poses in zip(*each, strict=True))
+        for apart in zip(*each, strict=True):
+            yield {name: cameras_disagree([poses[name] for poses in apart], self.parts) for name in apart[0]}
 
 
 def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> Poses:
@@ -98,7 +103,7 @@ class Follower:
 
     recording: Recording
     appearances: Mapping[str, Appearance]  # of each ball, by name
-    tracker: ChunkTracker | PerCameraTracker | SceneTracker
+    tracker: Tracker | PerCameraTracker
 
     @property
     def appearance(self) -> Appearance:
@@ -146,12 +151,8 @@ class Follower:
                 read = [movie.result() for movie in coming]
                 coming = ahead(batches[k + 1]) if k + 1 < len(batches) else []
                 times = time_s[batch.first : batch.last].tolist()
-                if isinstance(self.tracker, SceneTracker):
-                    scenes = list(self.tracker.track(read, batch.lengths, times))
-                    yield batch, {name: [scene[name] for scene in scenes] for name in self.appearances}
-                else:
-                    (only,) = self.appearances
-                    yield batch, {only: list(self.tracker.track(read, batch.lengths, times))}
+                scenes = list(self.tracker.track(read, batch.lengths, times))
+                yield batch, {name: [scene[name] for scene in scenes] for name in self.appearances}
 
 
 def sample_frames(

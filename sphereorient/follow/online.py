@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import Chunk
 from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.locate import Frame
 
 
@@ -17,7 +17,7 @@ class OnlineTracker:
 
     number = 1  # of the map in use; 0: none yet
 
-    def __init__(self, tracker: ChunkTracker, appearance: Appearance) -> None:
+    def __init__(self, tracker: BallTracker, appearance: Appearance) -> None:
         self.appearance = appearance
         self._tracker = tracker
         self._time_s: dict[int, float] = {}  # of the last frames

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, sphere_disk_px
+from sphereorient.follow.chunk import Ahead
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.locate import Frame, Match, assigned, find_disks, match_disks, places_of
@@ -31,15 +32,6 @@ SIZE_SIGMA = 0.06  # relative, of the radius of a disk
 DEPTH_SIGMA = 0.15  # relative, of the distance of a ball of which one camera alone tells
 PROPOSED_RAD, PLACED_SHARE = 0.05, 0.1  # errors of proposals and, in radii, of matches beside a prediction
 FREEDOM = 6.0  # of Student's distribution: motions change, and diameters are entered wrongly
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Ahead:
-    """What the frames before say of the pose of a ball."""
-
-    position_lab_mm: Tensor  # (3,)
-    R_lab_body: Tensor  # (3, 3)
-    covariance: Tensor  # (6, 6), of rotation (rad) and position (mm), lab
 
 
 @dataclass(frozen=True, eq=False)

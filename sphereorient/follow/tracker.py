@@ -1,463 +1,284 @@
-"""Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
+"""Poses of all balls in all frames: a search at the first frame of a chunk, then each frame from those before it."""
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
-from dataclasses import replace
-from functools import cached_property, partial
-from itertools import accumulate, combinations, pairwise
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
-from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.chunk import Chunk, Expected, mirrored, regained
-from sphereorient.follow.fixed_centre import FixedCentre
-from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
-from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
-from sphereorient.follow.settings import RefineSettings
+from sphereorient.follow.ball import BallTracker
+from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, Floats, mirrored, regained
+from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
+from sphereorient.follow.poses import Poses, supported
 from sphereorient.locate import Frame
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import SIZES, DisksPx, Fitter, Picture, Shown, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.pose.settle import settled
-from sphereorient.pose.start import NearStart
-from sphereorient.trajectory import Reason
 
-Floats = NDArray[np.float64]
-
-ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
-MORE_THAN_USUAL = 0.5  # of what a doubtful fit leaves: it may have stopped early, and is done once more
-CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
-CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
-LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
-HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk that others hide
-SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
-AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
-# What a camera alone gives, beside rotation and move from the pose.
-OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
+Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 
 
-class ChunkTracker:
-    """Tracks the sphere through chunks of frames, each chunk by itself from a search without history.
-    Frame numbers alone decide where chunks begin: no batch, worker or restart can change a result, and a wrong pose is
-    lost with its chunk. `centre` is that of a sphere that only rotates; None: each frame has its own position.
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a ball is in a frame."""
+
+    position_lab_mm: Tensor  # (3,)
+    move_mm: Tensor  # (3,), while the shutter is open
+
+
+class Tracker:
+    """Tracks balls through chunks of frames, each chunk by itself from a search without history, all balls in lock
+    step: each is fitted past the others where they are expected. Frame numbers alone decide where chunks begin: no
+    batch, worker or restart can change a result, and a wrong pose is lost with its chunk.
     """
 
-    def __init__(
-        self,
-        appearance: Appearance,
-        search: Initialiser,
-        settings: RefineSettings,
-        exposure_s: float = 0.0,
-        centre: FixedCentre | None = None,
-    ) -> None:
-        self.fitter: Fitter = appearance.fitter
-        self.search = replace(search, fitter=appearance.still, score_min=appearance.clear_score)
-        self.score_min = appearance.score_min
-        self.usual_score = appearance.usual_score
-        self.usual_apart_rad = appearance.usual_apart_rad
-        self.settings = settings
-        self.exposure_s = exposure_s
-        self.centre = centre
-        self._of_size: dict[int, ChunkTracker] = {}
+    def __init__(self, balls: Mapping[str, BallTracker], start: Start) -> None:
+        self.balls = dict(balls)
+        self.start = start
+        radius_mm = {name: ball.fitter.radius_mm for name, ball in self.balls.items()}
+        self._others = {
+            name: {other: size for other, size in radius_mm.items() if other != name} for name in self.balls
+        }
 
     def batches(self, frames: range) -> list[list[int]]:
         """Return the lengths of the chunks of each batch; chunks begin at multiples of `chunk_frames`."""
-        length = self.settings.chunk_frames
+        settings = next(iter(self.balls.values())).settings
+        length = settings.chunk_frames
         firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
-        return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
+        return [lengths[k : k + settings.chunks] for k in range(0, len(lengths), settings.chunks)]
 
-    def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Yield the poses of a batch's frames: shots of each view, lengths of the chunks, times of all frames."""
+    def track(
+        self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
+    ) -> Iterator[dict[str, Poses]]:
+        """Yield the poses of each ball in a batch's frames: shots of each view, lengths of the chunks, times of all
+        frames.
+        """
         firsts = list(accumulate([0, *batch[:-1]]))
-        chunks = [Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
-        found: dict[int, Poses] = {}
+        chunks = {
+            name: [Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
+            for name in self.balls
+        }
+        found: dict[int, dict[str, Poses]] = {}
         for k in range(max(batch)):
-            now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
-            frames = {chunk.first: [movie[chunk.first + k] for movie in shots] for chunk in now}
-            here = list(self._step(now, k, frames))
-            for chunk, poses, turn in zip(now, here, self.turns(now, here), strict=True):
-                chunk.saw(chunk.first + k, poses, turn)
-                found[chunk.first + k] = poses
-        self._follow_back(shots, [chunk.frames for chunk in chunks], time_s, found)
+            now = [n for n, length in enumerate(batch) if k < length]
+            frames = [[movie[firsts[n] + k] for movie in shots] for n in now]
+            here = self._step({name: [of_ball[n] for n in now] for name, of_ball in chunks.items()}, k, frames)
+            for name, tracker in self.balls.items():
+                own = [chunks[name][n] for n in now]
+                poses = [row[name] for row in here]
+                for chunk, one, turn in zip(own, poses, tracker.turns(own, poses), strict=True):
+                    chunk.saw(chunk.first + k, one, turn)
+            found |= {firsts[n] + k: row for n, row in zip(now, here, strict=True)}
+        self._follow_back(shots, [range(k, k + length) for k, length in zip(firsts, batch, strict=True)], time_s, found)
         yield from (found[k] for k in range(sum(batch)))
 
     def _follow_back(
-        self, shots: Sequence[Sequence[Frame]], spans: Sequence[range], time_s: Sequence[float], found: dict[int, Poses]
+        self,
+        shots: Sequence[Sequence[Frame]],
+        spans: Sequence[range],
+        time_s: Sequence[float],
+        found: dict[int, dict[str, Poses]],
     ) -> None:
-        """Follow the sphere back from where it was found to where it came into view, and put its poses into `found`."""
-        spans = [span for span in spans if regained([supported(found[k]) for k in span])]
-        chunks = mirrored(spans, time_s)
-        for k in range(max(map(len, spans), default=0)):
-            now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
-            frames = {chunk.first: -(chunk.first + k) for chunk in now}
-            lost = [chunk for chunk in now if not supported(found[frames[chunk.first]])]
-            ahead = {frames[chunk.first]: self.ahead(chunk, chunk.first + k) for chunk in lost}
-            known = {frame: expected for frame, expected in ahead.items() if expected is not None}
-            followed = self.follow(list(known.values()), [[movie[frame] for movie in shots] for frame in known])
-            pairs = zip(known, followed, strict=True)
-            found |= {frame: self.stated(poses) for frame, poses in pairs if poses is not None}
-            here = [found[frames[chunk.first]] for chunk in now]
-            for chunk, poses, turn in zip(now, here, self.turns(now, here), strict=True):
-                chunk.saw(chunk.first + k, poses, turn)
-
-    def turns(self, chunks: Sequence[Chunk], found: Sequence[Poses]) -> Floats:
-        """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
-        turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
-        for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
-            if chunk.past and supported(poses):
-                turns[row] = poses.R_lab_body[0].numpy() @ chunk.past[-1][1].R_lab_body[0].numpy().T
-        return so3.log(torch.from_numpy(turns))[: len(chunks)].numpy()
-
-    def _disks_px(self, position_lab_mm: Tensor) -> DisksPx:
-        """Return the fitter's disks of positions (n, 3); those of a fixed centre do not change."""
-        if self.centre is None:
-            return self.fitter.disks_px(position_lab_mm)
-        middles, radius, _ = self._disks_of_centre
-        return DisksPx(middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm)))
-
-    @cached_property
-    def _disks_of_centre(self) -> DisksPx:
-        assert self.centre is not None
-        return self.fitter.disks_px(self.centre.position_lab_mm[None])
-
-    def _lanes(self, count: int) -> int:
-        """Return the size of batches: always the same, since the last bits depend on it."""
-        return max(count, self.settings.chunks)
-
-    def _step(self, chunks: Sequence[Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
-        """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {chunk.first: self.ahead(chunk, chunk.first + k) for chunk in chunks}
-        ahead = {first: pose for first, pose in expected.items() if pose is not None}
-        followed = dict(zip(ahead, self.follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
-        if lost := [chunk.first for chunk in chunks if followed.get(chunk.first) is None]:
-            followed |= zip(lost, side_by_side(self.searched, [frames[n] for n in lost]), strict=True)
-        for chunk in chunks:
-            poses = followed[chunk.first]
-            assert poses is not None  # a search returns one that may be empty
-            yield self.stated(poses)
-
-    def ahead(self, chunk: Chunk, frame: int) -> Expected | None:
-        """Return what the frames before say of a frame of a chunk."""
-        pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
-        if pose is None or self.centre is None:
-            return pose
-        place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
-        return replace(pose, position_lab_mm=place, place_spread=spread)
-
-    def stated(self, poses: Poses) -> Poses:
-        """Return poses with the errors of a fixed centre."""
-        return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
-
-    def follow(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
-        """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
-        if not expected:
-            return []
-        asked, missing = len(expected), self._lanes(len(expected)) - len(expected)
-        expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
-        frames = [[shot.shown for shot in row] for row in shots]
-        usable = torch.tensor([[shot.readable for shot in row] for row in shots])
-        known = torch.stack([one.use for one in expected])
-        X, R_before, turn, spread, moved = (
-            torch.from_numpy(np.stack([getattr(one, name) for one in expected]))
-            for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
-        )
-        R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
-        use, among = known & usable, joined([one.among for one in expected])
-        if any(one.rough for one in expected):
-            was = X, R
-            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]), among)
-            share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
-            moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
-        disks_px = self._disks_px(X)
-        if among is not None:
-            disks_px = disks_px._replace(spoilt=self.fitter.spoilt(X, disks_px, moved, among))
-        visible = None if disks_px.spoilt is None else disks_px.spoilt.left
-        sees = torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE
-        usable, use = usable & sees, use & sees
-        start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
-        fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
-        fit = fitted(X, R, use, disks_px)
-        if visible is None and bool((poor := self._poor(fit, use)).any()):
-            # A sharp picture holds the fit where it began: once more, from coarse to fine.
-            again = fitted(*self._approached(frames, X, R, use, precision, poor, None), use)
-            better = (again.score * use).sum(1) > (fit.score * use).sum(1)
-            fit = again.where(poor & better, fit)
-        good = supported(fit, use)
-        if not bool(good.all()):
-            # Whether a picture is dark or white takes all of it: only where it is not as expected.
-            usable = sees & torch.stack(
-                [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
-            )
-            changed = (use != (known & usable)).any(1)
-            if bool(changed.any()):
-                use = known & usable
-                fit = fitted(X, R, use, disks_px).where(changed, fit)
-                good = torch.where(changed, supported(fit, use), good)
-        first = good
-        beyond = disks_px.largest_px > self.fitter.widest_px  # these have more pixels: see `_wider`
-        before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
-        alone: dict[int, FittedPoses] = {}
-        for some in by_decreasing_size(range(use.shape[1])):
-            if bool((good | beyond).all()):
-                break
-            # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
-            # one size, which disagree, the one nearer to the prediction counts.
-            fits = [fitted(X, R, _only(usable, one), disks_px) for one in some]
-            holds = [
-                supported(fit_, _only(usable, one)) & usable[:, one].all(1)
-                for one, fit_ in zip(some, fits, strict=True)
-            ]
-            astray = [
-                torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
-                for one, right in zip(fits, holds, strict=True)
-            ]
-            nearest, which = torch.stack(astray).min(0)
-            for k, one in enumerate(fits):
-                chosen = ~good & torch.isfinite(nearest) & (which == k)
-                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, some[k]), use)
-            good = good | torch.isfinite(nearest)
-            alone = {k: one for (k, *rest), one in zip(some, fits, strict=True) if not rest}
-        others = torch.zeros_like(use)
-        if bool((usable & ~use).any()):
-            # A camera without the sphere before may see it again: test it at the joint pose.
-            both = fitted(fit.position_lab_mm, fit.R_lab_body, usable)
-            unused = good & (usable & ~use).any(1)
-            limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
-            contradicts = self._contradictory(both, usable, limit)
-            back = unused & supported(both, usable) & ~contradicts
-            fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
-            several = good & ~back & ((usable & ~use).sum(1) > 1)
-            for k in range(use.shape[1] if bool(several.any()) else 0):
-                # Of several such cameras some may see it.
-                rows = several & (usable & ~use)[:, k]
-                wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
-                both = fitted(fit.position_lab_mm, fit.R_lab_body, wider)
-                rows &= supported(both, wider) & ~self._contradictory(both, wider, limit)
-                fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
-            # Another camera is judged only where this frame needs it: results must not depend on the batch.
-            doubtful = ~first | before.any(1) | (unused & contradicts)
-            others = (good & doubtful)[:, None] & usable & ~use
-        for k in range(use.shape[1] if bool(others.any()) else 0):
-            one = alone[k] if alone else fitted(X, R, _only(usable, [k]))
-            others[:, k] &= supported(one, _only(usable, [k]))
-            fit = _beside(fit, one, others[:, k], k)
-        reasons = [
-            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
-            for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
+        """Follow each ball of a chunk that was lost and found again back from there, and put its poses into `found`.
+        Where it does not arrive at the pose from which it was lost, two balls may have been taken for one: then a frame
+        between them stays without a pose.
+        """
+        spans = [
+            span for span in spans if any(regained([supported(found[k][name]) for k in span]) for name in self.balls)
         ]
-        found = [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
-        for n in torch.nonzero(beyond[:asked])[:, 0].tolist():
-            (found[n],) = self._wider(float(disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
+        chunks = {name: mirrored(spans, time_s) for name in self.balls}
+        lost: dict[tuple[str, int], Poses] = {}  # what was found at first, where that has changed
+        for k in range(max(map(len, spans), default=0)):
+            now = [n for n, span in enumerate(spans) if k < len(span)]
+            numbers = [spans[n].stop - 1 - k for n in now]
+            ahead = {
+                name: [tracker.ahead(chunks[name][n], -number) for n, number in zip(now, numbers, strict=True)]
+                for name, tracker in self.balls.items()
+            }
+            places = [
+                {
+                    name: place
+                    for name, poses in found[number].items()
+                    if (place := _place(poses, ahead[name][row])) is not None
+                }
+                for row, number in enumerate(numbers)
+            ]
+            wanted = {
+                name: [
+                    one if not supported(found[number][name]) or (name, number + 1) in lost else None
+                    for one, number in zip(of_ball, numbers, strict=True)
+                ]
+                for name, of_ball in ahead.items()
+            }
+            frames = [[movie[number] for movie in shots] for number in numbers]
+            followed = self._followed(wanted, places, frames, [True] * len(now))
+            for name, tracker in self.balls.items():
+                for n, number, row in zip(now, numbers, followed, strict=True):
+                    poses, was, chunk = row[name], found[number][name], chunks[name][n]
+                    if supported(was):
+                        if (name, number + 1) in lost and not (poses is not None and _same(poses, was, tracker)):
+                            found[number + 1] |= {name: lost[name, number + 1]}
+                            chunk.forget()
+                    elif poses is not None:
+                        lost[name, number] = was
+                        found[number] |= {name: tracker.stated(poses)}
+                own = [chunks[name][n] for n in now]
+                here = [found[number][name] for number in numbers]
+                for chunk, number, one, turn in zip(own, numbers, here, tracker.turns(own, here), strict=True):
+                    chunk.saw(-number, one, turn)
+
+    def _step(
+        self, chunks: Mapping[str, Sequence[Chunk]], k: int, frames: Sequence[Sequence[Frame]]
+    ) -> list[dict[str, Poses]]:
+        """Measure one frame of each chunk."""
+        ahead = {
+            name: [tracker.ahead(chunk, chunk.first + k) for chunk in chunks[name]]
+            for name, tracker in self.balls.items()
+        }
+        known = [
+            {name: _expected_place(one) for name, of_ball in ahead.items() if (one := of_ball[n]) is not None}
+            for n in range(len(frames))
+        ]
+        rough = [any(one is not None and one.rough for one in row) for row in zip(*ahead.values(), strict=True)]
+        # Where a motion is not known yet, the others are looked past once all are found.
+        first = [{} if unsure else row for unsure, row in zip(rough, known, strict=True)]
+        found = self._followed(ahead, first, frames, [True] * len(frames))
+        if any(rough) and any(self._others.values()):
+            at = [
+                {name: _found_place(poses, row[name]) for name, poses in there.items() if poses is not None}
+                for row, there in zip(known, found, strict=True)
+            ]
+            again = self._followed(ahead, at, frames, rough)
+            found = [again[n] if unsure else row for n, (unsure, row) in enumerate(zip(rough, found, strict=True))]
+        past = [
+            {
+                name: before
+                for name, poses in row.items()
+                if poses is None and (before := _extrapolated(chunks[name][n], chunks[name][n].first + k)) is not None
+            }
+            for n, row in enumerate(found)
+        ]
+        rows = list(zip(found, known, frames, past, strict=True))
+        whole = all(poses is not None for row in found for poses in row.values())
+        return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
+
+    def _followed(
+        self,
+        ahead: Mapping[str, Sequence[Expected | None]],
+        places: Sequence[Mapping[str, _Place]],
+        frames: Sequence[Sequence[Frame]],
+        wanted: Sequence[bool],
+    ) -> list[dict[str, Poses | None]]:
+        """Fit the predicted balls of each frame that is wanted, past the others at their places."""
+        found: list[dict[str, Poses | None]] = [dict.fromkeys(self.balls) for _ in frames]
+        for name, tracker in self.balls.items():
+            rows = {n: one for n, one in enumerate(ahead[name]) if one is not None and wanted[n]}
+            expected = [replace(one, among=self._among(name, places[n])) for n, one in rows.items()]
+            for n, poses in zip(rows, tracker.follow(expected, [frames[n] for n in rows]), strict=True):
+                found[n][name] = poses
         return found
 
-    def _wider(self, radius_px: float) -> "ChunkTracker":
-        """Return a tracker of single frames for a disk that is larger than those the movie was studied on."""
-        steps = math.ceil(math.log(radius_px / self.fitter.widest_px) / math.log(SIZES))
-        if steps not in self._of_size:
-            wider = self._of_size[steps] = copy(self)
-            wider.fitter = replace(self.fitter, widest_px=self.fitter.widest_px * SIZES**steps)
-            wider.settings, wider._of_size = self.settings.model_copy(update={"chunks": 1}), {}
-        return self._of_size[steps]
-
-    def _poor(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which poses (B,) leave much more of a picture in use than right ones usually do."""
-        return ((1.0 - fit.score > MORE_THAN_USUAL * (1.0 - self.usual_score)) & use).any(1)
-
-    def _approached(
+    def _completed(
         self,
-        frames: Sequence[Sequence[Shown]],
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        precision: Tensor,
-        rough: Tensor,
-        among: Neighbours | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
-        for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
-            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
-            fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
-            X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
-            R = torch.where(rough[:, None, None], fit.R_lab_body, R)
-        return X, R
+        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead]],
+    ) -> dict[str, Poses]:
+        """Return the poses of all balls of a frame: those followed, and those that a search finds."""
+        followed, known, shots, past = frame
+        done = {name: poses for name, poses in followed.items() if poses is not None}
+        lost = [name for name in self.balls if name not in done]
+        if not lost:
+            return {name: self.balls[name].stated(poses) for name, poses in done.items()}
+        places = {name: _found_place(poses, known.get(name)) for name, poses in done.items()}
+        there = self.start(shots, lost, {name: place.position_lab_mm for name, place in places.items()}, past)
+        places |= {name: _found_place(poses, None) for name, poses in there.items() if len(poses)}
+        for name in lost:
+            among = self._among(name, places) if len(there[name]) else None
+            done[name] = there[name] if among is None else self.balls[name].looked_past(there[name], shots, among)
+        return {name: self.balls[name].stated(done[name]) for name in self.balls}
 
-    def _fitted(
-        self,
-        frames: Sequence[Sequence[Shown]],
-        start: Callable[..., NearStart],
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        disks_px: DisksPx | None = None,
-    ) -> FittedPoses:
-        """Fit poses that are nearly right; `start` knows the rest of where they begin."""
-        begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
-        return settled(self.fitter, frames, begin, disks_px)
-
-    def _from(self, position_lab_mm: Tensor) -> Tensor:
-        """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
-        return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
-
-    def _supported(self, fit: FittedPoses, use: Tensor, visible: Tensor | None = None) -> Tensor:
-        """Return which poses have converged and explain all pictures in use well, (B,) bool. Of disks of which others
-        leave a share `visible` (B, C), less is asked, and nothing where it is too little for a score.
-        """
-        seen = use.numpy()
-        explained = (fit.score.numpy() >= self.score_min) | ~seen
-        if visible is not None:
-            left, score = visible.numpy(), fit.score.numpy()
-            explained |= (score >= self.score_min - HIDDEN_LESS * (1.0 - left)) & (left < 1.0)
-            explained |= (score == 0) & (left < SILENT)
-        arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
-        if visible is not None:  # of little paint the pose may not be known at all
-            arrived &= ((score > 0) & seen).any(1) & np.isfinite(fit.covariance.numpy()).all((1, 2))
-        good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
-        return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
-
-    def _contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
-        """Return for which poses two cameras disagree, (B,) bool: their pictures are not of one instant."""
-        wrong = torch.zeros(len(use), dtype=torch.bool)
-        for k, m in combinations(range(use.shape[1]), 2):
-            apart = said.own_turn[:, k] - said.own_turn[:, m]
-            spread = said.own_covariance[:, k] + said.own_covariance[:, m]
-            away = (apart[:, None] @ torch.linalg.pinv(spread) @ apart[..., None])[:, 0, 0].clamp_min(0).sqrt()
-            far = apart.norm(dim=-1) > limit * CONTRADICTS_USUAL * self.usual_apart_rad
-            wrong = wrong | (use[:, k] & use[:, m] & far & (away > limit * CONTRADICTS_SIGMAS))
-        return wrong
-
-    def searched(self, shots: Sequence[Frame]) -> Poses:
-        """Find the poses of a frame without history, with those cameras whose pictures support them."""
-        poses = self.search.poses(shots)
-        if not len(poses):
-            return poses
-        frames, usable = [shot.picture for shot in shots], _usable(shots)
-        if self.centre is not None:
-            optics = self.search.fitter.optics
-            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
-            order = explaining_first(fit, poses.use).argsort(stable=True)
-            poses = poses_of(fit, order, poses.use, poses.reason)
-        if bool((usable & ~poses.use).any()):
-            poses = self._all_seeing(poses, frames, usable)
-        seen = poses.use & (poses.score[0] >= self.score_min)
-        reason = [
-            Reason.LOW_SCORE if was and not now else why
-            for was, now, why in zip(poses.use.tolist(), seen.tolist(), poses.reason, strict=True)
-        ]
-        if not bool(seen.any()):
-            return no_pose(len(shots), reason)
-        if bool(self._contradictory(poses, seen.expand(len(poses), -1))[0]):
-            return self._by_each(poses, frames, seen)
-        if bool((seen == poses.use).all()):
-            return poses
-        fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
-        return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
-
-    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours) -> Poses:
-        """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
-        those whose pictures support none are left out.
-        """
-        fitter, count = self.search.fitter, len(poses)
-        frames, X = [shot.picture for shot in shots], poses.position_lab_mm[:1]
-        visible = self.fitter.spoilt(X, fitter.disks_px(X), None, among).left[0]
-        use, every = poses.use & (visible > LEAST_VISIBLE), among.of([0] * count)
-        if not bool(use.any()):
-            return replace(poses, use=use)
-        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), every)
-        order = explaining_first(fit, use).argsort(stable=True)
-        best = fit.of(order[:1])
-        seen = use & (best.score[0] > 0) & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
-        seen &= torch.isfinite(best.covariance).all()
-        reason = [
-            Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
-            for now, why in zip(seen.tolist(), poses.reason, strict=True)
-        ]
-        if bool(seen.any()) and not bool((seen == use).all()):
-            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), every)
-            order = explaining_first(fit, seen).argsort(stable=True)
-        return poses_of(fit, order, seen, reason)
-
-    def _looked_at(
-        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps, among: Neighbours | None = None
-    ) -> FittedPoses:
-        """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
-        X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
-        known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
-        held = self.centre is not None
-        use = use.expand(count, -1)
-        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use, known, held, among)
-
-    def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
-        """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
-        each = seen.expand(len(poses), -1)
-        steps = ((self.search.fitter.optics.fine, 1, 4),)
-
-        def supporting(some: Sequence[Sequence[int]]) -> dict[tuple[int, ...], FittedPoses]:
-            fits = {tuple(one): self._looked_at(frames, poses, _only(each, one), steps) for one in some}
-            return {one: fit for one, fit in fits.items() if bool(self._supported(fit, _only(each, one))[0])}
-
-        seeing = torch.nonzero(seen)[:, 0].tolist()
-        right = next(filter(None, map(supporting, by_decreasing_size(seeing))), None)
-        if right is None:
-            return poses
-        main, fit = next(iter(right.items()))
-        alone = right if len(main) == 1 else supporting([[k] for k in seeing if k not in main])
-        others = {k: one for (k,), one in alone.items() if k not in main}
-        for k, one in others.items():
-            fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
-        reason = [
-            Reason.OK if k in main else Reason.CONTRADICTS if k in others else why for k, why in enumerate(poses.reason)
-        ]
-        return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
-
-    def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
-        """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
-        fit = self._looked_at(frames, poses, usable, self.search.fitter.optics.steps)
-        order = fit.nll.argsort(stable=True)
-        if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
-            return poses
-        reason = [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
-        return poses_of(fit, order, usable, reason)
+    def _among(self, name: str, places: Mapping[str, _Place]) -> Neighbours | None:
+        """Return the neighbours of one ball in one frame; None where there are none."""
+        others = self._others[name]
+        return _neighbours(others, places) if others else None
 
 
-def _usable(shots: Sequence[Frame]) -> Tensor:
-    return torch.tensor([shot.usable for shot in shots])
+def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
+    """Return the neighbours of balls, each given by its name and the poses of its frame, as if at rest."""
+    each = []
+    for name, there in rows:
+        places = {other: _found_place(poses, None) for other, poses in there.items() if len(poses)}
+        radii = {other: one.fitter.radius_mm for other, one in balls.items() if other != name}
+        each.append(_neighbours(radii, places))
+    found = joined(each)
+    assert found is not None
+    return found
 
 
-def _only(usable: Tensor, cameras: Sequence[int]) -> Tensor:
-    only, some = torch.zeros_like(usable), list(cameras)
-    only[:, some] = usable[:, some]
-    return only
+def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, _Place]) -> Neighbours:
+    """Return the neighbours, by name, of one pose."""
+    nowhere = _Place(torch.full((3,), torch.nan, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    there = [places.get(name, nowhere) for name in radius_mm]
+    return Neighbours(
+        position_lab_mm=torch.stack([one.position_lab_mm for one in there])[None],
+        radius_mm=torch.tensor([list(radius_mm.values())], dtype=torch.float64),
+        move_mm=torch.stack([one.move_mm for one in there])[None],
+    )
 
 
-def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
-    """Record what a camera alone gives beside poses (B,) to which it did not contribute."""
-    if not bool(rows.any()):
-        return fit
-    own = {
-        "own_turn": so3.log(other.R_lab_body @ fit.R_lab_body.mT),
-        "own_move": other.position_lab_mm - fit.position_lab_mm,
-        **{name: getattr(other, name)[:, camera] for name in OWN},
-    }
-    told = {name: getattr(fit, name).clone() for name in own}
-    for name, value in own.items():
-        told[name][rows, camera] = value[rows]
-    return replace(fit, **told)
+def _extrapolated(chunk: Chunk, frame: int) -> Ahead | None:
+    """Return what the last poses of a chunk say of a later frame: a motion of one order less, that of the last two of
+    three poses, is within the error. None of a single pose.
+    """
+    if len(chunk.past) < 2:
+        return None
+    time_s = np.array([chunk.time_s[number] for number, _ in chunk.past])
+    poses = [one for _, one in chunk.past]
+    weight, lower = (_weights(time_s[k:], chunk.time_s[frame]) for k in (0, 1))
+    last = poses[-1].R_lab_body[0]
+    X = torch.stack([one.position_lab_mm[0] for one in poses])
+    turn = so3.log(torch.stack([one.R_lab_body[0] for one in poses]) @ last.mT)
+    path = torch.cat([turn, X], 1)
+    ahead = weight @ path
+    other = lower @ path[1:] - ahead
+    spread = sum(w * w * one.covariance[0] for w, one in zip(weight.tolist(), poses, strict=True))
+    apart = torch.stack([other[:3].square().sum(), other[3:].square().sum()]).repeat_interleave(3)
+    return Ahead(
+        position_lab_mm=ahead[3:],
+        R_lab_body=so3.exp(ahead[:3]) @ last,
+        covariance=spread + torch.diag(apart),
+    )
 
 
-def _reason(used: bool, contradicts: bool, sees: bool, shot: Frame, before: Reason) -> Reason:
-    if used:
-        return Reason.OK
-    if not sees:
-        return Reason.HIDDEN
-    if contradicts:
-        return Reason.CONTRADICTS
-    if not shot.usable:
-        return shot.reason
-    return before if before in (Reason.NOT_FOUND, Reason.OUTLINE) else Reason.LOW_SCORE
+def _weights(time_s: Floats, at_s: float) -> Tensor:
+    """Return the weights by which the polynomial through values at some times has its value at another one."""
+    apart = time_s[:, None] - time_s
+    np.fill_diagonal(apart, 1.0)
+    share = (at_s - time_s[None]) / apart
+    np.fill_diagonal(share, 1.0)
+    return torch.from_numpy(share.prod(1))
+
+
+def _same(one: Poses, other: Poses, tracker: BallTracker) -> bool:
+    """Return whether the best poses of a frame are the same, but for their errors."""
+    turn = so3.geodesic_distance(one.R_lab_body[0], other.R_lab_body[0])
+    move = (one.position_lab_mm[0] - other.position_lab_mm[0]).norm()
+    return bool(turn < DISTINCT_RAD) and bool(move < MOVE_SHARE * tracker.fitter.radius_mm)
+
+
+def _place(poses: Poses, expected: Expected | None) -> _Place | None:
+    """Return where a ball is in a frame, or is expected."""
+    before = None if expected is None else _expected_place(expected)
+    return _found_place(poses, before) if supported(poses) else before
+
+
+def _expected_place(one: Expected) -> _Place:
+    return _Place(torch.from_numpy(one.position_lab_mm), torch.from_numpy(one.moved[3:]))
+
+
+def _found_place(poses: Poses, before: _Place | None) -> _Place:
+    """Return the place of a frame's best pose, with the motion that was expected of it."""
+    still = torch.zeros(3, dtype=torch.float64)
+    return _Place(poses.position_lab_mm[0], still if before is None else before.move_mm)

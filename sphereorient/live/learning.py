@@ -21,10 +21,10 @@ from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.online import OnlineTracker
 from sphereorient.follow.poses import Poses, supported
-from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.live.growing_map import GrowingMap, LiveMap
 from sphereorient.live.relative import RelativeTracker
 from sphereorient.locate import Frame
@@ -230,7 +230,7 @@ def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
         candidates=settings.refine.candidates,
     )
     refine = settings.refine.model_copy(update={"chunks": 1})
-    tracker = ChunkTracker(found.appearance, begin, refine, centre=found.centre)
+    tracker = BallTracker(found.appearance, begin, refine, centre=found.centre)
     return OnlineTracker(tracker, found.appearance)
 
 

@@ -12,7 +12,6 @@ from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.files.whole_file import writing
 from sphereorient.follow.online import OnlineTracker
-from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.live.live import LiveTracker
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
@@ -53,10 +52,11 @@ def open_live(
         given = None if learnt is None else load_learnt(learnt)
         job = Job(recording=recording, settings=chosen, device=torch.device("cpu"), given=given)
         follower = precise.learn(job, silent) if given is None else precise.resume(job, given)
-        if not isinstance(follower.tracker, ChunkTracker):
+        if not follower.tracker.balls:
             do = "look with `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
-        yield LiveSetUp(recording=recording, tracker=OnlineTracker(follower.tracker, follower.appearance))
+        (ball,) = follower.tracker.balls.values()
+        yield LiveSetUp(recording=recording, tracker=OnlineTracker(ball, follower.appearance))
 
 
 @contextmanager

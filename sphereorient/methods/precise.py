@@ -9,11 +9,12 @@ from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Appearance, Following, estimate_appearance
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, PerCameraTracker, frames_at, frames_showing, sample_frames
 from sphereorient.follow.initialise import UNPROVEN, Initialiser
 from sphereorient.follow.poses import Poses, pose_table
-from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.follow.tracker import Tracker
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Joined, Learnt, Measured
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views, sizes_of
@@ -78,15 +79,16 @@ def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Fol
         score_min=appearance.clear_score,
     )
     there = appearance.on(job.device)
-    tracker: ChunkTracker | PerCameraTracker
+    tracker: Tracker | PerCameraTracker
     if appearance.together:
         centre = None
         if job.recording.experiment.fixed:
             frames, _ = sample_frames(job.recording, views, settings.refine.appearance_frames)
             centre = find_fixed_centre(begin, frames, appearance.score_min)
-        tracker = ChunkTracker(there, begin, settings.refine, exposure_s(job), centre)
+        ball = BallTracker(there, begin, settings.refine, exposure_s(job), centre)
+        tracker = Tracker({"": ball}, ball.start)
     else:
-        tracker = PerCameraTracker(there, begin, settings.refine)
+        tracker = PerCameraTracker("", there, begin, settings.refine)
     return Follower(recording=job.recording, appearances={"": appearance}, tracker=tracker)
 
 

@@ -13,12 +13,12 @@ from sphereorient.assemble.identity import same_balls
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Among, Appearance, Following, estimate_appearance
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.follower import Follower, frames_at, sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, supported
 from sphereorient.follow.scene_start import SceneStart
-from sphereorient.follow.scene_tracker import SceneTracker, among_found
-from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.follow.tracker import Tracker, among_found
 from sphereorient.locate import Frame
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
@@ -112,10 +112,10 @@ def follower(job: Job, appearances: Mapping[str, Appearance]) -> Follower:
             for name in names
         }
     balls = {
-        name: ChunkTracker(one.on(job.device), begin[name], settings.refine, precise.exposure_s(job))
+        name: BallTracker(one.on(job.device), begin[name], settings.refine, precise.exposure_s(job))
         for name, one in appearances.items()
     }
-    return Follower(recording=job.recording, appearances=appearances, tracker=SceneTracker(balls, SceneStart(begin)))
+    return Follower(recording=job.recording, appearances=appearances, tracker=Tracker(balls, SceneStart(begin)))
 
 
 def join(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:

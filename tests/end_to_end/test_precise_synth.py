@@ -32,7 +32,8 @@ from precise_examples import (
 from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
-from sphereorient.follow import ChunkTracker, Poses
+from sphereorient.follow import Poses, Tracker
+from sphereorient.follow.ball import BallTracker
 from sphereorient.locate import Frame
 from sphereorient.methods import precise
 from sphereorient.run.stages import track_movies
@@ -454,28 +455,29 @@ def test_two_runs_give_the_same_bytes_with_one_thread_or_two(short, tmp_path):
 @pytest.mark.slow
 def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
     """Chunks, workers and a run begun again at a block are all this: windows of other blocks."""
-    made: list[ChunkTracker] = []
+    made: list[BallTracker] = []
 
-    class Kept(ChunkTracker):
+    class Kept(BallTracker):
         def __init__(self, *parts: object) -> None:
             super().__init__(*parts)
             made.append(self)
 
-    monkeypatch.setattr(precise, "ChunkTracker", Kept)
+    monkeypatch.setattr(precise, "BallTracker", Kept)
     experiment = write(short.without_ball(np.arange(37, 39), ("cam1",)), tmp_path)
     track_movies(experiment, settings=settings("refine.chunk_frames=16"))
-    (tracker,) = made
+    (ball,) = made
+    tracker = Tracker({"": ball}, ball.start)
     pictures = [np.load(tmp_path / f"{name}.npy") for name in CAMERAS]
 
     def poses_of(*blocks: int) -> list[str]:
         """Follow blocks, by number, in one window."""
         rows = np.concatenate([np.arange(16 * block, 16 * block + 16) for block in blocks])
         shots = [[Frame(shown=picture) for picture in movie[rows]] for movie in pictures]
-        return [_digest(poses) for poses in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
+        return [_digest(row[""]) for row in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
 
     each = [poses_of(block) for block in range(3)]
     assert [poses_of(block) for block in (2, 0, 1)] == [each[2], each[0], each[1]]
-    tracker.settings = tracker.settings.model_copy(update={"lanes": 3})
+    ball.settings = ball.settings.model_copy(update={"chunks": 3})
     together = poses_of(0, 1, 2)
     assert poses_of(2, 1) == together[32:] + together[16:32]
     assert poses_of(1) == together[16:32]

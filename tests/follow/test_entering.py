@@ -10,8 +10,8 @@ import torch
 from run_examples import EXCERPT, SHORT
 
 from sphereorient import so3
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.poses import no_pose
-from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods.method import Learnt
 from sphereorient.methods.settings import load_settings
 from sphereorient.run import MemoryStore, Request, run
@@ -38,7 +38,7 @@ def assert_same_poses(track, other):
 def test_frames_before_the_first_one_that_a_search_finds_are_followed_back(known, monkeypatch):
     right, path = known
     searches = []
-    found = ChunkTracker.searched
+    found = BallTracker.searched
 
     def searched(self, shots):
         searches.append(shots)
@@ -46,7 +46,7 @@ def test_frames_before_the_first_one_that_a_search_finds_are_followed_back(known
         here = found(self, shots)
         return no_pose(len(shots), [Reason.NOT_FOUND] * len(shots)) if len(searches) < 8 else here
 
-    monkeypatch.setattr(ChunkTracker, "searched", searched)
+    monkeypatch.setattr(BallTracker, "searched", searched)
     track = run(Request(experiment=EXCERPT, settings=SETTINGS, learnt=path), MemoryStore())
     assert len(searches) >= 8
     assert_same_poses(track, right)

@@ -17,10 +17,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow import ChunkTracker
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import FixedCentre, _follows, find_fixed_centre, mean_place
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.poses import Poses
+from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
@@ -132,7 +133,7 @@ def followed_poses(
     settings = Settings()
     with open_recording(load_experiment(path), cameras) as recording:
         begun = learn(Job(recording=recording, settings=settings, device=torch.device("cpu")), silent)
-        known, search = begun.appearance, begun.tracker.search
+        known, search = begun.appearance, begun.tracker.balls[""].search
         views = known.fitter.views
         shots, _ = sample_frames(recording, views, settings.refine.appearance_frames)
         place = find_fixed_centre(search, shots, known.score_min)
@@ -144,12 +145,13 @@ def followed_poses(
         times = recording.timeline.time_s.tolist()
         found = []
         for where in (None, place):
-            tracker = ChunkTracker(known, search, settings.refine, centre=where)
+            ball = BallTracker(known, search, settings.refine, centre=where)
+            tracker = Tracker({"": ball}, ball.start)
             poses: list[Poses] = []
             for window in tracker.batches(recording.frames):
                 n = len(poses)
                 some = slice(n, n + sum(window))
-                poses += tracker.track([movie[some] for movie in movies], window, times[some])
+                poses += [row[""] for row in tracker.track([movie[some] for movie in movies], window, times[some])]
             found.append(poses)
         errors = 0.01 * f64([[1.0, 0.0, 0.0], [0.3, 1.0, -0.6]])
         turns = torch.stack(

@@ -10,15 +10,16 @@ import torch
 from several_examples import FRAMES, write_several
 
 from sphereorient import so3
-from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow.scene_tracker import SceneTracker
+from sphereorient.experiment.recording import open_recording
+from sphereorient.follow.poses import no_pose
+from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import screened_frames
-from sphereorient.methods import precise, several
+from sphereorient.methods import several
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import load_settings
 from sphereorient.run.stages import run
 from sphereorient.run.store import FolderStore, MemoryStore, Request, read_poses
-from sphereorient.trajectory import Tracks
+from sphereorient.trajectory import Reason, Tracks
 
 pytestmark = pytest.mark.slow
 CHUNK = "refine.chunk_frames=12"
@@ -119,12 +120,12 @@ def followed_where(movie, again, exchanged=False):
 
         def start(frame, names, known, past):
             if 0 < number[id(frame[0])] < again:
-                return {}
+                return {name: no_pose(len(frame), [Reason.NOT_FOUND] * len(frame)) for name in names}
             found = scene.start(frame, names, known, past)
             return found | {"a": found["c"], "c": found["a"]} if exchanged and number[id(frame[0])] == again else found
 
         balls = {name: tracker if name == "b" else Astray(tracker, 8) for name, tracker in scene.balls.items()}
-        return list(SceneTracker(balls, start).track(shots, [20], recording.clock.tolist()))
+        return list(Tracker(balls, start).track(shots, [20], recording.clock.tolist()))
 
 
 def names_of(found, movie):
@@ -152,24 +153,3 @@ def test_another_ball_found_in_its_place_is_not_joined_to_it(tracks, movie):
     first, other = names[0], names[-1]
     assert first != other
     assert names == first * 8 + "-" + other * 11
-
-
-def test_one_ball_followed_as_a_scene_is_followed_as_ever(tmp_path):
-    movie = write_several(tmp_path, "b", cameras=2)
-    with open_recording(movie.experiment) as recording, one_thread():
-        job = Job(recording=recording, settings=load_settings(None, (CHUNK,)), device=torch.device("cpu"))
-        follower = precise.learn(job, silent)
-        tracker, views = follower.tracker, follower.appearance.fitter.views
-
-        def shots():
-            pairs = zip(recording.streams, views, strict=True)
-            return [list(screened_frames(stream, view.background)) for stream, view in pairs]
-
-        scene = SceneTracker({"": tracker}, lambda frame, names, known, past: {"": tracker.searched(frame)})
-        times, batch = recording.clock.tolist(), [12, 12, 6]
-        alone, together = list(tracker.track(shots(), batch, times)), list(scene.track(shots(), batch, times))
-    for one, of_scene in zip(alone, together, strict=True):
-        for name, part in one.parts().items():
-            assert torch.equal(part, of_scene[""].parts()[name]), name
-        assert one.use.tolist() == of_scene[""].use.tolist()
-        assert one.reason == of_scene[""].reason

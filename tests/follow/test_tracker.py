@@ -12,11 +12,11 @@ from refine_examples import f64
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import Chunk, mirrored, regained
 from sphereorient.follow.follower import cameras_disagree
 from sphereorient.follow.initialise import by_decreasing_size
 from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.trajectory import Reason
 
 TIMES = [0.0, 1.0, 2.5, 3.2]
@@ -135,7 +135,7 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
             own_covariance=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(1, 2, 3, 3),
         )
         tracker = SimpleNamespace(usual_apart_rad=0.002)
-        return bool(ChunkTracker._contradictory(tracker, said, torch.tensor([[True, both]])))
+        return bool(BallTracker._contradictory(tracker, said, torch.tensor([[True, both]])))
 
     assert disagree(0.006, -0.006)
     assert not disagree(0.006, 0.006), "both would turn the pose alike"

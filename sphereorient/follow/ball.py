@@ -1,0 +1,414 @@
+"""Poses of one ball in single frames: from what the frames before say, or by a search."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import combinations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.chunk import Ahead, Chunk, Expected
+from sphereorient.follow.fixed_centre import FixedCentre
+from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
+from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
+from sphereorient.follow.settings import RefineSettings
+from sphereorient.locate import Frame
+from sphereorient.pose.fit import FittedPoses
+from sphereorient.pose.fitter import SIZES, DisksPx, Fitter, Picture, Shown, Steps
+from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.settle import settled
+from sphereorient.pose.start import NearStart
+from sphereorient.trajectory import Reason
+
+Floats = NDArray[np.float64]
+
+ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
+MORE_THAN_USUAL = 0.5  # of what a doubtful fit leaves: it may have stopped early, and is done once more
+CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
+CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
+LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
+HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk that others hide
+SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
+AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
+# What a camera alone gives, beside rotation and move from the pose.
+OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
+
+
+class BallTracker:
+    """Measures one ball in frames of several chunks at a time; see `Tracker`. `centre` is that of a ball that only
+    rotates; None: each frame has its own position.
+    """
+
+    def __init__(
+        self,
+        appearance: Appearance,
+        search: Initialiser,
+        settings: RefineSettings,
+        exposure_s: float = 0.0,
+        centre: FixedCentre | None = None,
+    ) -> None:
+        self.fitter: Fitter = appearance.fitter
+        self.search = replace(search, fitter=appearance.still, score_min=appearance.clear_score)
+        self.score_min = appearance.score_min
+        self.usual_score = appearance.usual_score
+        self.usual_apart_rad = appearance.usual_apart_rad
+        self.settings = settings
+        self.exposure_s = exposure_s
+        self.centre = centre
+        self._of_size: dict[int, BallTracker] = {}
+
+    def turns(self, chunks: Sequence[Chunk], found: Sequence[Poses]) -> Floats:
+        """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
+        turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
+        for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
+            if chunk.past and supported(poses):
+                turns[row] = poses.R_lab_body[0].numpy() @ chunk.past[-1][1].R_lab_body[0].numpy().T
+        return so3.log(torch.from_numpy(turns))[: len(chunks)].numpy()
+
+    def _disks_px(self, position_lab_mm: Tensor) -> DisksPx:
+        """Return the fitter's disks of positions (n, 3); those of a fixed centre do not change."""
+        if self.centre is None:
+            return self.fitter.disks_px(position_lab_mm)
+        middles, radius, _ = self._disks_of_centre
+        return DisksPx(middles.expand(-1, len(position_lab_mm), -1), radius.expand(len(position_lab_mm)))
+
+    @cached_property
+    def _disks_of_centre(self) -> DisksPx:
+        assert self.centre is not None
+        return self.fitter.disks_px(self.centre.position_lab_mm[None])
+
+    def _lanes(self, count: int) -> int:
+        """Return the size of batches: always the same, since the last bits depend on it."""
+        return max(count, self.settings.chunks)
+
+    def ahead(self, chunk: Chunk, frame: int) -> Expected | None:
+        """Return what the frames before say of a frame of a chunk."""
+        pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
+        if pose is None or self.centre is None:
+            return pose
+        place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
+        return replace(pose, position_lab_mm=place, place_spread=spread)
+
+    def stated(self, poses: Poses) -> Poses:
+        """Return poses with the errors of a fixed centre."""
+        return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
+
+    def follow(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
+        """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
+        if not expected:
+            return []
+        asked, missing = len(expected), self._lanes(len(expected)) - len(expected)
+        expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
+        frames = [[shot.shown for shot in row] for row in shots]
+        usable = torch.tensor([[shot.readable for shot in row] for row in shots])
+        known = torch.stack([one.use for one in expected])
+        X, R_before, turn, spread, moved = (
+            torch.from_numpy(np.stack([getattr(one, name) for one in expected]))
+            for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
+        )
+        R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
+        use, among = known & usable, joined([one.among for one in expected])
+        if any(one.rough for one in expected):
+            was = X, R
+            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]), among)
+            share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
+            moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
+        disks_px = self._disks_px(X)
+        if among is not None:
+            disks_px = disks_px._replace(spoilt=self.fitter.spoilt(X, disks_px, moved, among))
+        visible = None if disks_px.spoilt is None else disks_px.spoilt.left
+        sees = torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE
+        usable, use = usable & sees, use & sees
+        start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
+        fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
+        fit = fitted(X, R, use, disks_px)
+        if visible is None and bool((poor := self._poor(fit, use)).any()):
+            # A sharp picture holds the fit where it began: once more, from coarse to fine.
+            again = fitted(*self._approached(frames, X, R, use, precision, poor, None), use)
+            better = (again.score * use).sum(1) > (fit.score * use).sum(1)
+            fit = again.where(poor & better, fit)
+        good = supported(fit, use)
+        if not bool(good.all()):
+            # Whether a picture is dark or white takes all of it: only where it is not as expected.
+            usable = sees & torch.stack(
+                [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
+            )
+            changed = (use != (known & usable)).any(1)
+            if bool(changed.any()):
+                use = known & usable
+                fit = fitted(X, R, use, disks_px).where(changed, fit)
+                good = torch.where(changed, supported(fit, use), good)
+        first = good
+        beyond = disks_px.largest_px > self.fitter.widest_px  # these have more pixels: see `_wider`
+        before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
+        alone: dict[int, FittedPoses] = {}
+        for some in by_decreasing_size(range(use.shape[1])):
+            if bool((good | beyond).all()):
+                break
+            # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
+            # one size, which disagree, the one nearer to the prediction counts.
+            fits = [fitted(X, R, _only(usable, one), disks_px) for one in some]
+            holds = [
+                supported(fit_, _only(usable, one)) & usable[:, one].all(1)
+                for one, fit_ in zip(some, fits, strict=True)
+            ]
+            astray = [
+                torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
+                for one, right in zip(fits, holds, strict=True)
+            ]
+            nearest, which = torch.stack(astray).min(0)
+            for k, one in enumerate(fits):
+                chosen = ~good & torch.isfinite(nearest) & (which == k)
+                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, some[k]), use)
+            good = good | torch.isfinite(nearest)
+            alone = {k: one for (k, *rest), one in zip(some, fits, strict=True) if not rest}
+        others = torch.zeros_like(use)
+        if bool((usable & ~use).any()):
+            # A camera without the sphere before may see it again: test it at the joint pose.
+            both = fitted(fit.position_lab_mm, fit.R_lab_body, usable)
+            unused = good & (usable & ~use).any(1)
+            limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
+            contradicts = self._contradictory(both, usable, limit)
+            back = unused & supported(both, usable) & ~contradicts
+            fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
+            several = good & ~back & ((usable & ~use).sum(1) > 1)
+            for k in range(use.shape[1] if bool(several.any()) else 0):
+                # Of several such cameras some may see it.
+                rows = several & (usable & ~use)[:, k]
+                wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
+                both = fitted(fit.position_lab_mm, fit.R_lab_body, wider)
+                rows &= supported(both, wider) & ~self._contradictory(both, wider, limit)
+                fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
+            # Another camera is judged only where this frame needs it: results must not depend on the batch.
+            doubtful = ~first | before.any(1) | (unused & contradicts)
+            others = (good & doubtful)[:, None] & usable & ~use
+        for k in range(use.shape[1] if bool(others.any()) else 0):
+            one = alone[k] if alone else fitted(X, R, _only(usable, [k]))
+            others[:, k] &= supported(one, _only(usable, [k]))
+            fit = _beside(fit, one, others[:, k], k)
+        reasons = [
+            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
+            for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
+        ]
+        found = [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
+        for n in torch.nonzero(beyond[:asked])[:, 0].tolist():
+            (found[n],) = self._wider(float(disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
+        return found
+
+    def _wider(self, radius_px: float) -> "BallTracker":
+        """Return a tracker of single frames for a disk that is larger than those the movie was studied on."""
+        steps = math.ceil(math.log(radius_px / self.fitter.widest_px) / math.log(SIZES))
+        if steps not in self._of_size:
+            wider = self._of_size[steps] = copy(self)
+            wider.fitter = replace(self.fitter, widest_px=self.fitter.widest_px * SIZES**steps)
+            wider.settings, wider._of_size = self.settings.model_copy(update={"chunks": 1}), {}
+        return self._of_size[steps]
+
+    def _poor(self, fit: FittedPoses, use: Tensor) -> Tensor:
+        """Return which poses (B,) leave much more of a picture in use than right ones usually do."""
+        return ((1.0 - fit.score > MORE_THAN_USUAL * (1.0 - self.usual_score)) & use).any(1)
+
+    def _approached(
+        self,
+        frames: Sequence[Sequence[Shown]],
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        precision: Tensor,
+        rough: Tensor,
+        among: Neighbours | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
+        for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
+            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
+            fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
+            X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
+            R = torch.where(rough[:, None, None], fit.R_lab_body, R)
+        return X, R
+
+    def _fitted(
+        self,
+        frames: Sequence[Sequence[Shown]],
+        start: Callable[..., NearStart],
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        disks_px: DisksPx | None = None,
+    ) -> FittedPoses:
+        """Fit poses that are nearly right; `start` knows the rest of where they begin."""
+        begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
+        return settled(self.fitter, frames, begin, disks_px)
+
+    def _from(self, position_lab_mm: Tensor) -> Tensor:
+        """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
+        return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
+
+    def _supported(self, fit: FittedPoses, use: Tensor, visible: Tensor | None = None) -> Tensor:
+        """Return which poses have converged and explain all pictures in use well, (B,) bool. Of disks of which others
+        leave a share `visible` (B, C), less is asked, and nothing where it is too little for a score.
+        """
+        seen = use.numpy()
+        explained = (fit.score.numpy() >= self.score_min) | ~seen
+        if visible is not None:
+            left, score = visible.numpy(), fit.score.numpy()
+            explained |= (score >= self.score_min - HIDDEN_LESS * (1.0 - left)) & (left < 1.0)
+            explained |= (score == 0) & (left < SILENT)
+        arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
+        if visible is not None:  # of little paint the pose may not be known at all
+            arrived &= ((score > 0) & seen).any(1) & np.isfinite(fit.covariance.numpy()).all((1, 2))
+        good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
+        return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
+
+    def _contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
+        """Return for which poses two cameras disagree, (B,) bool: their pictures are not of one instant."""
+        wrong = torch.zeros(len(use), dtype=torch.bool)
+        for k, m in combinations(range(use.shape[1]), 2):
+            apart = said.own_turn[:, k] - said.own_turn[:, m]
+            spread = said.own_covariance[:, k] + said.own_covariance[:, m]
+            away = (apart[:, None] @ torch.linalg.pinv(spread) @ apart[..., None])[:, 0, 0].clamp_min(0).sqrt()
+            far = apart.norm(dim=-1) > limit * CONTRADICTS_USUAL * self.usual_apart_rad
+            wrong = wrong | (use[:, k] & use[:, m] & far & (away > limit * CONTRADICTS_SIGMAS))
+        return wrong
+
+    def start(
+        self, shots: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
+    ) -> dict[str, Poses]:
+        """Find a ball that is alone in the scene, as `SceneStart` finds several."""
+        return dict.fromkeys(names, self.searched(shots))
+
+    def searched(self, shots: Sequence[Frame]) -> Poses:
+        """Find the poses of a frame without history, with those cameras whose pictures support them."""
+        poses = self.search.poses(shots)
+        if not len(poses):
+            return poses
+        frames, usable = [shot.picture for shot in shots], _usable(shots)
+        if self.centre is not None:
+            optics = self.search.fitter.optics
+            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
+            order = explaining_first(fit, poses.use).argsort(stable=True)
+            poses = poses_of(fit, order, poses.use, poses.reason)
+        if bool((usable & ~poses.use).any()):
+            poses = self._all_seeing(poses, frames, usable)
+        seen = poses.use & (poses.score[0] >= self.score_min)
+        reason = [
+            Reason.LOW_SCORE if was and not now else why
+            for was, now, why in zip(poses.use.tolist(), seen.tolist(), poses.reason, strict=True)
+        ]
+        if not bool(seen.any()):
+            return no_pose(len(shots), reason)
+        if bool(self._contradictory(poses, seen.expand(len(poses), -1))[0]):
+            return self._by_each(poses, frames, seen)
+        if bool((seen == poses.use).all()):
+            return poses
+        fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
+        return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
+
+    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours) -> Poses:
+        """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
+        those whose pictures support none are left out.
+        """
+        fitter, count = self.search.fitter, len(poses)
+        frames, X = [shot.picture for shot in shots], poses.position_lab_mm[:1]
+        visible = self.fitter.spoilt(X, fitter.disks_px(X), None, among).left[0]
+        use, every = poses.use & (visible > LEAST_VISIBLE), among.of([0] * count)
+        if not bool(use.any()):
+            return replace(poses, use=use)
+        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), every)
+        order = explaining_first(fit, use).argsort(stable=True)
+        best = fit.of(order[:1])
+        seen = use & (best.score[0] > 0) & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
+        seen &= torch.isfinite(best.covariance).all()
+        reason = [
+            Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
+            for now, why in zip(seen.tolist(), poses.reason, strict=True)
+        ]
+        if bool(seen.any()) and not bool((seen == use).all()):
+            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), every)
+            order = explaining_first(fit, seen).argsort(stable=True)
+        return poses_of(fit, order, seen, reason)
+
+    def _looked_at(
+        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps, among: Neighbours | None = None
+    ) -> FittedPoses:
+        """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
+        X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
+        known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
+        held = self.centre is not None
+        use = use.expand(count, -1)
+        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use, known, held, among)
+
+    def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
+        """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
+        each = seen.expand(len(poses), -1)
+        steps = ((self.search.fitter.optics.fine, 1, 4),)
+
+        def supporting(some: Sequence[Sequence[int]]) -> dict[tuple[int, ...], FittedPoses]:
+            fits = {tuple(one): self._looked_at(frames, poses, _only(each, one), steps) for one in some}
+            return {one: fit for one, fit in fits.items() if bool(self._supported(fit, _only(each, one))[0])}
+
+        seeing = torch.nonzero(seen)[:, 0].tolist()
+        right = next(filter(None, map(supporting, by_decreasing_size(seeing))), None)
+        if right is None:
+            return poses
+        main, fit = next(iter(right.items()))
+        alone = right if len(main) == 1 else supporting([[k] for k in seeing if k not in main])
+        others = {k: one for (k,), one in alone.items() if k not in main}
+        for k, one in others.items():
+            fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
+        reason = [
+            Reason.OK if k in main else Reason.CONTRADICTS if k in others else why for k, why in enumerate(poses.reason)
+        ]
+        return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
+
+    def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
+        """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
+        fit = self._looked_at(frames, poses, usable, self.search.fitter.optics.steps)
+        order = fit.nll.argsort(stable=True)
+        if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
+            return poses
+        reason = [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
+        return poses_of(fit, order, usable, reason)
+
+
+def _usable(shots: Sequence[Frame]) -> Tensor:
+    return torch.tensor([shot.usable for shot in shots])
+
+
+def _only(usable: Tensor, cameras: Sequence[int]) -> Tensor:
+    only, some = torch.zeros_like(usable), list(cameras)
+    only[:, some] = usable[:, some]
+    return only
+
+
+def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
+    """Record what a camera alone gives beside poses (B,) to which it did not contribute."""
+    if not bool(rows.any()):
+        return fit
+    own = {
+        "own_turn": so3.log(other.R_lab_body @ fit.R_lab_body.mT),
+        "own_move": other.position_lab_mm - fit.position_lab_mm,
+        **{name: getattr(other, name)[:, camera] for name in OWN},
+    }
+    told = {name: getattr(fit, name).clone() for name in own}
+    for name, value in own.items():
+        told[name][rows, camera] = value[rows]
+    return replace(fit, **told)
+
+
+def _reason(used: bool, contradicts: bool, sees: bool, shot: Frame, before: Reason) -> Reason:
+    if used:
+        return Reason.OK
+    if not sees:
+        return Reason.HIDDEN
+    if contradicts:
+        return Reason.CONTRADICTS
+    if not shot.usable:
+        return shot.reason
+    return before if before in (Reason.NOT_FOUND, Reason.OUTLINE) else Reason.LOW_SCORE
