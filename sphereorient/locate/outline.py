@@ -19,7 +19,8 @@ PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
 THIN = 0.6  # of the least coverage: support of a circle below which it has no rim. Balls: 1.2 or more; blades: 0.4
-FEW, ROUGH = 0.6, 2 / 3  # of the directions; of the tolerance times the coverage: largest rms where so few show an edge
+# Largest rms of a circle: of the tolerance times the squared coverage; a short arc counts as this coverage once.
+ROUGH, SHORT = 1.5, 4 / 9
 PROFILES = 180  # radial profiles; more sample the same pixels again
 ALL_AROUND = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -386,6 +387,6 @@ def fit_outline(
     fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
     if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
         return None
-    if fit.coverage < FEW and fit.rms_px > ROUGH * settings.edge_tolerance_px * fit.coverage:
+    if fit.rms_px > ROUGH * settings.edge_tolerance_px * fit.coverage * max(fit.coverage, SHORT):
         return None
     return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top, painted=painted)
