@@ -10,7 +10,7 @@ from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.report.columns import package, to_xarray
 from sphereorient.trajectory import Trajectory, quaternions_wxyz
-from sphereorient.trajectory.walk import rotation_vectors
+from sphereorient.trajectory.walk import fictrac_rows
 
 Floats = NDArray[np.float64]
 TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
@@ -23,37 +23,25 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
     R, ms, walk = track.posed, 1e3 * track.time, track.walk()
     count = np.arange(len(R))
     begin = np.maximum.accumulate(np.where(walk.start, count, 0))
-    R_cam_lab = camera.R_cam_lab.numpy()
-    from_first = R @ R[begin].transpose(0, 2, 1)  # lab
-    # FicTrac's absolute rotations are those since its first frame, in the lab with the camera's pose put before.
-    R_cam = R_cam_lab @ from_first @ R_cam_lab.T
     step_s = np.diff(track.time, prepend=np.nan)
     ahead, right = walk.forward_rad_s * step_s, walk.side_rad_s * step_s
-    error = np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2))
     stretch = np.where(np.isfinite(walk.heading_rad), 0.0, np.nan)
-    columns = [
-        count + 1,
-        walk.turn_rad @ R_cam_lab.T,
-        error,
-        walk.turn_rad,
-        rotation_vectors(R_cam),
-        rotation_vectors(R_cam_lab.T @ R_cam),
-        walk.path,
-        walk.heading_rad,
-        np.mod(np.arctan2(right, ahead), 2 * np.pi),
-        np.hypot(ahead, right),
-        _since(ahead, begin) + stretch,
-        _since(right, begin) + stretch,
-        ms,
-        count - begin + 1,
-        np.diff(ms, prepend=np.nan),
-        ms,
-    ]
-    table = np.column_stack([np.asarray(part, np.float64) for part in columns])
-    # The first frame of a stretch has not moved.
-    table[walk.start, 1:4] = table[walk.start, 5:8] = 0.0
-    table[walk.start, 17:19] = 0.0
-    return table
+    return fictrac_rows(
+        camera.R_cam_lab.numpy(),
+        R @ R[begin].transpose(0, 2, 1),
+        ahead,
+        right,
+        walk.start,
+        frame=count + 1,
+        turn_lab=walk.turn_rad,
+        error=np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)),
+        path=walk.path,
+        heading=walk.heading_rad,
+        sums=np.stack([_since(steps, begin) + stretch for steps in (ahead, right)], axis=1),
+        time_ms=ms,
+        sequence=count - begin + 1,
+        step_ms=np.diff(ms, prepend=np.nan),
+    )
 
 
 def _since(steps: Floats, begin: NDArray[np.int64]) -> Floats:
