@@ -43,7 +43,7 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
     turn[1:] = rotation_vectors(R_lab_body[1:] @ R_lab_body[:-1].transpose(0, 2, 1))
     ahead, right, about, across = arcs(turn)
     heading, path = np.full(len(turn), np.nan), np.full((len(turn), 2), np.nan)
-    for first, last in _stretches(known):
+    for first, last in runs_of(known):
         some = slice(first + 1, last)
         heading[first:last] = np.concatenate([[0.0], np.cumsum(about[some])])
         steps = turned(across[some], heading[first : last - 1])
@@ -108,7 +108,7 @@ def rotation_vectors(R: Floats) -> Floats:
     return turn
 
 
-def _stretches(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last + 1 of the stretches of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last + 1 of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
