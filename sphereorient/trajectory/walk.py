@@ -8,6 +8,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from sphereorient import so3
+from sphereorient.trajectory.datasets import runs_of
 
 Floats = NDArray[np.float64]
 # The columns of FicTrac's table, in order, and how many numbers each has. Source: FicTrac's doc/data_header.txt.
@@ -106,9 +107,3 @@ def rotation_vectors(R: Floats) -> Floats:
     turn: Floats = so3.log(torch.from_numpy(some)).numpy()
     turn[~known] = np.nan
     return turn
-
-
-def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last + 1 of the runs of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
