@@ -15,7 +15,8 @@ import sys
 import time
 from pathlib import Path
 
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
+from ensembles import EnsembleSpec, draw_ensemble, filtered_track
+
 from sphereorient.trajectory import Trajectory
 
 

@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from ensembles import EnsembleSpec, Nominal, draw_ensemble, nominal, smoothed_track
 
 from sphereorient.motion import ProcessNoise
 from sphereorient.statistics.density import fit_stretched
 from sphereorient.statistics.moments import moments, noise_let_through
 from sphereorient.statistics.segments import UNITS, Ensemble, ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings
-from sphereorient.synth.ensemble import EnsembleSpec, Nominal, draw_ensemble, nominal, smoothed_track
 from sphereorient.trajectory import Trajectory
 
 NOISE_DEG, ROUGH_DEG, NOISE_MM = 0.1, 2.0, 0.05

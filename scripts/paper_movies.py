@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
+from ensembles import Draw, EnsembleSpec, Law
 from numpy.typing import NDArray
 from scipy.special import expit
 from torch import Tensor
@@ -18,10 +19,9 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, save_cameras
 from sphereorient.files.picture import write_picture
 from sphereorient.movies import write_ffv1
-from sphereorient.synth import EnsembleSpec, RandomMotion, SynthSettings, degrade, make_scene, random_texture
+from sphereorient.synth import RandomMotion, SynthSettings, degrade, make_scene, random_texture
 from sphereorient.synth.degrade import Disk
 from sphereorient.synth.degrade_scene import picture_of_ball
-from sphereorient.synth.ensemble import Draw, Law
 from sphereorient.synth.scene import Exposure, digitise, exposures, seeded
 from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, instants_s, write_truth
 

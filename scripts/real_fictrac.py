@@ -36,6 +36,7 @@ from sphereorient.methods.settings import Settings, load_settings
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.texture_map import compare_pictures, map_figure, write_learnt, write_texture
 from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory.walk import FICTRAC
 
 REPO = Path(__file__).resolve().parents[1]
 SIZE, VFOV_DEG, CENTRE = (384, 288), 45.0, (192.0, 144.0)
@@ -152,12 +153,13 @@ def compare_attitudes(R_lab_body: torch.Tensor, source: Path) -> None:
     print("absolute attitude, best constant rotations taken off:")
     valid = torch.isfinite(R_lab_body).flatten(1).all(1)
     for q in reversed(FACTORS):
-        theirs = torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, 8:11])
+        theirs = torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, FICTRAC["rotation_cam"]])
         C = to_cone()
         R = C @ so3.exp(theirs) @ C.mT
         told(f"ours - FicTrac q{q}", np.rad2deg(so3.geodesic_distance(*aligned(R[valid], R_lab_body[valid])).numpy()))
     a, b = (
-        so3.exp(torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, 8:11])) for q in (6, 10)
+        so3.exp(torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, FICTRAC["rotation_cam"]]))
+        for q in (6, 10)
     )
     told("FicTrac q6 - q10", np.rad2deg(so3.geodesic_distance(*aligned(a, b)).numpy()))
 

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
+from ensembles import EnsembleSpec, draw_ensemble
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track as shown
@@ -24,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from sphereorient.statistics.isotropy import anisotropic_frame, isotropy, uniformity
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
 
 Floats = NDArray[np.float64]
 Attitudes = tuple[Floats, NDArray[np.int64] | None]

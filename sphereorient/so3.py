@@ -10,19 +10,14 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
-from sphereorient.files.compiled import compiled
+from sphereorient.files.compiled import compiled, record
 
 SOURCE = Path(__file__).with_suffix("")
+_Rotations = record(SOURCE, "Rotations")
 MEAN_STEPS = 12
 NO_ROTATION = 1e-3  # of an entry of R R^T - I: far beyond rounding, half a milliradian
 ROUNDING = 1e-9  # a count that is a whole number by geometry must not be rounded up for the last bits of a sine
 HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic lattice with a point per unit of volume
-
-
-class _Rotations(ctypes.Structure):
-    """The record of so3.c."""
-
-    _fields_ = [("count", ctypes.c_int64), ("from", ctypes.c_void_p), ("to", ctypes.c_void_p)]
 
 
 def exp(rotvec: Tensor) -> Tensor:

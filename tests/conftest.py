@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 REPO = Path(__file__).resolve().parents[1]
-# Examples of one room serve the tests of others.
+# Examples of one room serve the tests of others, and so do scripts.
 sys.path[:0] = sorted(str(folder) for folder in Path(__file__).parent.rglob("*/") if folder.name != "__pycache__")
+sys.path.append(str(REPO / "scripts"))
 SHARED = REPO.parent / "shared"
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-12}
 BATCHES: list[tuple[int, ...]] = [(), (0,), (1,), (2, 1, 3)]

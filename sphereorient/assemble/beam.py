@@ -25,6 +25,7 @@ from sphereorient.assemble.states import (
     rotation_between,
     soft_min,
 )
+from sphereorient.trajectory import runs_of
 
 BEAM_NATS = 30.0  # more than a break and a new beginning cost
 STATES_MAX = 256
@@ -244,11 +245,10 @@ class BeamSearch:
             alone[2:] |= np.minimum.reduceat(others, self.offset[2:-1] - self.offset[2]) - each[here] >= PIN_ALONE_NATS
             follows = alone[2:] & alone[1:-1] & alone[:-2] & close[1:] & close[:-1]
             follows &= ratio[here] - np.maximum(self.still[main[2:]] + self.log_stuck, 0.0) >= PIN_NATS
-        edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
-        for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
-            if end - begin + 1 < max(length, 2 * PIN_MARGIN + 4):
+        for begin, end in runs_of(follows):
+            if end - begin + 2 < max(length, 2 * PIN_MARGIN + 4):
                 continue
-            first, stop = begin + PIN_MARGIN + 1, end - PIN_MARGIN
+            first, stop = begin + PIN_MARGIN + 1, end + 1 - PIN_MARGIN
             # There one state is left.
             starts = first + np.flatnonzero(single[first:stop] & single[first - 1 : stop - 1])
             if len(starts):

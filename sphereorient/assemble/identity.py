@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from sphereorient import so3
+from sphereorient.trajectory import runs_of
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -123,8 +124,7 @@ def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
     ends = sorted({0, *breaks, seen.shape[1]})
     for row, there in enumerate(seen):
         for first, last in pairwise(ends):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], there[first:last].astype(int), [0]]))) + first
-            found += [_Piece(row, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+            found += [_Piece(row, first + a, first + b) for a, b in runs_of(there[first:last])]
     return found
 
 

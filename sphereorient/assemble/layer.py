@@ -12,11 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient import so3
-from sphereorient.assemble.first_order_cost import edge_costs, turns_over_gaps
 from sphereorient.assemble.second_order import Chosen, physical_path
 from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
-from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path, taken, visited_before
+from sphereorient.assemble.trellis import (
+    ShortestPath,
+    SoftPath,
+    edge_costs,
+    shortest_path,
+    soft_path,
+    taken,
+    turns_over_gaps,
+    visited_before,
+)
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 Values = Tensor | NDArray[np.floating]

@@ -15,6 +15,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, centre_lab_mm, sphere_disk_px
 from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.trajectory import Tracks, Trajectory
+from sphereorient.trajectory.walk import FICTRAC
 
 Floats = NDArray[np.float64]
 Frames = NDArray[np.int64]
@@ -22,7 +23,6 @@ RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "al
 ALIGNMENTS = ("none", "body", "both")
 AXES = 3
 ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
-FICTRAC_FRAME, FICTRAC_ROTATION = 0, slice(8, 11)  # columns: frame counter, absolute rotation vector (camera axes)
 FICTRAC_COLUMNS = 23  # at least; newer versions have more
 POINTS = 41  # across a disk, of which some are hidden
 DO = "pass the truth.h5 of this synthetic experiment"
@@ -226,7 +226,6 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats]:
     """Read frames (N,), from 0, and orientations (N, 3, 3), body to camera axes, of a FicTrac 2 .dat file.
 
     They are relative to its first frame, in axes of its own: align with "both". Raise BenchError for other files.
-    Source: FicTrac's doc/data_header.txt.
     """
     do = "pass FicTrac's .dat file"
     try:
@@ -237,8 +236,8 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats]:
     if rows.shape[0] == 0 or rows.shape[1] < FICTRAC_COLUMNS:
         got = f"{rows.shape[0]} lines of {rows.shape[1]}"
         raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
-    R = so3.exp(torch.from_numpy(np.ascontiguousarray(rows[:, FICTRAC_ROTATION]))).numpy()
-    return rows[:, FICTRAC_FRAME].astype(np.int64), R
+    R = so3.exp(torch.from_numpy(np.ascontiguousarray(rows[:, FICTRAC["rotation_cam"]]))).numpy()
+    return rows[:, 0].astype(np.int64), R
 
 
 READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}

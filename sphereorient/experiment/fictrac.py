@@ -12,6 +12,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
+from sphereorient.sphere.view import fitted_circle
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 DO = "name the config.txt with which FicTrac ran"
@@ -65,7 +66,7 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
         rate_hz=rate[0] if len(rate) == 1 and rate[0] > 0 else None,
         vfov_deg=vfov[0],
         ignored=tuple(_polygons(path, values.get("roi_ignr", ""))),
-        circle_px=_circle(limb.reshape(-1, 2)) if len(limb) >= 6 and len(limb) % 2 == 0 else None,
+        circle_px=fitted_circle(limb.reshape(-1, 2)) if len(limb) >= 6 and len(limb) % 2 == 0 else None,
         R_animal_cam=so3.exp(torch.tensor(turn, dtype=torch.float64)),
     )
 
@@ -81,10 +82,3 @@ def _polygons(path: Path, text: str) -> list[NDArray[np.int32]]:
         got, do = "another count of numbers", "correct it"
         raise ExperimentError(refusal(f"{path}, roi_ignr", expected="u, v of three points or more", got=got, do=do))
     return [np.rint(one).astype(np.int32).reshape(-1, 2) for one in polygons]
-
-
-def _circle(limb: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return the circle that fits points (n, 2) best, by Kasa's linear least squares."""
-    design = np.column_stack([2 * limb, np.ones(len(limb))])
-    u, v, rest = np.linalg.lstsq(design, (limb**2).sum(1), rcond=None)[0]
-    return float(u), float(v), float(np.sqrt(max(rest + u**2 + v**2, 0.0)))

@@ -2,12 +2,28 @@
 
 import ctypes
 import os
+import re
 from functools import cache
 from pathlib import Path
 
 import torch
 
 WITHOUT = "SPHEREORIENT_NO_COMPILED"  # an environment variable: where it is set, nothing compiled is used
+
+NUMBERS = {"int64_t": ctypes.c_int64, "float": ctypes.c_float, "double": ctypes.c_double}
+
+
+@cache
+def record(source: Path, name: str) -> type[ctypes.Structure]:
+    """Return a record of a C source (without suffix): numbers, pointers and other records, as declared there."""
+    text = re.sub(r"/\*.*?\*/", "", source.with_suffix(".c").read_text(encoding="utf-8"), flags=re.DOTALL)
+    declared = re.findall(rf"typedef struct {{([^}}]*)}} {name};", text)[0]
+    fields = [
+        (part.strip(" *"), ctypes.c_void_p if "*" in part else NUMBERS.get(kind) or record(source, kind))
+        for kind, parts in re.findall(r"(?:const )?(\w+) ([^;]+);", declared)
+        for part in parts.split(",")
+    ]
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
 @cache

@@ -60,6 +60,12 @@ def decoded_grey(content: bytes) -> NDArray[Any] | None:
     return None if picture is None or picture.ndim != 2 else np.asarray(picture)
 
 
+def eight_bits(picture: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return a grey picture of any number type for people to see: its brightest level is white."""
+    white = max(1.0, float(np.percentile(picture[::4, ::4], 99.9)))
+    return np.clip(picture * (255.0 / white), 0, 255).astype(np.uint8)
+
+
 def write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
     """Write a picture (H, W) by the suffix of its name, whole or not at all (OutputError)."""
     with put_aside(path) as aside:

@@ -23,12 +23,11 @@ from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.live.feed import movie_frames
 from sphereorient.live.outputs import HOST
 from sphereorient.live.shared import SharedFrames
+from sphereorient.trajectory.walk import FICTRAC
 
 BEGIN_S = 120.0  # until the tracker's first line
 QUIET_S = 2.0  # without a line: the end
 FIRST = 50  # lines that do not count: caches fill
-# Columns of FicTrac's line: number, rotation since the stretch began (camera), place in the stretch.
-NUMBER, ROTATION, SEQUENCE = 1, slice(9, 12), 23
 TENTHS = 10
 EVERY = 1000  # lines from one look at the memory to the next
 # Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
@@ -184,8 +183,8 @@ def _received(
             continue
         now = time.perf_counter()
         begun.set()
-        rotation = map(float, parts[ROTATION])
-        found.append((float(parts[NUMBER]), now, *rotation, float(parts[SEQUENCE])))
+        row = list(map(float, parts[1:]))  # behind "FT"
+        found.append((row[0], now, *row[FICTRAC["rotation_cam"]], *row[FICTRAC["sequence"]]))
         saw(len(found))
 
 

@@ -11,7 +11,7 @@ from sphereorient.cameras import Camera
 from sphereorient.live.live import Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
-from sphereorient.trajectory.walk import arcs, rotation_vectors, turned
+from sphereorient.trajectory.walk import arcs, fictrac_rows, rotation_vectors, turned
 
 Floats = NDArray[np.float64]
 DIGITS = 14
@@ -28,47 +28,41 @@ class FicTracLines:
         self._before: Measured | None = None
         self._first = np.eye(3)  # R_lab_body where this stretch begins
         self._sequence = 0
-        self._heading, self._path, self._sums = 0.0, np.zeros(2), np.zeros(2)
+        self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
 
     def columns(self, now: Measured) -> Floats:
         """Return the columns (25,) of the next frame."""
         before, self._before = self._before, now
-        step_ms = math.nan if before is None else 1e3 * (now.time_s - before.time_s)
-        begins = before is None or not before.valid
-        if now.valid and begins:
+        start = now.valid and (before is None or not before.valid)
+        if start:
             self._first, self._sequence = now.R_lab_body, 0
-            self._heading, self._path, self._sums = 0.0, np.zeros(2), np.zeros(2)
-        R_before = now.R_lab_body if before is None or begins else before.R_lab_body
-        R_cam = self._R_cam_lab @ now.R_lab_body @ self._first.T @ self._R_cam_lab.T
-        rotations = np.stack([now.R_lab_body @ R_before.T, R_cam, self._R_cam_lab.T @ R_cam])
-        turn, *absolute = rotation_vectors(rotations)
-        *rates, step = arcs(turn[None])
-        ahead, right, about = (float(part[0]) for part in rates)
+            self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
+        R_before = now.R_lab_body if before is None or start else before.R_lab_body
+        turn = rotation_vectors((now.R_lab_body @ R_before.T)[None])
+        ahead, right, about, step = arcs(turn)
         if now.valid:
-            self._path = self._path + turned(step, np.array([self._heading]))[0]
-            self._heading = (self._heading + about) % (2 * math.pi)
-            self._sums = self._sums + np.array([ahead, right])
+            self._path = self._path + turned(step, np.array([self._heading]))
+            self._heading = (self._heading + float(about[0])) % (2 * math.pi)
+            self._sums = self._sums + np.column_stack([ahead, right])
         self._sequence += 1
-        nothing = np.nan if not now.valid else 0.0
-        direction = math.nan if begins else math.atan2(right, ahead) % (2 * math.pi)
-        return np.array(
-            [
-                now.number + 1,
-                *(turn @ self._R_cam_lab.T),
-                now.error_rad,
-                *turn,
-                *absolute[0],
-                *absolute[1],
-                *(self._path + nothing),
-                self._heading + nothing,
-                *((0.0, 0.0) if begins and now.valid else (direction, math.hypot(ahead, right))),
-                *(self._sums + nothing),
-                1e3 * now.time_s,
-                self._sequence,
-                step_ms,
-                1e3 * now.time_s,
-            ]
+        nothing = 0.0 if now.valid else np.nan
+        rows = fictrac_rows(
+            self._R_cam_lab,
+            (now.R_lab_body @ self._first.T)[None],
+            ahead,
+            right,
+            np.array([start]),
+            frame=now.number + 1,
+            turn_lab=turn,
+            error=now.error_rad,
+            path=self._path + nothing,
+            heading=self._heading + nothing,
+            sums=self._sums + nothing,
+            time_ms=1e3 * now.time_s,
+            sequence=self._sequence,
+            step_ms=math.nan if before is None else 1e3 * (now.time_s - before.time_s),
         )
+        return rows.ravel()
 
 
 def fictrac_line(columns: Floats) -> str:

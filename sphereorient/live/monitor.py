@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sphereorient.live.feed import Arrival, Feed, Tell
 from sphereorient.live.live import Measured
 from sphereorient.trajectory import Reason
+from sphereorient.trajectory.walk import FICTRAC
 
 KEPT = 1000  # latencies
 LOST_S = 0.5  # without a pose: then it is told
@@ -35,7 +36,6 @@ NOT_EXPLAINED = (
     "its outline is seen, but no orientation explains its paint: this is another ball, or the map of another one, or "
     "light or focus are others than when they were studied"
 )
-PATH, HEADING = slice(14, 16), 16  # places in FicTrac's columns
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,9 +85,9 @@ class Monitor:
         self._watch(now)
         heading_rad = float("nan")
         if columns is not None:
-            x, y = columns[PATH].tolist()
+            x, y = columns[FICTRAC["path"]].tolist()
             self.path.append((x, y))
-            heading_rad = float(columns[HEADING])
+            heading_rad = float(columns[FICTRAC["heading"]][0])
         self.newest = Seen(arrival=self._arrival, now=now, heading_rad=heading_rad)
 
     def _watch(self, now: Measured) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, error_words, refusal
 from sphereorient.files.page_server import HOST, PageHandler, new_token
+from sphereorient.files.picture import eight_bits
 from sphereorient.live.lines import without_nan
 from sphereorient.live.monitor import Monitor, Seen
 from sphereorient.pose import CameraView
@@ -26,7 +27,6 @@ PAGE = Path(__file__).with_name("page.html")
 WIDEST = 640  # px, of a picture that is sent
 BARS = 40  # of the histogram
 STEPS = 1000  # of the path
-WHITE = 99.9  # percentile of the pixels that is shown white, of pictures of more than 8 bit
 Json = dict[str, Any]
 
 
@@ -106,9 +106,7 @@ class LivePage:
 def _jpeg(picture: NDArray[Any] | None) -> str | None:
     if picture is None:
         return None
-    if picture.dtype != np.uint8:
-        white = max(1.0, float(np.percentile(picture[::4, ::4], WHITE)))
-        picture = np.clip(picture * (255.0 / white), 0, 255).astype(np.uint8)
+    picture = picture if picture.dtype == np.uint8 else eight_bits(picture)
     if (width := picture.shape[1]) > WIDEST:
         size = WIDEST, round(picture.shape[0] * WIDEST / width)
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -12,10 +12,9 @@ from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
 from sphereorient.files.provenance import provenance
 from sphereorient.mapping import LearntMap, fit_map, take_crops
-from sphereorient.mapping.alike import shared_maps
+from sphereorient.mapping.alike import corrected, shared_maps
 from sphereorient.mapping.balls import take_crops_of_all
 from sphereorient.mapping.compare import MapComparison
-from sphereorient.mapping.old_map import corrected
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml

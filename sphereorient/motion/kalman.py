@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.files.compiled import compiled
+from sphereorient.files.compiled import compiled, record
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+SOURCE = Path(__file__).with_suffix("")
+_Chain = record(SOURCE, "Chain")
 EVERY = 64  # states between stored covariances; the smoother computes the others again, to the same bits
 
 
@@ -165,20 +167,9 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
     return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)
 
 
-class _Chain(ctypes.Structure):
-    """The record `Chain` of kalman.c, field by field."""
-
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in ("count", "size", "every", "wanted_rows")),
-        *((name, ctypes.c_void_p) for name in ("carried", "drift", "kind", "grown", "noise", "start", "measured")),
-        *((name, ctypes.c_void_p) for name in ("covariance", "used", "state", "stored", "gain", "innovation")),
-        *((name, ctypes.c_void_p) for name in ("inverse", "sums", "wanted", "smoothed", "spread", "mahalanobis")),
-    ]
-
-
 def library() -> ctypes.CDLL | None:
     """Return the compiled recursions; None where there are none."""
-    return compiled(Path(__file__).with_name("kalman"), _Chain)
+    return compiled(SOURCE, _Chain)
 
 
 def _run(code: ctypes.CDLL, name: str, chain: StateSpace, **arrays: Floats) -> None:
@@ -186,8 +177,8 @@ def _run(code: ctypes.CDLL, name: str, chain: StateSpace, **arrays: Floats) -> N
     given = {key: np.ascontiguousarray(getattr(chain, key)) for key in StateSpace.__dataclass_fields__} | arrays
     numbers = {"count": len(chain.measured), "size": len(chain.start), "every": EVERY}
     numbers["wanted_rows"] = len(arrays.get("wanted", ()))
-    record = _Chain(**numbers, **{key: array.ctypes.data for key, array in given.items()})
-    if code[name](ctypes.byref(record)):
+    task = _Chain(**numbers, **{key: array.ctypes.data for key, array in given.items()})
+    if code[name](ctypes.byref(task)):
         raise MemoryError
 
 

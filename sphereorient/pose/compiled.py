@@ -3,7 +3,7 @@
 import ctypes
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.files.compiled import compiled
+from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
 from sphereorient.locate import Background
 from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
@@ -39,78 +39,9 @@ RESULTS = {
 }  # parts of `FittedPoses`, in the order of the record
 READABLE = {np.dtype(name) for name in ("uint8", "uint16", "float32")}  # pixels, in this machine's order of bytes
 SOURCE = Path(__file__).with_name("refine")
-
-
-class _Table(ctypes.Structure):
-    _fields_ = [("rows", ctypes.c_void_p), ("side", ctypes.c_int64)]
-
-
-# The records of refine.c, field by field.
-class _Task(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in ("disks", "places", "inner", "cameras", "tiles", "instants", "origins")),
-        *((name, ctypes.c_void_p) for name in ("grey", "behind", "inside", "clipped", "direction", "origin", "axes")),
-        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm", "moved", "instant", "shares", "tile")),
-        *((name, ctypes.c_float) for name in ("radius_mm", "blur_px")),
-        *((name, _Table) for name in ("paint", "unseen")),
-        *(
-            (name, ctypes.c_float)
-            for name in ("unseen_most", "known_least", "cover_least", "sine_most", "noise_least", "tukey2", "outliers")
-        ),
-        ("edge", ctypes.c_void_p),
-        ("edges", ctypes.c_int64),
-        ("edge_most", ctypes.c_float),
-        ("lab", ctypes.c_int64),
-        ("light", ctypes.c_void_p),
-        ("light_side", ctypes.c_int64),
-        ("cover", ctypes.c_void_p),
-        ("depths", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("gain", "noise", "stray")),
-        *((name, ctypes.c_int64) for name in ("n_difference", "n_black")),
-        *((name, ctypes.c_void_p) for name in ("start", "start_rotation", "use", "place_precision")),
-        ("iterations", ctypes.c_int64),
-        ("limb_px", ctypes.c_void_p),
-        *((name, ctypes.c_float) for name in ("edge_px", "most_hidden", "covered", "most_each", "least_of_window")),
-        *((name, ctypes.c_int64) for name in ("window", "margin")),
-        ("place", ctypes.c_void_p),
-        ("kept", ctypes.c_void_p),
-        *((name, ctypes.c_void_p) for name in RESULTS),
-    ]
-
-
-class _Stencil(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in ("places", "inner", "tiles")),
-        *((name, ctypes.c_void_p) for name in ("place", "tile")),
-    ]
-
-
-class _Scene(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in ("width", "height", "origins")),
-        *((name, ctypes.c_void_p) for name in ("behind", "shown", "direction", "origin", "axes")),
-        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm")),
-        ("full_scale", ctypes.c_double),
-    ]
-
-
-class _Shot(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_int64) for name in ("grey", "row", "column", "bytes", "u", "v")]
-
-
-class _Near(ctypes.Structure):
-    _fields_ = [
-        ("task", _Task),
-        ("some", _Stencil),
-        ("all", _Stencil),
-        *((name, ctypes.c_void_p) for name in ("scene", "shot", "moved")),
-        *((name, ctypes.c_int64) for name in ("some_more", "all_more")),
-        ("near_rad", ctypes.c_double),
-        ("most_hidden", ctypes.c_float),
-        ("held", ctypes.c_int64),
-        ("far", ctypes.c_void_p),
-        *((name, ctypes.c_void_p) for name in ("some_hidden", "all_hidden")),
-    ]
+_Table, _Task, _Stencil, _Scene, _Shot, _Near = (
+    record(SOURCE, name) for name in ("Table", "Task", "Stencil", "Scene", "Shot", "Near")
+)
 
 
 def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
@@ -168,10 +99,16 @@ def refined(
     task.start, task.start_rotation = at(X, torch.float64), at(R, torch.float64)
     task.use, task.place_precision = at(use), at(place_precision, torch.float64)
     task.iterations, task.most_hidden = iterations, most_hidden
-    for name, part in (("kept", kept), *parts.items()):
-        setattr(task, name, part.data_ptr())
+    task.kept = kept.data_ptr()
+    _into(task, parts)
     _run(code.refine, task, poses)
     return kept, parts
+
+
+def _into(task: ctypes.Structure, parts: Mapping[str, Tensor]) -> None:
+    """Let the results of a task go into the parts of `FittedPoses`: the last fields, in the order of `RESULTS`."""
+    for field, part in zip(_Task._fields_[-len(RESULTS) :], parts.values(), strict=True):
+        setattr(task, field[0], part.data_ptr())
 
 
 def _run(work: Callable[..., int], task: ctypes.Structure, poses: int) -> None:
@@ -233,14 +170,13 @@ def settled(
     task.cameras, task.instants, task.instant, task.shares = cameras, instants, at(instant), at(share)
     task.start, task.start_rotation = at(begin.position_lab_mm, torch.float64), at(begin.R_lab_body, torch.float64)
     task.use, task.place_precision = at(begin.use), at(begin.place_precision, torch.float64)
-    for name, part in parts.items():
-        setattr(task, name, part.data_ptr())
+    _into(task, parts)
     _run(code.settle, near, poses)
     return parts, far
 
 
 @lru_cache(maxsize=16)
-def _of_scene(sight: LinesOfSight, background: Background) -> tuple[_Scene, list[Tensor]]:
+def _of_scene(sight: LinesOfSight, background: Background) -> tuple[ctypes.Structure, list[Tensor]]:
     """Return the record of a camera, and what it points to."""
     alive = [torch.from_numpy(np.ascontiguousarray(background.mean)), sight.direction]
     alive += [sight.origin.contiguous(), sight.axes.contiguous(), sight.pitch_rad, sight.pitch_mm]
@@ -265,7 +201,7 @@ def _of_scene(sight: LinesOfSight, background: Background) -> tuple[_Scene, list
 
 
 @lru_cache(maxsize=64)
-def _of_stencil(stencil: Stencil) -> _Stencil:
+def _of_stencil(stencil: Stencil) -> ctypes.Structure:
     tiles = int(stencil.tile.max()) + 1
     place, tile = stencil.place.data_ptr(), stencil.tile.data_ptr()
     return _Stencil(places=len(stencil.tile), inner=stencil.inner, tiles=tiles, place=place, tile=tile)
@@ -289,7 +225,7 @@ class _Addresses:
 
 
 @lru_cache(maxsize=16)
-def _of_model(model: SphereModel) -> tuple[_Task, _Addresses]:
+def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
     """Return a record with all that depends on the model alone, and what it points to."""
     at = _Addresses()
     light, paint, unseen = model.light.tables, model.paint, model.paint.unseen

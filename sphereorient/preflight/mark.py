@@ -66,12 +66,6 @@ class Marking(ABC):
         return read_text(self.path, TEXT_BYTES, "a YAML file", self.error, "correct the path")
 
 
-def eight_bits(picture: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return a grey picture of any number type with its brightest level as white."""
-    white = max(1.0, float(np.percentile(picture, 99.9)))
-    return np.clip(picture * (255.0 / white), 0, 255).astype(np.uint8)
-
-
 def png(picture: NDArray[np.uint8]) -> bytes:
     """Return a picture as a PNG file, quickly."""
     return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])

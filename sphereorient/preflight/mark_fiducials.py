@@ -14,7 +14,8 @@ from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.plates import read_plate_picture
 from sphereorient.calibration.targets import FIDUCIALS
 from sphereorient.errors import CameraError, refusal
-from sphereorient.preflight.mark import Json, Marking, eight_bits, png
+from sphereorient.files.picture import eight_bits
+from sphereorient.preflight.mark import Json, Marking, png
 
 
 class FiducialMarking(Marking):

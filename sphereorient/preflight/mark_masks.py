@@ -15,10 +15,10 @@ from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import Experiment, open_movies
 from sphereorient.experiment.stream import given_mask
-from sphereorient.files.picture import write_picture
+from sphereorient.files.picture import eight_bits, write_picture
 from sphereorient.movies import Movie, flipped_picture
 from sphereorient.preflight.first_look import FirstLook, look_at_movie
-from sphereorient.preflight.mark import Json, Marking, eight_bits, png
+from sphereorient.preflight.mark import Json, Marking, png
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 

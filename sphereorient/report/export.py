@@ -1,28 +1,32 @@
-"""A track for other programs: tables, MATLAB, and what programs of poses read (docs/export.md)."""
+"""A track for other programs: tables, MATLAB; of poses FicTrac's table, TUM's, VTK for ParaView, NWB, netCDF."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.files.whole_file import put_aside
-from sphereorient.report import export_poses
 from sphereorient.report.columns import (
     FORMULA,
     as_text,
     columns,
     frame_wise,
     metadata,
+    package,
     reasons,
     safe_names,
     to_arrow,
+    to_xarray,
     with_unit,
 )
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
+from sphereorient.trajectory.walk import fictrac_rows
 
 SUFFIXES = {
     ".csv": "csv",
@@ -36,6 +40,8 @@ SUFFIXES = {
     ".nc": "netcdf",
 }
 ROWS = 50_000  # written at once
+TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
+Floats = NDArray[np.float64]
 Advance = Callable[[int, int], None]
 
 
@@ -145,17 +151,142 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
     return arrays
 
 
-def _poses(write: Callable[[Trajectory, Path, Camera | None], None]) -> Callable[[Export], None]:
-    return lambda job: write(job.track, job.path, job.camera)
+def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
+    """Return the 25 columns of FicTrac's table, (N, 25); the lab is the animal's frame, x ahead, y right, z down.
+    Column 5, an error of its own, is the root mean square of the stated errors, rad. NaN where there is no pose.
+    """
+    R, ms, walk = track.posed, 1e3 * track.time, track.walk()
+    count = np.arange(len(R))
+    begin = np.maximum.accumulate(np.where(walk.start, count, 0))
+    step_s = np.diff(track.time, prepend=np.nan)
+    ahead, right = walk.forward_rad_s * step_s, walk.side_rad_s * step_s
+    stretch = np.where(np.isfinite(walk.heading_rad), 0.0, np.nan)
+    return fictrac_rows(
+        camera.R_cam_lab.numpy(),
+        R @ R[begin].transpose(0, 2, 1),
+        ahead,
+        right,
+        walk.start,
+        frame=count + 1,
+        turn_lab=walk.turn_rad,
+        error=np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)),
+        path=walk.path,
+        heading=walk.heading_rad,
+        sums=np.stack([_since(steps, begin) + stretch for steps in (ahead, right)], axis=1),
+        time_ms=ms,
+        sequence=count - begin + 1,
+        step_ms=np.diff(ms, prepend=np.nan),
+    )
+
+
+def _since(steps: Floats, begin: NDArray[np.int64]) -> Floats:
+    """Return the sum of steps (N,) since the frames `begin`, these not included."""
+    total = np.nancumsum(steps)
+    return np.asarray(total - total[begin])
+
+
+def _write_fictrac(job: Export) -> None:
+    """Write FicTrac's table of a ball in its place."""
+    if job.camera is None:
+        do = "add --experiment experiment.yaml: the table has the camera's axes"
+        raise OutputError(refusal("--to fictrac", expected="the experiment of the track", got="none", do=do))
+    np.savetxt(job.path, fictrac_table(job.track, job.camera), fmt="%.14g", delimiter=", ")
+
+
+def _write_tum(job: Export) -> None:
+    """Write time, position and quaternion x y z w of each valid frame, as evo and rpg_trajectory_evaluation read it."""
+    track = job.track
+    w, xyz = np.split(quaternions_wxyz(track.orientation[track.valid]), [1], axis=1)
+    table = np.column_stack([track.time[track.valid], track.position[track.valid], xyz, w])
+    header = f"time_s x_{track.length_unit} y z qx qy qz qw (R_lab_body); made by sphereorient"
+    np.savetxt(job.path, table, fmt="%.17g", header=header)
+
+
+def _write_vtk(job: Export) -> None:
+    """Write VTKHDF, a time series for ParaView: the ball's centre, a point in each valid frame, with its vectors.
+    Source: the file format of VTK 9.3, transient poly data.
+    """
+    track = job.track
+    some = track.valid
+    count = int(some.sum())
+    R, time, position = track.orientation[some], track.time[some], track.position[some]
+    parts = {
+        **{f"body_{axis}": R[:, :, k] for k, axis in enumerate("xyz")},
+        "quaternion_wxyz": quaternions_wxyz(R),
+        **{name: getattr(track, name)[some] for name in ("velocity", "acceleration", "omega_lab", "alpha_lab")},
+        "orientation_sigma_rad": np.sqrt(np.trace(track.orientation_cov[some], axis1=1, axis2=2) / 3),
+        "frame": np.flatnonzero(some),
+        "flags": track.flags[some].astype(np.int64),
+    }
+    frame, zeros = np.arange(count), np.zeros(count, np.int64)
+    with h5py.File(job.path, "w") as file:
+        root = file.create_group("VTKHDF", track_order=True)
+        root.attrs["Version"] = np.array([2, 0])
+        kind = np.bytes_("PolyData")
+        root.attrs.create("Type", kind, dtype=h5py.string_dtype("ascii", len(kind)))
+        root["NumberOfPoints"] = np.ones(count, np.int64)
+        root["Points"] = position
+        steps = root.create_group("Steps")
+        steps.attrs["NSteps"] = count
+        steps["Values"] = time
+        steps["PartOffsets"], steps["NumberOfParts"] = frame, np.ones(count, np.int64)
+        steps["PointOffsets"] = frame
+        # Each part has one vertex, and nothing else.
+        vertex = np.stack([frame, zeros, zeros, zeros], axis=1)
+        steps["CellOffsets"], steps["ConnectivityIdOffsets"] = vertex, vertex
+        for topology in TOPOLOGIES:
+            group, one = root.create_group(topology), int(topology == "Vertices")
+            group["NumberOfCells"] = group["NumberOfConnectivityIds"] = np.full(count, one, np.int64)
+            group["Offsets"] = np.tile([0, 1], count) if one else np.zeros(count, np.int64)
+            group["Connectivity"] = np.zeros(count * one, np.int64)
+        data, offsets = root.create_group("PointData"), steps.create_group("PointDataOffsets")
+        for name, values in parts.items():
+            data[name], offsets[name] = values, frame
+
+
+def _write_nwb(job: Export) -> None:
+    """Write Neurodata Without Borders: rotation, angular velocity, position and the walk as time series; SI units."""
+    pynwb = package("pynwb", "nwb")
+    from datetime import UTC, datetime
+
+    track, walk = job.track, job.track.walk()
+    about = f"{track.title}: {track.method} method of sphereorient"
+    # The recording's date is not in a track: the epoch says so.
+    begin = datetime(1970, 1, 1, tzinfo=UTC)
+    file = pynwb.NWBFile(session_description=about, identifier=track.title, session_start_time=begin)
+    module = file.create_processing_module(name="behavior", description="pose of the ball; frames without one are NaN")
+    length, unit = (1.0, "radii") if track.length_unit == "radii" else (1e-3, "m")
+    series = {
+        "orientation_wxyz": (quaternions_wxyz(track.orientation), "1", "quaternion of R_lab_body, w first"),
+        "omega_lab": (track.omega_lab, "rad/s", "angular velocity, lab"),
+        "position": (length * track.position, unit, "centre of the ball, lab"),
+        "velocity": (track.velocity, "radii/s" if unit == "radii" else "m/s", "velocity of the centre, lab"),
+        "walk_forward": (walk.forward_rad_s, "radii/s", "of an animal that walks on the ball, ahead (lab x)"),
+        "walk_side": (walk.side_rad_s, "radii/s", "of the animal, to the right (lab y)"),
+        "walk_turn": (walk.turn_rad_s, "rad/s", "of the animal, to the right"),
+        "walk_heading": (walk.heading_rad, "rad", "direction that the animal faces, since the segment began"),
+        "walk_path": (walk.path, "radii", "place on the plane on which the animal walks"),
+    }
+    for name, (values, units, description) in series.items():
+        module.add(pynwb.TimeSeries(name=name, data=values, unit=units, timestamps=track.time, description=description))
+    with pynwb.NWBHDF5IO(str(job.path), "w") as io:
+        io.write(file)
+
+
+def _write_netcdf(job: Export) -> None:
+    """Write netCDF 3, all arrays with named axes and units."""
+    data = to_xarray(job.track)
+    data = data.assign({name: data[name].astype("int32") for name in ("flags", "segment", "valid")})
+    data.to_netcdf(job.path, engine="scipy")
 
 
 WRITERS: dict[str, Callable[[Export], None]] = {
     "csv": _write_csv,
     "parquet": _write_parquet,
     "mat": _write_mat,
-    "fictrac": _poses(export_poses.write_fictrac),
-    "tum": _poses(export_poses.write_tum),
-    "vtk": _poses(export_poses.write_vtk),
-    "nwb": _poses(export_poses.write_nwb),
-    "netcdf": _poses(export_poses.write_netcdf),
+    "fictrac": _write_fictrac,
+    "tum": _write_tum,
+    "vtk": _write_vtk,
+    "nwb": _write_nwb,
+    "netcdf": _write_netcdf,
 }

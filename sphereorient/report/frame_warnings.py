@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.evaluate.score import distance_deg
-from sphereorient.trajectory import Flag, Reason, Trajectory
+from sphereorient.trajectory import Flag, Reason, Trajectory, runs_of
 
 FLAG_WORDS = {
     Flag.POSITION_INTERPOLATED: "position interpolated over a gap",
@@ -139,7 +139,7 @@ def _flags(track: Trajectory) -> Ranked:
     score = np.nan_to_num(_score(track), nan=np.inf)
     flags = shown_flags(track)
     for _, flag in sorted((int((flags & flag > 0).sum()), flag) for flag in FLAG_WORDS):
-        runs = list(runs_of((flags & flag > 0) & track.valid))
+        runs = runs_of((flags & flag > 0) & track.valid)
         for first, last in sorted(runs, key=lambda run: float(score[run[0] : run[1]].min())):
             yield first + int(score[first:last].argmin()), FLAG_WORDS[flag]
 
@@ -172,12 +172,6 @@ def _score(track: Trajectory) -> Floats:
     scores = np.stack([np.full(len(track), np.inf), *(camera.score for camera in track.cameras.values())])
     lowest = np.fmin.reduce(scores)
     return np.asarray(np.where(np.isfinite(lowest), lowest, np.nan), np.float64)
-
-
-def runs_of(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Yield first and last + 1 of the runs of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    yield from ((first, last) for first, last in edges.reshape(-1, 2).tolist())
 
 
 @dataclass(frozen=True, kw_only=True)

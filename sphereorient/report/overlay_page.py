@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sphereorient.movies import Grey
-from sphereorient.report.frame_warnings import flag_words, lost_cameras, runs_of, shown_flags
+from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags
 from sphereorient.report.overlay_model import CropWindow, LightFit, Model, axes_px, crop, outline_px
-from sphereorient.trajectory import CameraTrack, Trajectory
+from sphereorient.trajectory import CameraTrack, Trajectory, runs_of
 
 Colour = tuple[int, int, int]
 BACKGROUND: Colour = (18, 18, 22)

@@ -1,10 +1,15 @@
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import check_tail
 from sphereorient.sphere.texture import sample_spline, sample_texture
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,6 +107,14 @@ def nearest_approach(to_centre: Tensor, direction: Tensor, axis: int = -1) -> Te
     `to_centre` leads from a point of a line to the centre, `direction` is the line's unit direction.
     """
     return (to_centre * direction).sum(axis, keepdim=True) * direction - to_centre
+
+
+def fitted_circle(points: Floats, weight: Floats | None = None) -> tuple[float, float, float]:
+    """Return centre and radius of the circle that fits points (K, 2) best, by Kasa's linear least squares (1976)."""
+    root = np.ones(len(points)) if weight is None else np.sqrt(weight)
+    columns = np.column_stack([2 * points, np.ones(len(points))])
+    u, v, c = np.linalg.lstsq(columns * root[:, None], (points**2).sum(1) * root, rcond=None)[0].tolist()
+    return u, v, math.sqrt(max(c + u * u + v * v, 0.0))
 
 
 def smooth_positive(x: Tensor, width: float) -> Tensor:

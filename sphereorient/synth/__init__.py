@@ -1,7 +1,6 @@
 """Synthetic movies with exact truth: random motion and paint, the scene of one to four cameras, degradations."""
 
 from sphereorient.synth.degrade import degrade
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track, smoothed_track
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
 from sphereorient.synth.scene import RenderedScene, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings

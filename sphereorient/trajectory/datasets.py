@@ -130,3 +130,9 @@ def named_group(parent: h5py.Group, name: str) -> h5py.Group:
 
 def _place(name: str) -> str:
     return name.replace("candidate_", "candidates/")
+
+
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last + 1 of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,14 +1,21 @@
 """How an animal walks on a ball that turns under it: heading, path, and speeds ahead, to the side and of turns."""
 
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sphereorient import so3
+from sphereorient.trajectory.datasets import runs_of
 
 Floats = NDArray[np.float64]
+# The columns of FicTrac's table, in order, and how many numbers each has. Source: FicTrac's doc/data_header.txt.
+WIDTHS = {"frame": 1, "turn_cam": 3, "error": 1, "turn_lab": 3, "rotation_cam": 3, "rotation_lab": 3}
+WIDTHS |= {"path": 2, "heading": 1, "direction": 1, "speed": 1, "sums": 2, "time_ms": 1, "sequence": 1}
+WIDTHS |= {"step_ms": 1, "clock_ms": 1}
+FICTRAC = {name: slice(end - WIDTHS[name], end) for name, end in zip(WIDTHS, accumulate(WIDTHS.values()), strict=True)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +44,7 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
     turn[1:] = rotation_vectors(R_lab_body[1:] @ R_lab_body[:-1].transpose(0, 2, 1))
     ahead, right, about, across = arcs(turn)
     heading, path = np.full(len(turn), np.nan), np.full((len(turn), 2), np.nan)
-    for first, last in _stretches(known):
+    for first, last in runs_of(known):
         some = slice(first + 1, last)
         heading[first:last] = np.concatenate([[0.0], np.cumsum(about[some])])
         steps = turned(across[some], heading[first : last - 1])
@@ -71,6 +78,28 @@ def turned(steps: Floats, heading_rad: Floats) -> Floats:
     return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
 
 
+def fictrac_rows(
+    R_cam_lab: Floats, R_from_first: Floats, ahead: Floats, right: Floats, start: NDArray[np.bool_], **own: ArrayLike
+) -> Floats:
+    """Return FicTrac's columns, (N, 25), of rotations since a stretch began, (N, 3, 3), lab, and steps (N,), radii; a
+    frame that is the `start` of a stretch, (N,), has not moved. `own`: the other columns by their names in `FICTRAC`.
+    """
+    # FicTrac's absolute rotations are those since its first frame, in the lab with the camera's pose put before.
+    R_cam = R_cam_lab @ R_from_first @ R_cam_lab.T
+    own |= {
+        "turn_cam": np.asarray(own["turn_lab"]) @ R_cam_lab.T,
+        "rotation_cam": rotation_vectors(R_cam),
+        "rotation_lab": rotation_vectors(R_cam_lab.T @ R_cam),
+        "direction": np.mod(np.arctan2(right, ahead), 2 * np.pi),
+        "speed": np.hypot(ahead, right),
+        "clock_ms": own["time_ms"],
+    }
+    rows = np.column_stack([np.asarray(own[name], np.float64) for name in FICTRAC])
+    for name in ("turn_cam", "turn_lab", "direction", "speed"):
+        rows[start, FICTRAC[name]] = 0.0
+    return rows
+
+
 def rotation_vectors(R: Floats) -> Floats:
     """Return the rotation vectors (N, 3), rad, of rotations (N, 3, 3); NaN of NaN."""
     known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
@@ -78,9 +107,3 @@ def rotation_vectors(R: Floats) -> Floats:
     turn: Floats = so3.log(torch.from_numpy(some)).numpy()
     turn[~known] = np.nan
     return turn
-
-
-def _stretches(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last + 1 of the stretches of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

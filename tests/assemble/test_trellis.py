@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble import edge_costs, first_order_cost, shortest_path
+from sphereorient.assemble import edge_costs, shortest_path, trellis
 from sphereorient.errors import ShapeError
 
 SEEDS = range(6)
@@ -303,7 +303,7 @@ def test_edge_costs_do_not_depend_on_how_many_are_computed_at_once(rng, monkeypa
     score = torch.rand(2, 6, 3, generator=rng, dtype=torch.float64)
     time = torch.arange(6.0, dtype=torch.float64).expand(2, 6)
     whole = edge_costs(R, score, time)
-    monkeypatch.setattr(first_order_cost, "PAIRS_AT_ONCE", 1)
+    monkeypatch.setattr(trellis, "PAIRS_AT_ONCE", 1)
     assert_close(edge_costs(R, score, time), whole)
 
 

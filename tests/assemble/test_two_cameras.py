@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
 
+import figure_repair
 import pytest
 import torch
 from assemble_examples import candidates_of, noisy, single, times, turned_deg, turning
@@ -17,9 +17,6 @@ from sphereorient.assemble import AssembleSettings, Fused, assemble_path, assemb
 from sphereorient.assemble.two_cameras import Track, _roughest_turn
 from sphereorient.errors import ExperimentError, ShapeError
 from sphereorient.trajectory import Flag
-
-sys.path.insert(0, str(REPO / "scripts"))
-import figure_repair
 
 SETTINGS = AssembleSettings()
 STRETCH = range(20, 30)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
-
-import pytest
-from conftest import REPO
-
-sys.path.insert(0, str(REPO / "scripts"))
 
 import figures
 import kept
+import pytest
+from conftest import REPO
 
 # Pages whose tables hold numbers that nobody measured: formats, sources, settings' meanings, lists of findings.
 NOT_MEASURED = {"check.md", "data-format.md", "export.md", "movies.md", "parameters.md", "degradations.md"}

@@ -10,22 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType, SimpleNamespace
 
-import numpy as np
-import pytest
-import torch
-from conftest import REPO
-
-sys.path.insert(0, str(REPO / "scripts"))
-
 import kept
+import numpy as np
 import paper_movies
 import paper_table
+import pytest
 import reproduce_paper
+import torch
+from conftest import REPO
+from ensembles import EnsembleSpec, draw_ensemble
 
 from sphereorient import load_experiment, so3, track_movies
 from sphereorient.errors import BenchError
 from sphereorient.statistics import BootstrapSettings, ensemble_of
-from sphereorient.synth import EnsembleSpec, draw_ensemble
 
 
 def test_the_filmed_motion_has_the_rms_values_of_table_i_and_passes_near_the_middle():

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import REPO
+from bench_robustness import markdown
 from scipy.spatial.transform import Rotation
 
 from sphereorient.cli import main
@@ -32,9 +32,6 @@ from sphereorient.evaluate.robustness.run import (
 from sphereorient.evaluate.score import aligned_errors_deg, orientations_at, read_fictrac, true_orientations
 from sphereorient.report.robustness import robustness_figure, worst_first, write_table
 from sphereorient.trajectory import CameraTrack, Trajectory
-
-sys.path.insert(0, str(REPO / "scripts"))
-from bench_robustness import markdown
 
 FRAMES = 24
 

@@ -16,7 +16,7 @@ from sphereorient import so3
 from sphereorient.cameras import PinholeCamera
 from sphereorient.live.lines import FicTracLines, JsonLines, fictrac_line
 from sphereorient.live.live import Measured
-from sphereorient.report.export_poses import fictrac_table
+from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Trajectory
 
 

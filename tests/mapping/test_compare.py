@@ -11,6 +11,7 @@ from map_examples import shift_field, warped
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
+from sphereorient.mapping.alike import nearest_texels
 from sphereorient.mapping.compare import (
     compare_maps,
     compass,
@@ -20,7 +21,6 @@ from sphereorient.mapping.compare import (
     turned_map,
     without_changed,
 )
-from sphereorient.mapping.old_map import nearest_texels
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth.textures import random_texture
 

@@ -13,7 +13,7 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, fit_map, iterations, learn, take_crops
-from sphereorient.mapping.kept import read_kept, write_kept
+from sphereorient.mapping.learn import read_kept, write_kept
 from sphereorient.pose import fitter
 from sphereorient.pose.lab_light import LabLight
 

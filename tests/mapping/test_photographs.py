@@ -11,12 +11,10 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from conftest import REPO, SHARED
+from conftest import SHARED
 from map_examples import mapped, rewrite
-from renders import disks_of_pictures, error_deg, pictures, turning
-
-sys.path.append(str(REPO / "scripts"))
 from photographs import Stills, write_stills
+from renders import disks_of_pictures, error_deg, pictures, turning
 
 from sphereorient import so3
 from sphereorient.cli import main

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import cv2
@@ -11,15 +10,13 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO
+from demo_figure import demo_figure
 from matplotlib.figure import Figure
 
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.trajectory import CameraTrack, Trajectory
-
-sys.path.insert(0, str(REPO / "scripts"))
-from demo_figure import demo_figure
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"
 TRUTH = EXCERPT / "truth.h5"

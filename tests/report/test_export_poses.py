@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera
 from sphereorient.errors import OutputError
-from sphereorient.report.export import export_track
-from sphereorient.report.export_poses import fictrac_table
+from sphereorient.report.export import export_track, fictrac_table
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.walk import walk_of
 

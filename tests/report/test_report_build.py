@@ -11,13 +11,13 @@ import h5py
 import numpy as np
 import PIL.Image
 import pytest
+from ensembles import EnsembleSpec, draw_ensemble, filtered_track
 
 from sphereorient.cli import main
 from sphereorient.errors import OutputError
 from sphereorient.pose.worn import CELLS, UNUSED_PAINT, worn_text
 from sphereorient.report.build import _check_folder
 from sphereorient.sphere.texture_table import octahedral_directions
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import Trajectory
 
 QUICK = ["--set", "statistics.resamples=100"]

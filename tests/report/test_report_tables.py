@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet
 import pytest
+from ensembles import EnsembleSpec, draw_ensemble, filtered_track
 
 from sphereorient.report import tables
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.statistics import StatisticsSettings, Surroundings, ensemble_of, summarise
 from sphereorient.statistics.cameras import camera_distances
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import CameraTrack, Reason
 
 

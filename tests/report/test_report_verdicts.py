@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ensembles import EnsembleSpec, draw_ensemble, filtered_track
 
 from sphereorient.report.verdicts import Grade, verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.cameras import CameraDistance
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 
 ACTION = re.compile(r".*; (if this is not meant|see|run|pass|track|read|compute) [^;]*$")  # its end says what to do
 FEW = StatisticsSettings(resamples=100)

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from ensembles import EnsembleSpec, draw_ensemble
 from overlay_examples import true_track
 
 from sphereorient import so3
@@ -23,7 +24,6 @@ from sphereorient.report.verdicts import verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.noise import width_curve
 from sphereorient.statistics.segments import ensemble_of
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
 from sphereorient.trajectory import Trajectory
 
 FEW = StatisticsSettings(resamples=100)

@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-
+import ensemble_coverage as coverage
 import numpy as np
 import pytest
-from conftest import REPO
+from ensembles import EnsembleSpec, draw_ensemble, smoothed_track
 
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, smoothed_track
-
-
-@pytest.fixture(scope="module")
-def coverage():
-    spec = importlib.util.spec_from_file_location("ensemble_coverage", REPO / "scripts" / "ensemble_coverage.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["ensemble_coverage"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_nominal_values_as_often_as_they_say(coverage):
+def test_intervals_hold_the_nominal_values_as_often_as_they_say():
     spec = EnsembleSpec(mean_frames=100.0)
     truth = coverage.truths(spec)
     few = BootstrapSettings(resamples=300)
@@ -38,7 +26,7 @@ def test_intervals_hold_the_nominal_values_as_often_as_they_say(coverage):
 
 
 @pytest.mark.slow
-def test_one_repetition_with_noise_recovers_every_rms(coverage):
+def test_one_repetition_with_noise_recovers_every_rms():
     spec = EnsembleSpec(segments=40, mean_frames=90.0)
     _, known = smoothed_track(draw_ensemble(spec, 100), coverage.NOISE_DEG, coverage.NOISE_MM, 100)
     truth = dict.fromkeys(coverage.truths(spec), 0.0)

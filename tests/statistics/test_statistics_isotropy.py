@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ensembles import EnsembleSpec, draw_ensemble
 from scipy.spatial.transform import Rotation
 from statistics_examples import ensemble
 
@@ -16,7 +17,6 @@ from sphereorient.statistics.isotropy import (
 )
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
 
 FEW = BootstrapSettings(resamples=100)
 UNEQUAL = {"omega_rms": (6.0, 8.0, 10.0)}

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from ensembles import EnsembleSpec, draw_ensemble, filtered_track
 
 from sphereorient.errors import TrackError
 from sphereorient.motion import gaussian_derivative, gaussian_kernel
 from sphereorient.statistics.noise import multi_lag, width_curve
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 
 FEW = BootstrapSettings(resamples=200)
 NOISE_DEG, NOISE_MM = 0.1, 0.05

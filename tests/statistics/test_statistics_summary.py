@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ensembles import EnsembleSpec, draw_ensemble, filtered_track
 from statistics_examples import STEP_S, track
 
 from sphereorient.errors import TrackError
 from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
 from sphereorient.statistics.lags import correlation
 from sphereorient.statistics.segments import UNITS, ensemble_of
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 
 FEW = StatisticsSettings(resamples=100)
 

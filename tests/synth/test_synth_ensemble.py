@@ -6,14 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
-from scipy.stats import kstest
-
-from sphereorient.motion import omega_from_orientations
-from sphereorient.statistics.moments import moments
-from sphereorient.statistics.segments import ensemble_of
-from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import (
+from ensembles import (
     EnsembleSpec,
     Law,
     draw_ensemble,
@@ -21,6 +14,13 @@ from sphereorient.synth.ensemble import (
     nominal,
     smoothed_track,
 )
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+
+from sphereorient.motion import omega_from_orientations
+from sphereorient.statistics.moments import moments
+from sphereorient.statistics.segments import ensemble_of
+from sphereorient.statistics.settings import BootstrapSettings
 
 FEW = BootstrapSettings(resamples=100)
 

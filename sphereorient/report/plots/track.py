@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.report.plots import style as look
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Trajectory, runs_of
 from sphereorient.trajectory.datasets import in_length
 
 Floats = NDArray[np.float64]
@@ -72,11 +72,10 @@ def track_figure(track: Trajectory) -> Figure:
     for axes, name in zip(panels[1:].ravel(), shown, strict=True):
         _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
         axes.set_ylabel(in_length(RATES[name], track.length_unit))
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], track.valid, [True]]).astype(np.int8)))
     half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
-    runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
+    runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in runs_of(~track.valid)]
     for axes in panels.ravel():
-        if len(edges):
+        if runs:
             across = axes.get_xaxis_transform()
             axes.broken_barh(runs, (0, 1), transform=across, zorder=0, label="not valid", **NOT_VALID)
         axes.margins(x=0.01)

@@ -20,6 +20,7 @@ from sphereorient.errors import PaintError, error_words, refusal
 from sphereorient.files.whole_file import TABLE_BYTES, read_text, read_whole
 from sphereorient.search import crop_disk
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.view import fitted_circle
 from sphereorient.tools.spin.dots import DotTable
 
 Photograph = NDArray[Any]
@@ -136,16 +137,12 @@ def _outlined(fine: NDArray[np.float32], level: float) -> tuple[float, float, fl
 
 
 def _circle(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Fit a circle to points (K, 2): centre, radius, share on it (Kasa 1976; weights of Geman and McClure 1987)."""
+    """Fit a circle to points (K, 2): centre, radius, share on it (weights of Geman and McClure 1987)."""
     if len(points) < 8:
         return NO_CIRCLE
-    columns = np.column_stack([2 * points, np.ones(len(points))])
-    square = (points**2).sum(1)
     weight, u, v, radius = np.ones(len(points)), 0.0, 0.0, math.nan
     for step in range(STEPS):
-        root = np.sqrt(weight)
-        u, v, c = np.linalg.lstsq(columns * root[:, None], square * root, rcond=None)[0].tolist()
-        radius = math.sqrt(max(c + u * u + v * v, 0.0))
+        u, v, radius = fitted_circle(points, weight)
         off = np.hypot(points[:, 0] - u, points[:, 1] - v) - radius
         scale = ON_CIRCLE * max(radius, 1.0) * max(1.0, 4.0 - step)  # loose at first: outliers pull the first circle
         weight = 1 / (1 + (off / (0.5 * scale)) ** 2) ** 2
