@@ -1,12 +1,14 @@
 """Print the rooms of the package, what each imports, and every import that points downwards; draw the picture.
 
-.venv/bin/python scripts/rooms.py            # prints; exits 1 where an import points downwards or in a circle
+.venv/bin/python scripts/rooms.py            # prints; exits 1 where an import points downwards or in a circle,
+                                             # or a room has more lines than CONTRIBUTING.md allows
 .venv/bin/python scripts/rooms.py --write    # also writes the list and the picture of CONTRIBUTING.md
 """
 
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -118,11 +120,24 @@ def sentence(name: str) -> str:
     return (ast.get_docstring(ast.parse(path.read_text())) or "").split("\n")[0].rstrip(".")
 
 
+def ceilings() -> dict[str, int]:
+    """Return how many lines each room may have, as CONTRIBUTING.md says."""
+    rows = re.findall(r"^\| `(\w+)` \|.*\| ([\d,]+) \|$", (REPO / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    return {name: int(number.replace(",", "")) for name, number in rows}
+
+
+def too_large() -> list[str]:
+    """Return the rooms that have more lines than they may."""
+    most = ceilings()
+    sizes = {name: lines(name)[0] for name in ORDER}
+    return [f"{name}: {size} lines, at most {most[name]}" for name, size in sizes.items() if size > most[name]]
+
+
 def write_list() -> None:
-    """Write the list of rooms into CONTRIBUTING.md."""
-    path = REPO / "CONTRIBUTING.md"
-    rows = ["| room | what | lines |", "|---|---|---|"]
-    rows += [f"| `{name}` | {sentence(name)} | {lines(name)[0]:,} |" for name in ORDER]
+    """Write the list of rooms into CONTRIBUTING.md; ceilings stay."""
+    path, most = REPO / "CONTRIBUTING.md", ceilings()
+    rows = ["| room | what | lines | at most |", "|---|---|---|---|"]
+    rows += [f"| `{name}` | {sentence(name)} | {lines(name)[0]:,} | {most[name]:,} |" for name in ORDER]
     head, _, rest = path.read_text().partition("<!-- rooms -->\n")
     tail = rest.partition("<!-- end of rooms -->\n")[2]
     text = "\n".join(rows)
@@ -175,11 +190,13 @@ def main() -> int:
     if "--write" in sys.argv[1:]:
         write_list()
         draw(REPO / "docs" / "rooms.png")
-    wrong, round_ = downward(), circles()
+    wrong, round_, large = downward(), circles(), too_large()
     for arrow in wrong:
         print(f"downward: {arrow}")
+    for one in large:
+        print(f"too large: {one}")
     print(f"downward imports: {len(wrong)}; modules in circles: {len(round_)} {' '.join(round_)}")
-    return int(bool(wrong or round_))
+    return int(bool(wrong or round_ or large))
 
 
 if __name__ == "__main__":

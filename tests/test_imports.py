@@ -62,3 +62,8 @@ def test_a_script_uses_names_that_exist(path):
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
             assert hasattr(modules[node.value.id], node.attr), f"{node.value.id}.{node.attr}"
+
+
+def test_no_room_is_larger_than_its_ceiling():
+    assert set(rooms.ceilings()) == set(rooms.ORDER)
+    assert rooms.too_large() == []

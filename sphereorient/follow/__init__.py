@@ -1,4 +1,4 @@
-"""Along time: appearance, initialisation, chunks of frames, one tracker per camera."""
+"""Along time: appearance, search without history, chunks of frames, one tracker for all balls."""
 
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.poses import Poses
