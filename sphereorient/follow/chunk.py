@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.follow.poses import Poses, supported
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.trajectory import Reason
@@ -109,6 +111,29 @@ class Chunk:
             open_share=open_share,
         )
 
+    def extrapolated(self, frame: int) -> Ahead | None:
+        """Return what the last poses say of a later frame by the polynomial through them; the covariance includes the
+        difference from the next lower order. None of a single pose.
+        """
+        if len(self.past) < 2:
+            return None
+        time_s = np.array([self.time_s[number] for number, _ in self.past])
+        poses = [one for _, one in self.past]
+        weight, lower = (_weights(time_s[k:], self.time_s[frame]) for k in (0, 1))
+        last = poses[-1].R_lab_body[0]
+        X = torch.stack([one.position_lab_mm[0] for one in poses])
+        turn = so3.log(torch.stack([one.R_lab_body[0] for one in poses]) @ last.mT)
+        path = torch.cat([turn, X], 1)
+        ahead = weight @ path
+        other = lower @ path[1:] - ahead
+        spread = sum(w * w * one.covariance[0] for w, one in zip(weight.tolist(), poses, strict=True))
+        apart = torch.stack([other[:3].square().sum(), other[3:].square().sum()]).repeat_interleave(3)
+        return Ahead(
+            position_lab_mm=ahead[3:],
+            R_lab_body=so3.exp(ahead[:3]) @ last,
+            covariance=spread + torch.diag(apart),
+        )
+
     def saw(self, frame: int, poses: Poses, turn: Floats) -> None:
         """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
         if supported(poses):
@@ -120,6 +145,15 @@ class Chunk:
         """Forget all poses: what comes is another motion."""
         self.past.clear()
         self.turns.clear()
+
+
+def _weights(time_s: Floats, at_s: float) -> Tensor:
+    """Return the weights by which the polynomial through values at some times has its value at another one."""
+    apart = time_s[:, None] - time_s
+    np.fill_diagonal(apart, 1.0)
+    share = (at_s - time_s[None]) / apart
+    np.fill_diagonal(share, 1.0)
+    return torch.from_numpy(share.prod(1))
 
 
 def regained(seen: Sequence[bool]) -> bool:

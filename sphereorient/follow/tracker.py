@@ -4,14 +4,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
-from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, Floats, mirrored, regained
+from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.poses import Poses, supported
 from sphereorient.locate import Frame
@@ -157,7 +156,7 @@ class Tracker:
             {
                 name: before
                 for name, poses in row.items()
-                if poses is None and (before := _extrapolated(chunks[name][n], chunks[name][n].first + k)) is not None
+                if poses is None and (before := chunks[name][n].extrapolated(chunks[name][n].first + k)) is not None
             }
             for n, row in enumerate(found)
         ]
@@ -226,39 +225,6 @@ def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, _Place]) ->
         radius_mm=torch.tensor([list(radius_mm.values())], dtype=torch.float64),
         move_mm=torch.stack([one.move_mm for one in there])[None],
     )
-
-
-def _extrapolated(chunk: Chunk, frame: int) -> Ahead | None:
-    """Return what the last poses of a chunk say of a later frame: a motion of one order less, that of the last two of
-    three poses, is within the error. None of a single pose.
-    """
-    if len(chunk.past) < 2:
-        return None
-    time_s = np.array([chunk.time_s[number] for number, _ in chunk.past])
-    poses = [one for _, one in chunk.past]
-    weight, lower = (_weights(time_s[k:], chunk.time_s[frame]) for k in (0, 1))
-    last = poses[-1].R_lab_body[0]
-    X = torch.stack([one.position_lab_mm[0] for one in poses])
-    turn = so3.log(torch.stack([one.R_lab_body[0] for one in poses]) @ last.mT)
-    path = torch.cat([turn, X], 1)
-    ahead = weight @ path
-    other = lower @ path[1:] - ahead
-    spread = sum(w * w * one.covariance[0] for w, one in zip(weight.tolist(), poses, strict=True))
-    apart = torch.stack([other[:3].square().sum(), other[3:].square().sum()]).repeat_interleave(3)
-    return Ahead(
-        position_lab_mm=ahead[3:],
-        R_lab_body=so3.exp(ahead[:3]) @ last,
-        covariance=spread + torch.diag(apart),
-    )
-
-
-def _weights(time_s: Floats, at_s: float) -> Tensor:
-    """Return the weights by which the polynomial through values at some times has its value at another one."""
-    apart = time_s[:, None] - time_s
-    np.fill_diagonal(apart, 1.0)
-    share = (at_s - time_s[None]) / apart
-    np.fill_diagonal(share, 1.0)
-    return torch.from_numpy(share.prod(1))
 
 
 def _same(one: Poses, other: Poses, tracker: BallTracker) -> bool:
