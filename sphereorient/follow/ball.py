@@ -1,11 +1,12 @@
 """Poses of one ball in single frames: from what the frames before say, or by a search."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,6 +40,41 @@ SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown pai
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 # What a camera alone gives, beside rotation and move from the pose.
 OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Predicted:
+    """B predictions of a ball, and the pictures of C cameras that may show it."""
+
+    shots: Sequence[Sequence[Frame]]  # B of C
+    frames: Sequence[Sequence[Shown]]
+    position_lab_mm: Tensor  # (B, 3)
+    R_lab_body: Tensor  # (B, 3, 3)
+    precision: Tensor  # (B, 3, 3), mm^-2, of the position
+    start: partial[NearStart]  # of a fit, but for pose and use
+    known: Tensor  # (B, C) bool, cameras that saw the ball before
+    readable: Tensor  # (B, C) bool
+    sees: Tensor  # (B, C) bool, cameras to which other balls leave enough of it
+    contradicted: Tensor  # (B,) bool, a camera contradicted the others before
+    beyond: Tensor  # (B,) bool, disks that have more pixels: see `BallTracker._wider`
+    disks_px: DisksPx
+    visible: Tensor | None  # (B, C), share of the disks that other balls leave; None: all
+
+
+class _Found(NamedTuple):
+    """Fits of B predictions, cameras in use (B, C) bool, whether these support it (B,), and cameras (B, C) with a
+    picture that can show the ball.
+    """
+
+    fit: FittedPoses
+    use: Tensor
+    good: Tensor
+    usable: Tensor
+
+    @property
+    def unused(self) -> Tensor:
+        """Cameras (B, C) with such a picture that are not in use."""
+        return self.usable & ~self.use
 
 
 class BallTracker:
@@ -106,57 +142,103 @@ class BallTracker:
             return []
         asked, missing = len(expected), self._lanes(len(expected)) - len(expected)
         expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
-        frames = [[shot.shown for shot in row] for row in shots]
-        usable = torch.tensor([[shot.readable for shot in row] for row in shots])
-        known = torch.stack([one.use for one in expected])
+        there = self._predicted(expected, shots)
+        first = self._first_fit(there)
+        found, alone = self._with_fewer(there, first)
+        found, doubtful = self._with_more(there, found)
+        # Another camera is judged only where this frame needs it: results must not depend on the batch.
+        others = (found.good & (~first.good | there.contradicted | doubtful))[:, None] & found.unused
+        fit = found.fit
+        for k in range(others.shape[1] if bool(others.any()) else 0):
+            only = _only(found.usable, [k])
+            one = alone[k] if alone else self._fitted(there, there.position_lab_mm, there.R_lab_body, only)
+            others[:, k] &= self._supported(one, only, there.visible)
+            fit = _beside(fit, one, others[:, k], k)
+        reasons = [
+            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
+            for *seen, row, one in zip(
+                found.use.tolist(), others.tolist(), there.sees.tolist(), shots, expected, strict=True
+            )
+        ]
+        poses = [
+            poses_of(fit, slice(n, n + 1), found.use[n], reasons[n]) if found.good[n] else None for n in range(asked)
+        ]
+        for n in torch.nonzero(there.beyond[:asked])[:, 0].tolist():
+            (poses[n],) = self._wider(float(there.disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
+        return poses
+
+    def _predicted(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> _Predicted:
+        """Return where the ball is expected; a rough prediction is brought near first."""
         X, R_before, turn, spread, moved = (
             torch.from_numpy(np.stack([getattr(one, name) for one in expected]))
             for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
         )
         R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
-        use, among = known & usable, joined([one.among for one in expected])
+        known, among = torch.stack([one.use for one in expected]), joined([one.among for one in expected])
+        frames = [[shot.shown for shot in row] for row in shots]
+        readable = torch.tensor([[shot.readable for shot in row] for row in shots])
         if any(one.rough for one in expected):
-            was = X, R
-            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]), among)
+            was, rough = (X, R), torch.tensor([one.rough for one in expected])
+            X, R = self._approached(frames, X, R, known & readable, precision, rough, among)
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         disks_px = self._disks_px(X)
         if among is not None:
             disks_px = disks_px._replace(spoilt=self.fitter.spoilt(X, disks_px, moved, among))
         visible = None if disks_px.spoilt is None else disks_px.spoilt.left
-        sees = torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE
-        usable, use = usable & sees, use & sees
-        start = partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among)
-        fitted, supported = partial(self._fitted, frames, start), partial(self._supported, visible=visible)
-        fit = fitted(X, R, use, disks_px)
+        return _Predicted(
+            shots=shots,
+            frames=frames,
+            position_lab_mm=X,
+            R_lab_body=R,
+            precision=precision,
+            start=partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among),
+            known=known,
+            readable=readable,
+            sees=torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE,
+            contradicted=torch.tensor([Reason.CONTRADICTS in one.reason for one in expected]),
+            beyond=disks_px.largest_px > self.fitter.widest_px,
+            disks_px=disks_px,
+            visible=visible,
+        )
+
+    def _first_fit(self, there: _Predicted) -> _Found:
+        """Fit the pictures of all cameras that saw the ball before."""
+        X, R, disks_px, visible = there.position_lab_mm, there.R_lab_body, there.disks_px, there.visible
+        usable = there.readable & there.sees
+        use = there.known & usable
+        fit = self._fitted(there, X, R, use, disks_px)
         if visible is None and bool((poor := self._poor(fit, use)).any()):
             # A sharp picture holds the fit where it began: once more, from coarse to fine.
-            again = fitted(*self._approached(frames, X, R, use, precision, poor, None), use)
+            near = self._approached(there.frames, X, R, use, there.precision, poor, None)
+            again = self._fitted(there, *near, use)
             better = (again.score * use).sum(1) > (fit.score * use).sum(1)
             fit = again.where(poor & better, fit)
-        good = supported(fit, use)
+        good = self._supported(fit, use, visible)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.
-            usable = sees & torch.stack(
-                [all_ if ok else _usable(row) for all_, ok, row in zip(usable, good.tolist(), shots, strict=True)]
-            )
-            changed = (use != (known & usable)).any(1)
+            rows = zip(usable, good.tolist(), there.shots, strict=True)
+            usable = there.sees & torch.stack([all_ if ok else _usable(row) for all_, ok, row in rows])
+            changed = (use != (there.known & usable)).any(1)
             if bool(changed.any()):
-                use = known & usable
-                fit = fitted(X, R, use, disks_px).where(changed, fit)
-                good = torch.where(changed, supported(fit, use), good)
-        first = good
-        beyond = disks_px.largest_px > self.fitter.widest_px  # these have more pixels: see `_wider`
-        before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
+                use = there.known & usable
+                fit = self._fitted(there, X, R, use, disks_px).where(changed, fit)
+                good = torch.where(changed, self._supported(fit, use, visible), good)
+        return _Found(fit, use, good, usable)
+
+    def _with_fewer(self, there: _Predicted, found: _Found) -> tuple[_Found, dict[int, FittedPoses]]:
+        """Leave out as few cameras as possible where one picture without the ball spoils the joint fit; of subsets of
+        one size, which disagree, the one nearer to the prediction counts. Return also the fits of single cameras.
+        """
+        fit, use, good, usable = found
+        X, R = there.position_lab_mm, there.R_lab_body
         alone: dict[int, FittedPoses] = {}
         for some in by_decreasing_size(range(use.shape[1])):
-            if bool((good | beyond).all()):
+            if bool((good | there.beyond).all()):
                 break
-            # One picture without the sphere spoils the joint fit: leave out as few cameras as possible; of subsets of
-            # one size, which disagree, the one nearer to the prediction counts.
-            fits = [fitted(X, R, _only(usable, one), disks_px) for one in some]
+            fits = [self._fitted(there, X, R, _only(usable, one), there.disks_px) for one in some]
             holds = [
-                supported(fit_, _only(usable, one)) & usable[:, one].all(1)
+                self._supported(fit_, _only(usable, one), there.visible) & usable[:, one].all(1)
                 for one, fit_ in zip(some, fits, strict=True)
             ]
             astray = [
@@ -169,38 +251,30 @@ class BallTracker:
                 fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, some[k]), use)
             good = good | torch.isfinite(nearest)
             alone = {k: one for (k, *rest), one in zip(some, fits, strict=True) if not rest}
-        others = torch.zeros_like(use)
-        if bool((usable & ~use).any()):
-            # A camera without the sphere before may see it again: test it at the joint pose.
-            both = fitted(fit.position_lab_mm, fit.R_lab_body, usable)
-            unused = good & (usable & ~use).any(1)
-            limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
-            contradicts = self._contradictory(both, usable, limit)
-            back = unused & supported(both, usable) & ~contradicts
-            fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
-            several = good & ~back & ((usable & ~use).sum(1) > 1)
-            for k in range(use.shape[1] if bool(several.any()) else 0):
-                # Of several such cameras some may see it.
-                rows = several & (usable & ~use)[:, k]
-                wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
-                both = fitted(fit.position_lab_mm, fit.R_lab_body, wider)
-                rows &= supported(both, wider) & ~self._contradictory(both, wider, limit)
-                fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
-            # Another camera is judged only where this frame needs it: results must not depend on the batch.
-            doubtful = ~first | before.any(1) | (unused & contradicts)
-            others = (good & doubtful)[:, None] & usable & ~use
-        for k in range(use.shape[1] if bool(others.any()) else 0):
-            one = alone[k] if alone else fitted(X, R, _only(usable, [k]))
-            others[:, k] &= supported(one, _only(usable, [k]))
-            fit = _beside(fit, one, others[:, k], k)
-        reasons = [
-            [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
-            for *seen, row, one in zip(use.tolist(), others.tolist(), sees.tolist(), shots, expected, strict=True)
-        ]
-        found = [poses_of(fit, slice(n, n + 1), use[n], reasons[n]) if good[n] else None for n in range(asked)]
-        for n in torch.nonzero(beyond[:asked])[:, 0].tolist():
-            (found[n],) = self._wider(float(disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
-        return found
+        return _Found(fit, use, good, usable), alone
+
+    def _with_more(self, there: _Predicted, found: _Found) -> tuple[_Found, Tensor]:
+        """Test cameras that did not see the ball before at the joint pose: they may see it again. Return also for which
+        frames, (B,) bool, they contradict the others.
+        """
+        fit, use, good, usable = found
+        if not bool(found.unused.any()):
+            return found, torch.zeros_like(good)
+        both = self._fitted(there, fit.position_lab_mm, fit.R_lab_body, usable)
+        unused = good & found.unused.any(1)
+        limit = torch.where(there.contradicted, AGREES_AGAIN, 1.0)
+        contradicts = self._contradictory(both, usable, limit)
+        back = unused & self._supported(both, usable, there.visible) & ~contradicts
+        fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
+        several = good & ~back & ((usable & ~use).sum(1) > 1)
+        for k in range(use.shape[1] if bool(several.any()) else 0):
+            # Of several such cameras some may see it.
+            rows = several & (usable & ~use)[:, k]
+            wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
+            both = self._fitted(there, fit.position_lab_mm, fit.R_lab_body, wider)
+            rows &= self._supported(both, wider, there.visible) & ~self._contradictory(both, wider, limit)
+            fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
+        return _Found(fit, use, good, usable), unused & contradicts
 
     def _wider(self, radius_px: float) -> "BallTracker":
         """Return a tracker of single frames for a disk that is larger than those the movie was studied on."""
@@ -234,17 +308,11 @@ class BallTracker:
         return X, R
 
     def _fitted(
-        self,
-        frames: Sequence[Sequence[Shown]],
-        start: Callable[..., NearStart],
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        disks_px: DisksPx | None = None,
+        self, there: _Predicted, X: Tensor, R: Tensor, use: Tensor, disks_px: DisksPx | None = None
     ) -> FittedPoses:
-        """Fit poses that are nearly right; `start` knows the rest of where they begin."""
-        begin = start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
-        return settled(self.fitter, frames, begin, disks_px)
+        """Fit poses that are nearly right."""
+        begin = there.start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
+        return settled(self.fitter, there.frames, begin, disks_px)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
