@@ -11,6 +11,7 @@ import ast
 import re
 import sys
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[1]
@@ -89,6 +90,7 @@ def circles() -> list[str]:
     return sorted(left)
 
 
+@cache
 def lines(name: str) -> tuple[int, int]:
     """Return the lines of a room, and those of them that are code: no blank line, comment or docstring."""
     total = code = 0

@@ -1,6 +1,5 @@
 """Poses of one ball in single frames: from what the frames before say, or by a search."""
 
-import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import SIZES, DisksPx, Fitter, Picture, Shown, Steps
+from sphereorient.pose.fitter import SIZES, DisksPx, Fitter, Picture, Shown, Steps, size_steps
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.settle import settled
 from sphereorient.pose.start import NearStart
@@ -278,7 +277,7 @@ class BallTracker:
 
     def _wider(self, radius_px: float) -> "BallTracker":
         """Return a tracker of single frames for a disk that is larger than those the movie was studied on."""
-        steps = math.ceil(math.log(radius_px / self.fitter.widest_px) / math.log(SIZES))
+        steps = size_steps(radius_px / self.fitter.widest_px)
         if steps not in self._of_size:
             wider = self._of_size[steps] = copy(self)
             wider.fitter = replace(self.fitter, widest_px=self.fitter.widest_px * SIZES**steps)

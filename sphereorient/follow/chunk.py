@@ -58,11 +58,6 @@ class Chunk:
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
     turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
 
-    @property
-    def frames(self) -> range:
-        """The frames of the chunk."""
-        return range(self.first, self.last)
-
     def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> Expected | None:
         """Extrapolate position and rotation, to second order where three frames are known."""
         rows = [poses for number, poses in self.past if number >= frame - len(self.past)]

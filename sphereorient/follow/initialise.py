@@ -120,8 +120,12 @@ class Initialiser:
     def outline(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of the sphere in a camera's picture, or None and the reason; see `find_ball`."""
         key = ("outline", view.name, view.diameter_px, self.locating)
-        there = picture, view.background, view.diameter_px, self.locating
-        found: Found = self._once(picture, key, lambda: ball_at(self._blobs(picture, view), *there))
+        scene, size = view.background, view.diameter_px
+
+        def find() -> Found:
+            return ball_at(self._blobs(picture, view), scene.difference(picture), picture, scene, size, self.locating)
+
+        found: Found = self._once(picture, key, find)
         return found
 
     def disks(self, shots: Sequence[Frame]) -> list[Outline | None]:

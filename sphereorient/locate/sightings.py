@@ -70,19 +70,22 @@ def find_ball(
 
     Source: paper section III A.
     """
-    blobs = find_blobs(background.difference(frame), background.noise, diameter_px, settings)
-    return ball_at(blobs, frame, background, diameter_px, settings)
+    difference = background.difference(frame)
+    blobs = find_blobs(difference, background.noise, diameter_px, settings)
+    return ball_at(blobs, difference, frame, background, diameter_px, settings)
 
 
 def ball_at(
     blobs: Sequence[Blob],
+    difference: NDArray[np.float32],
     frame: NDArray[np.generic],
     background: Background,
     diameter_px: float,
     settings: LocateSettings,
 ) -> Found:
-    """Return the outline of one of the blobs of a frame (H, W), best first; see `find_ball`."""
-    difference = background.difference(frame)
+    """Return the outline of one of the blobs, best first, of a frame (H, W) and its `difference` from the background;
+    see `find_ball`.
+    """
     best: Outline | None = None
     likeliest = (False, 0.0)  # painted and supported ones first, then by coverage
     for blob in blobs:

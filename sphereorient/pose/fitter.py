@@ -326,7 +326,7 @@ class Fitter:
         middles = middle_px.nan_to_num().tolist()
         if radius_px is None:
             radius_px = max(1.0, float(largest_px.max()))
-            radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
+            radius_px = SIZES ** size_steps(radius_px)
         stencil = self.stencil(level, radius_px)
         pictures = self.decoded(pictures, middle_px, stencil, level.extra_px)
         disks = []
@@ -455,6 +455,11 @@ def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTab
     """Return a fitter with an assumed blur, and flat light."""
     optics = Optics(base, blur_px, widest_px(views))
     return Fitter(views=views, radius_mm=radius_mm, optics=optics, light=unknown_light(views))
+
+
+def size_steps(ratio: float) -> int:
+    """Return how many steps of `SIZES` a ratio of stencil sizes needs."""
+    return math.ceil(math.log(ratio) / math.log(SIZES))
 
 
 def defocus_radii(blur_px: float, diameter_px: float) -> float:

@@ -23,12 +23,12 @@ from sphereorient.follow.appearance.presence import (
     second_ball,
     with_least_merit,
 )
-from sphereorient.follow.appearance.record import Among, Appearance, Following, Studied, clear_of
+from sphereorient.follow.appearance.record import Among, Appearance, Following, Studied, clear_of, soft
 from sphereorient.follow.appearance.worn import without_worn
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.fitter import CameraView, Fitter, Optics, defocus_radii, widest_px
+from sphereorient.pose.fitter import CameraView, Fitter, Optics, widest_px
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -80,13 +80,13 @@ def estimate_appearance(
     if following is not None and sample.camera is None:
         studied, sharper = with_motion(studied, search, sample.frame, following, others)
     check_white(studied.fitter)
-    moves = studied is not still
+    moves = studied.fitter.instants > 1
     studied, rivals = lit_in_the_lab(studied, preferred=among is not None)
     studied = without_occluders(studied)
     score_min = _score_min(studied, still.right_score if moves else studied.right_score, best, wrong)
     sure = [frames[k] for k in proven(found)] if among is None else []
-    with_merit = bool(sure) and sample.camera is None
-    views = with_least_merit(search, sure, sample.poses[2]) if with_merit else studied.fitter.views
+    alone = among is None and sample.camera is None  # a ball, and all cameras together
+    views = with_least_merit(search, sure, sample.poses[2]) if alone else studied.fitter.views
     fitter, fit, use = _as_followed(studied, views), studied.fit, studied.use
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(studied.pixels, fit, use, fitter.model(fitter.optics.fine))
@@ -133,5 +133,5 @@ def _score_min(studied: Studied, still: float, best: float, wrong: float) -> flo
         wrong = right - (best - wrong)
     least = min(right, still)
     score_min = 0.5 * (least + min(wrong, least))
-    soft = defocus_radii(studied.fitter.optics.blur_px, widest_px(studied.fitter.views)) > 0
-    return min(score_min, clear_of(right)) if soft else score_min  # there wrong poses explain nearly as much
+    # Out of focus wrong poses explain nearly as much.
+    return min(score_min, clear_of(right)) if soft(studied.fitter) else score_min

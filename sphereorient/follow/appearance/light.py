@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.follow.appearance.record import Studied
+from sphereorient.follow.appearance.record import Studied, enough_of, soft
 from sphereorient.pose.blur import FINER, FINEST, best_blur_px
-from sphereorient.pose.fitter import Fitter, Optics, Rivals, defocus_radii, widest_px
+from sphereorient.pose.fitter import Fitter, Optics, Rivals, widest_px
 from sphereorient.pose.occluders import USUALLY_HIDDEN
 
 BLUR_ROUNDS = 4
@@ -18,7 +18,7 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
     """
     diameter_px = widest_px(studied.fitter.views)
     studied = studied.lit()
-    soft = defocus_radii(studied.fitter.optics.blur_px, diameter_px) > 0  # there each round moves it by little
+    slow = soft(studied.fitter)  # there each round moves the blur by little
     for done in range(1 if given else BLUR_ROUNDS):
         before_px = studied.fitter.optics.blur_px
         if not given:
@@ -26,7 +26,7 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
             blur_px = best_blur_px(fitter, studied.paint, *fits, FINEST if done else FINER)
             studied = replace(studied, fitter=replace(fitter, optics=Optics(studied.paint, blur_px, diameter_px)))
         studied = studied.lit()
-        if not soft and abs(studied.fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
+        if not slow and abs(studied.fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
             break
     return studied
 
@@ -57,7 +57,7 @@ def without_occluders(studied: Studied) -> Studied:
     the ball is hidden in most pictures.
     """
     fitter, fit, use = studied.fitter, studied.fit, studied.use
-    free = studied.thinned(fitter.unoccluded(studied.whole, fit.position_lab_mm, fit.R_lab_body))
+    free = enough_of(fitter.unoccluded(studied.whole, fit.position_lab_mm, fit.R_lab_body))
     hidden = 1.0 - free.inside.sum(-1) / studied.pixels.inside.sum(-1).clamp_min(1)
     if float(hidden[use.flatten()].median()) > USUALLY_HIDDEN:
         return replace(studied, fitter=replace(fitter, most_hidden=0.0))

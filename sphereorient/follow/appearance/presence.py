@@ -9,11 +9,11 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.files.threads import side_by_side
-from sphereorient.follow.appearance.record import ALWAYS, clear_of
+from sphereorient.follow.appearance.record import ALWAYS, clear_of, soft
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.locate import Frame
-from sphereorient.pose.fitter import LEAST_LEFT, CameraView, Fitter, defocus_radii, widest_px
+from sphereorient.pose.fitter import LEAST_LEFT, CameraView, Fitter
 from sphereorient.trajectory import Reason
 
 BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
@@ -26,8 +26,7 @@ RIVALS = 0.1  # share of the frames with two claimants, two frames at least: the
 
 def for_blur(search: Initialiser) -> Initialiser:
     """Return a search that trusts no outline of pictures out of focus: the texture locates the sphere."""
-    soft = defocus_radii(search.fitter.optics.blur_px, widest_px(search.fitter.views))
-    return replace(search, score_min=ALWAYS) if soft else search
+    return replace(search, score_min=ALWAYS) if soft(search.fitter) else search
 
 
 def find_poses(search: Initialiser, frames: Sequence[Sequence[Frame]]) -> tuple[Initialiser, list[Poses]]:

@@ -67,7 +67,7 @@ class Appearance:
     @property
     def soft(self) -> bool:
         """Whether the pictures are out of focus; the model of blur then errs by more than noise, and is not stated."""
-        return defocus_radii(self.fitter.optics.blur_px, widest_px(self.fitter.views)) > 0
+        return soft(self.fitter)
 
     @property
     def in_doubt(self) -> bool:
@@ -106,7 +106,7 @@ class Studied:
     def begun(cls, fitter: Fitter, paint: TextureTable, whole: Pixels, poses: tuple[Tensor, Tensor, Tensor]) -> Self:
         """Fit poses: positions (B, 3), rotations (B, 3, 3) and use (B, C)."""
         X, R, use = poses
-        pixels = whole.thinned(_every(whole))
+        pixels = enough_of(whole)
         fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
         return cls(fitter=fitter, paint=paint, whole=whole, pixels=pixels, fit=fit, use=use)
 
@@ -114,10 +114,6 @@ class Studied:
     def right_score(self) -> float:
         """Score of the typical pose."""
         return float(self.fit.score[self.use].median())
-
-    def thinned(self, whole: Pixels) -> Pixels:
-        """Return as many pixels of these disks as are studied."""
-        return whole.thinned(_every(whole))
 
     def lit(self) -> Self:
         """Estimate the light, and fit the poses with it."""
@@ -130,5 +126,11 @@ def clear_of(typical: float) -> float:
     return 1 - CLEAR * (1 - typical)
 
 
-def _every(whole: Pixels) -> int:
-    return max(1, round(whole.grey.shape[1] / ENOUGH))
+def soft(fitter: Fitter) -> bool:
+    """Return whether the pictures are out of focus by the blur that is known."""
+    return defocus_radii(fitter.optics.blur_px, widest_px(fitter.views)) > 0
+
+
+def enough_of(whole: Pixels) -> Pixels:
+    """Return about `ENOUGH` pixels of each disk."""
+    return whole.thinned(max(1, round(whole.grey.shape[1] / ENOUGH)))
