@@ -21,7 +21,7 @@ from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import screened_frames
-from sphereorient.methods.proposers import open_view
+from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
@@ -41,7 +41,7 @@ def main() -> None:
     settings, every = Settings(), arguments.every
     with open_recording(arguments.experiment / "experiment.yaml") as recording:
         numbers, texture, radius_mm = recording.frames, recording.texture, recording.experiment.radius_mm
-        views = [open_view(recording, stream, settings, silent) for stream in recording.streams]
+        views = [open_views(recording, stream, settings, silent)[""] for stream in recording.streams]
         shots = [
             list(screened_frames(stream, view.background))[::every]
             for stream, view in zip(recording.streams, views, strict=True)

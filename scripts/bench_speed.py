@@ -41,9 +41,9 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Frame, screened_frames
-from sphereorient.methods import precise, several
+from sphereorient.methods import precise
 from sphereorient.methods.method import Job
-from sphereorient.methods.proposers import open_view
+from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import kalman
 from sphereorient.motion.matern import Prior
@@ -165,7 +165,7 @@ def prepared(folder: Path, cameras: list[str] | None = None, say: Callable[[str,
     """Learn what the stages need, as the pipeline does."""
     settings = Settings()
     with open_recording(folder / "experiment.yaml", cameras) as recording:
-        eyes = [open_view(recording, reel, settings, silent) for reel in recording.streams]
+        eyes = [open_views(recording, reel, settings, silent)[""] for reel in recording.streams]
         shots = [
             list(screened_frames(reel, eye.background, 0, FOLLOWED))
             for reel, eye in zip(recording.streams, eyes, strict=True)
@@ -236,7 +236,7 @@ def stages(bench: Bench) -> float:
 def steps(bench: Bench, lanes: int) -> tuple[float, float]:
     """CPU seconds a camera of a block's first two frames, and of a predicted one, as many blocks side by side."""
     ball = BallTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
-    short, each = steps_of(Tracker({"": ball}, ball.start), bench.shots, bench.times, lanes)
+    short, each = steps_of(Tracker({"": ball}), bench.shots, bench.times, lanes)
     return short / lanes / len(bench.eyes), each / lanes / len(bench.eyes)
 
 
@@ -289,7 +289,7 @@ def three_balls() -> None:
             write_synthetic_experiment(folder, settings)
             with open_recording(folder / "experiment.yaml") as recording:
                 job = Job(recording=recording, settings=Settings(), device=torch.device("cpu"))
-                follower = several.learn(job, silent)
+                follower = precise.learn(job, silent)
                 views = next(iter(follower.appearances.values())).fitter.views
                 shots = [
                     list(screened_frames(reel, view.background, 0, MANY))

@@ -26,7 +26,7 @@ from sphereorient.experiment.stream import spread_frames
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Background, Frame
-from sphereorient.methods.proposers import open_view
+from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter
@@ -117,7 +117,7 @@ def measured(folder: Path) -> None:
         with h5py.File(folder / "truth.h5") as file:
             R_lab_body = torch.from_numpy(file["orientation"][()])[frames.start : frames.stop]
         for stream in recording.streams:
-            view = open_view(recording, stream, settings, silent)
+            view = open_views(recording, stream, settings, silent)[""]
             pictures = [picture for picture, _ in stream.pictures() if picture is not None]
             errors = errors_deg(view, recording.texture, recording.experiment.radius_mm, pictures, R_lab_body)
             report(f"{folder.name}, {stream.name}", errors)

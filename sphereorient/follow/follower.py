@@ -40,7 +40,7 @@ class PerCameraTracker:
         self.parts = [part for part in (appearance.majority, *others) if part]
         balls = [BallTracker(appearance.of(*part), search, settings) for part in self.parts]
         self.balls: dict[str, BallTracker] = {}  # that are followed in all cameras together
-        self.trackers = [Tracker({name: ball}, ball.start) for ball in balls]
+        self.trackers = [Tracker({name: ball}) for ball in balls]
 
     def batches(self, frames: range) -> list[list[int]]:
         """Return the lengths of the chunks of each batch; see `Tracker`."""

@@ -1,6 +1,6 @@
 """Fitted poses of one frame, and of all frames, padded, for the path."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -59,24 +59,58 @@ class PoseTable(FittedPoses):
         return chosen
 
 
-def pose_table(batches: Iterable[Sequence[Poses]], cameras: int) -> PoseTable:
-    """Put the poses of N frames, given batch by batch, into arrays."""
-    flat: dict[str, list[Tensor]] = {name: [] for name in POSE_PARTS}
-    counts: list[int] = []
-    use: list[Tensor] = []
-    reason: list[tuple[Reason, ...]] = []
-    for frames in batches:
-        counts += [len(poses) for poses in frames]
-        use.append(torch.stack([poses.use for poses in frames]))
-        reason += [poses.reason for poses in frames]
-        for name, pieces in flat.items():
-            pieces.append(torch.cat([getattr(poses, name) for poses in frames]))
+def pose_tables(
+    batches: Iterable[Mapping[str, Sequence[Poses]]], names: Iterable[str], cameras: int
+) -> dict[str, PoseTable]:
+    """Put the poses of each ball in N frames, given batch by batch, into arrays."""
+    flat: dict[str, list[dict[str, Tensor]]] = {name: [] for name in names}
+    counts: dict[str, list[int]] = {name: [] for name in flat}
+    reason: dict[str, list[tuple[Reason, ...]]] = {name: [] for name in flat}
+    for batch in batches:
+        for name, frames in batch.items():
+            counts[name] += [len(poses) for poses in frames]
+            reason[name] += [poses.reason for poses in frames]
+            parts = {part: torch.cat([getattr(poses, part) for poses in frames]) for part in POSE_PARTS}
+            flat[name].append(parts | {"use": torch.stack([poses.use for poses in frames])})
+    return {name: _padded(flat[name], counts[name], reason[name], cameras) for name in flat}
+
+
+def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
+    """Put the poses of one ball in N frames into arrays."""
+    return pose_tables([{"": frames}], [""], cameras)[""]
+
+
+def _padded(
+    flat: Sequence[Mapping[str, Tensor]], counts: Sequence[int], reason: Sequence[tuple[Reason, ...]], cameras: int
+) -> PoseTable:
     mask = torch.arange(max([*counts, 1])) < torch.tensor(counts)[:, None]
     parts = blank_parts(cameras, *mask.shape)
     for name, whole in parts.items():
-        whole[mask] = torch.cat(flat[name])
+        whole[mask] = torch.cat([batch[name] for batch in flat])
     parts["nll"] = parts["nll"] - parts["nll"][:, :1]
-    return PoseTable(mask=mask, **parts, use=torch.cat(use), reason=tuple(reason))
+    return PoseTable(mask=mask, **parts, use=torch.cat([batch["use"] for batch in flat]), reason=tuple(reason))
+
+
+def exchanged(tables: Sequence[PoseTable], row: Tensor) -> list[PoseTable]:
+    """Return the tables of K balls of which ball k in frame n is the one of table `row` (K, N)."""
+    frame, (count, cameras) = torch.arange(row.shape[1]), (len(row), tables[0].use.shape[1])
+    most = max(table.mask.shape[1] for table in tables)
+    mask = torch.zeros(count, len(frame), most, dtype=torch.bool)
+    parts = blank_parts(cameras, count, len(frame), most)
+    for k, table in enumerate(tables):
+        mask[k, :, : table.mask.shape[1]] = table.mask
+        for name, part in table.parts().items():
+            parts[name][k, :, : part.shape[1]] = part
+    use = torch.stack([table.use for table in tables])
+    return [
+        PoseTable(
+            mask=mask[own, frame],
+            **{name: part[own, frame] for name, part in parts.items()},
+            use=use[own, frame],
+            reason=tuple(tables[k].reason[n] for n, k in enumerate(own.tolist())),
+        )
+        for own in row
+    ]
 
 
 def supported(poses: Poses) -> bool:

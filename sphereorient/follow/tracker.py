@@ -13,6 +13,7 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.poses import Poses, supported
+from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
 
@@ -33,9 +34,11 @@ class Tracker:
     batch, worker or restart can change a result, and a wrong pose is lost with its chunk.
     """
 
-    def __init__(self, balls: Mapping[str, BallTracker], start: Start) -> None:
+    def __init__(self, balls: Mapping[str, BallTracker]) -> None:
         self.balls = dict(balls)
-        self.start = start
+        first, *others = self.balls.values()
+        searches = {name: ball.search for name, ball in self.balls.items()}
+        self.start: Start = SceneStart(searches) if others else first.start
         radius_mm = {name: ball.fitter.radius_mm for name, ball in self.balls.items()}
         self._others = {
             name: {other: size for other, size in radius_mm.items() if other != name} for name in self.balls

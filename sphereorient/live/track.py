@@ -76,7 +76,7 @@ class TrackBlocks:
 
     def _of(self, time_s: list[float], poses: list[Poses], marks: list[tuple[int, int]]) -> Trajectory:
         experiment, cameras = self.recording.experiment, self.recording.cameras
-        table = pose_table([poses], len(cameras))
+        table = pose_table(poses, len(cameras))
         choice = torch.where(table.mask.any(1), 0, -1)
         clock = torch.tensor(time_s, dtype=torch.float64)
         learnt = self.tracker.appearance

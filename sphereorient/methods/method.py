@@ -171,7 +171,7 @@ class Job:
 
     def of(self, name: str) -> "Job":
         """Return the job of one ball alone; ExperimentError for an unknown name."""
-        given = None if self.given is None else {"": self.given[name]}
+        given = None if self.given is None else {name: self.given[name]}
         return replace(self, recording=self.recording.of(name), given=given)
 
 

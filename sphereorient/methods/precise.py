@@ -1,113 +1,115 @@
-"""The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
+"""The precise method: appearance of the movie, pose after pose, the most likely path, its motion; for K balls."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
+from sphereorient.assemble.identity import same_balls
+from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.recording import Progress
-from sphereorient.follow.appearance import Appearance, Following, estimate_appearance
+from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import find_fixed_centre
-from sphereorient.follow.follower import Follower, PerCameraTracker, frames_at, frames_showing, sample_frames
-from sphereorient.follow.initialise import UNPROVEN, Initialiser
-from sphereorient.follow.poses import Poses, pose_table
+from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import PoseTable, exchanged, pose_tables
 from sphereorient.follow.tracker import Tracker
 from sphereorient.methods import results
-from sphereorient.methods.method import Job, Joined, Learnt, Measured
-from sphereorient.methods.proposers import BlurMatchedSearch, open_views, sizes_of
-from sphereorient.pose.blur import estimate_blur_px
-from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter
-from sphereorient.trajectory import Trajectory
+from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
+from sphereorient.methods.paint import alike, following, open_paints, studies_of
+from sphereorient.methods.proposers import BlurMatchedSearch, sizes_of
+from sphereorient.trajectory import Flag, Trajectory
+
+Floats = NDArray[np.float64]
+
+SURE = 0.99  # probability from which a ball has its name
 
 
 def learn(job: Job, progress: Progress) -> Follower:
-    """Estimate backgrounds, blur, light and noise from frames spread over the movies."""
-    recording, settings = job.recording, job.settings
-    views, base, search = open_views(recording, settings, progress)
+    """Estimate backgrounds, and blur, light and noise of each paint, from frames spread over the movies."""
+    _check(job)
+    recording, refine, exposure_s = job.recording, job.settings.refine, exposure_of(job)
+    paints = open_paints(job, progress)
     progress("appearance", 0, 1)
-    blur_px = settings.refine.blur_px or FIRST_BLUR_PX
-    first = Initialiser(
-        fitter=first_fitter(views, recording.experiment.radius_mm, base, blur_px),
-        proposers=search.by_camera(views, blur_px),
-        locating=settings.locate,
-        candidates=settings.refine.candidates,
-        score_min=UNPROVEN,
-        known={},
-    )
-    assert first.known is not None
-    frames, places = frames_showing(recording, views, settings.refine.appearance_frames, first.disks)
-    shown = {id(shot.picture) for shots in frames for shot in shots}
-    first = replace(first, known={key: one for key, one in first.known.items() if key[0] in shown})
-    if settings.refine.blur_px is None:
-        pairs = (pair for shots in frames for pair in zip(shots, first.disks(shots), strict=True))
-        blur_px = estimate_blur_px((shot.picture, disk) for shot, disk in pairs if disk is not None)
-        # Only blurred pictures need blurred templates; sharp ones share one first guess.
-        if defocus_radii(blur_px, search.diameter_px):
-            fitter = first_fitter(views, recording.experiment.radius_mm, base, blur_px)
-            first = replace(first, fitter=fitter, proposers=search.by_camera(views, blur_px))
-    following = None
-    if exposure_s(job) > 0 and len(recording.clock) > 1:
-        beside = [place + 1 if place + 1 < len(recording.clock) else place - 1 for place in places]
-        following = Following(
-            shots=lambda rows: frames_at(recording, views, [beside[k] for k in rows]),
-            open_share=exposure_s(job) / (recording.clock[beside] - recording.clock[places]),
-        )
-    appearance = estimate_appearance(first, frames, base, settings.refine, following)
+    appearances: dict[str, Appearance] = {}
+    for paint, study in zip(paints, studies_of(recording, refine, paints), strict=True):
+        beside = following(recording, study, exposure_s)
+        one = estimate_appearance(study.first, study.frames, paint.base, refine, beside, study.among)
+        appearances |= dict.fromkeys(paint.names, one)
     progress("appearance", 1, 1)
-    return follower(job, appearance, search)
+    searches = {name: paint.search for paint in paints for name in paint.names}
+    return follower(job, {name: appearances[name] for name in recording.experiment.names}, searches)
 
 
 def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:
     """Return the follower of `learn`, from what another run or process learnt."""
-    appearance = learnt[""].appearance(job.recording)
-    search = BlurMatchedSearch(job.recording.texture, job.settings, sizes_of(appearance.fitter.views))
-    return follower(job, appearance, search)
+    _check(job)
+    names = job.recording.experiment.names
+    if set(learnt) != set(names):
+        do = "pass what was learnt of this experiment"
+        got, expected = ", ".join(sorted(learnt)), ", ".join(names)
+        raise ExperimentError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
+    appearances = {name: learnt[name].appearance(job.recording.of(name)) for name in names}
+    searches: dict[str, BlurMatchedSearch] = {}
+    for same in alike(job.recording):
+        sizes = sizes_of(appearances[same[0]].fitter.views)
+        searches |= dict.fromkeys(same, BlurMatchedSearch(job.recording.of(same[0]).texture, job.settings, sizes))
+    return follower(job, appearances, searches)
 
 
-def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Follower:
-    """Choose how to follow frames: all cameras together, or one by one if they disagree."""
-    settings, views = job.settings, appearance.fitter.views
-    proposers = search.by_camera(views, appearance.fitter.optics.blur_px)
-    begin = Initialiser(
-        fitter=appearance.still,
-        proposers=proposers,
-        locating=settings.locate,
-        candidates=settings.refine.candidates,
-        score_min=appearance.clear_score,
-    )
-    there = appearance.on(job.device)
-    tracker: Tracker | PerCameraTracker
-    if appearance.together:
+def follower(job: Job, appearances: Mapping[str, Appearance], searches: Mapping[str, BlurMatchedSearch]) -> Follower:
+    """Choose how to follow frames: all balls in all cameras together, or one by one the cameras that disagree."""
+    balls: dict[str, BallTracker] = {}
+    for name, one in appearances.items():
+        begin = Initialiser(
+            fitter=one.still,
+            proposers=searches[name].by_camera(one.fitter.views, one.fitter.optics.blur_px),
+            locating=job.settings.locate,
+            candidates=job.settings.refine.candidates,
+            score_min=one.clear_score,
+        )
+        if not one.together:
+            apart = PerCameraTracker(name, one.on(job.device), begin, job.settings.refine)
+            return Follower(recording=job.recording, appearances=appearances, tracker=apart)
         centre = None
-        if job.recording.experiment.fixed:
-            frames, _ = sample_frames(job.recording, views, settings.refine.appearance_frames)
-            centre = find_fixed_centre(begin, frames, appearance.score_min)
-        ball = BallTracker(there, begin, settings.refine, exposure_s(job), centre)
-        tracker = Tracker({"": ball}, ball.start)
-    else:
-        tracker = PerCameraTracker("", there, begin, settings.refine)
-    return Follower(recording=job.recording, appearances={"": appearance}, tracker=tracker)
+        if job.recording.of(name).experiment.fixed:
+            frames, _ = sample_frames(job.recording, one.fitter.views, job.settings.refine.appearance_frames)
+            centre = find_fixed_centre(begin, frames, one.score_min)
+        balls[name] = BallTracker(one.on(job.device), begin, job.settings.refine, exposure_of(job), centre)
+    return Follower(recording=job.recording, appearances=appearances, tracker=Tracker(balls))
 
 
-def exposure_s(job: Job) -> float:
+def exposure_of(job: Job) -> float:
     """Return how long the shutter is open, s; 0 where that is not known, or where the given blur holds its motion."""
     return 0.0 if job.settings.refine.blur_px is not None else job.recording.experiment.exposure_s or 0.0
 
 
 def join(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
-    """Choose the path through all frames' candidates and smooth it; return the track and what was learnt."""
+    """Choose each ball's path through all frames' candidates and smooth it; return its track and what was learnt.
+    Balls of one paint keep their names over the movie.
+    """
     assert follower is not None  # `learn` and `resume` return one
-    return {"": joined(job, follower.appearance, (poses[""] for poses in measured))}
+    tables = pose_tables(measured, follower.appearances, len(job.recording.streams))
+    found: dict[str, Joined] = {}
+    for names in alike(job.recording):
+        own, sure = _named([tables[name] for name in names], job, follower)
+        for name, table, certain in zip(names, own, sure, strict=True):
+            track, learnt = joined(job.of(name), follower.appearances[name], table)
+            flags = np.where(certain < SURE, np.uint32(Flag.IDENTITY), np.uint32(0))
+            found[name] = replace(track, identity=certain, flags=track.flags | flags), learnt
+    return {name: found[name] for name in follower.appearances}
 
 
-def joined(job: Job, appearance: Appearance, measured: Iterable[list[Poses]]) -> tuple[Trajectory, Learnt]:
+def joined(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Trajectory, Learnt]:
     """Join the poses of one ball, as `join`."""
     clock, settings = job.recording.clock, job.settings
-    given = None if job.given is None else job.given[""]
-    table = pose_table(measured, len(job.recording.streams))
+    given = None if job.given is None else job.given[job.recording.experiment.sphere.name]
     path = settings.path
     if given is not None and given.acceleration_rad_s2 is not None:
         path = path.model_copy(update={"acceleration_rad_s2": given.acceleration_rad_s2})
@@ -135,3 +137,28 @@ def joined(job: Job, appearance: Appearance, measured: Iterable[list[Poses]]) ->
     smoothed = motion.smooth_motion(poses, smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, appearance)
     return track, Learnt.of(appearance, smoothed.process, float(chosen.acceleration_rad_s2))
+
+
+def _named(tables: Sequence[PoseTable], job: Job, follower: Follower) -> tuple[Sequence[PoseTable], Sequence[Floats]]:
+    """Give K balls that look alike the same names in all frames; return how sure that is, see `same_balls`."""
+    if len(tables) == 1:
+        return tables, [np.full(len(tables[0]), np.nan)]
+    seen = np.stack([(table.mask[:, 0] & table.use.any(1)).numpy() for table in tables])
+    X, R = np.zeros((*seen.shape, 3)), np.tile(np.eye(3), (*seen.shape, 1, 1))
+    for k, table in enumerate(tables):
+        X[k, seen[k]] = table.position_lab_mm[:, 0].numpy()[seen[k]]
+        R[k, seen[k]] = table.R_lab_body[:, 0].numpy()[seen[k]]
+    breaks = [end for batch in follower.batches for end in accumulate((batch.first, *batch.lengths))]
+    order, sure = same_balls(X, R, seen, job.recording.clock.numpy(), breaks)
+    return exchanged(tables, torch.as_tensor(order)), list(sure)
+
+
+def _check(job: Job) -> None:
+    spheres = job.recording.experiment.spheres
+    fixed = [sphere.name for sphere in spheres if sphere.fixed]
+    if fixed and len(spheres) > 1:
+        do = "leave `fixed` out, or name it alone under `sphere`"
+        raise ExperimentError(refusal(f"spheres.{fixed[0]}", expected="a ball that moves", got="fixed: true", do=do))
+
+
+PRECISE = Method(learn=learn, resume=resume, join=join)

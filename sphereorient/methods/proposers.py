@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,10 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera
-from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.experiment.stream import CameraStream
 from sphereorient.files.cache import cached
-from sphereorient.locate import CameraScene, find_scene, find_scenes, known_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.fitter import defocus_radii
@@ -108,51 +103,6 @@ def _distance_radii(camera: Camera, diameter_px: float) -> float | None:
     half_rad = 0.5 * float(torch.linalg.cross(*rim).norm().clamp(max=1.0).asin())
     distance = 1 / max(math.sin(half_rad), 1e-9)
     return round(distance, 1) if distance < NEAR_RADII else None
-
-
-def open_views(
-    recording: Recording, settings: Settings, progress: Progress
-) -> tuple[list[CameraView], TextureTable, BlurMatchedSearch]:
-    """Estimate the cameras' backgrounds, and build the finest texture table and a template bank in parallel."""
-    with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
-        opening = [pool.submit(open_view, recording, stream, settings, progress) for stream in recording.streams]
-        known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
-        cameras = [recording.cameras[stream.name] for stream in recording.streams]
-        sizes = [px or view.result().diameter_px for px, view in zip(known, opening, strict=True)]
-        search = BlurMatchedSearch(recording.texture, settings, list(zip(cameras, sizes, strict=True)))
-        base = pool.submit(finest_table, recording.texture, search.diameter_px, recording.unseen)
-        sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
-        views = [view.result() for view in opening]
-        sharp.result()
-        return views, base.result(), search
-
-
-def open_scene(recording: Recording, settings: Settings, progress: Progress) -> dict[str, list[CameraView]]:
-    """Estimate the cameras' backgrounds of a movie of several balls; return the views of each ball, by its name."""
-    views: dict[str, list[CameraView]] = {name: [] for name in recording.experiment.names}
-
-    def scenes(stream: CameraStream) -> dict[str, CameraScene]:
-        stage = f"{stream.name}: background"
-        progress(stage, 0, 1)
-        found = find_scenes(recording, stream, settings.refine.background_frames, settings.locate)
-        progress(stage, 1, 1)
-        return found
-
-    with ThreadPoolExecutor(2) as pool:
-        for stream, found in zip(recording.streams, pool.map(scenes, recording.streams), strict=True):
-            first = CameraView.of(stream.name, stream.camera, next(iter(found.values())))
-            for name, scene in found.items():  # the lines of sight are computed once
-                views[name].append(replace(first, diameter_px=scene.diameter_px))
-    return views
-
-
-def open_view(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> CameraView:
-    """Estimate one camera's background."""
-    stage = f"{stream.name}: background"
-    progress(stage, 0, 1)
-    scene = find_scene(recording, stream, settings.refine.background_frames, settings.locate)
-    progress(stage, 1, 1)
-    return CameraView.of(stream.name, stream.camera, scene)
 
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:

@@ -21,9 +21,8 @@ from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.methods.method import Job
-from sphereorient.methods.proposers import open_scene
+from sphereorient.methods.paint import open_paints
 from sphereorient.methods.settings import Settings
-from sphereorient.methods.several import unlit
 from sphereorient.preflight import texture_map
 from sphereorient.preflight.cameras import BAD, GOOD, OUTLINE_PX
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
@@ -56,9 +55,9 @@ def look_at_scene(
     loaded = {path: load_map(path) for path in dict.fromkeys(one.texture_path for one in spheres) if path is not None}
     maps = {one.name: loaded[one.texture_path] for one in spheres if one.texture_path is not None}
     job = Job(recording=replace(recording, maps=maps), settings=settings, device=torch.device("cpu"))
-    views = open_scene(job.recording, settings, progress)
-    balls = unlit(job, views)
-    frames, places = sample_frames(job.recording, next(iter(views.values())), FRAMES)
+    first = {name: paint.first for paint in open_paints(job, progress) for name in paint.names}
+    balls = {name: first[name] for name in recording.experiment.names}
+    frames, places = sample_frames(job.recording, next(iter(balls.values())).fitter.views, FRAMES)
     start, found, disks = SceneStart(balls), [], []
     for k, shots in enumerate(frames):
         progress("balls", k, len(frames))

@@ -18,9 +18,9 @@ from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Learnt, Method, load_learnt, one_thread, save_learnt
 from sphereorient.methods.paper import PAPER
+from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
-from sphereorient.methods.several import PRECISE
 from sphereorient.pose.lasting import Lasting
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Tracks, Trajectory

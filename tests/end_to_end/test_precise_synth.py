@@ -466,7 +466,7 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
     experiment = write(short.without_ball(np.arange(37, 39), ("cam1",)), tmp_path)
     track_movies(experiment, settings=settings("refine.chunk_frames=16"))
     (ball,) = made
-    tracker = Tracker({"": ball}, ball.start)
+    tracker = Tracker({"": ball})
     pictures = [np.load(tmp_path / f"{name}.npy") for name in CAMERAS]
 
     def poses_of(*blocks: int) -> list[str]:

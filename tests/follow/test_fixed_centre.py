@@ -146,7 +146,7 @@ def followed_poses(
         found = []
         for where in (None, place):
             ball = BallTracker(known, search, settings.refine, centre=where)
-            tracker = Tracker({"": ball}, ball.start)
+            tracker = Tracker({"": ball})
             poses: list[Poses] = []
             for window in tracker.batches(recording.frames):
                 n = len(poses)

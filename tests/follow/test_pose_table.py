@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from sphereorient import so3
-from sphereorient.follow.poses import Poses, no_pose, pose_table
+from sphereorient.follow.poses import Poses, exchanged, no_pose, pose_table, pose_tables
 from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.trajectory import Reason
 
@@ -41,7 +41,7 @@ def test_the_parts_that_are_gathered_are_all_that_a_pose_has():
 
 def test_every_pose_keeps_its_frame_and_rank():
     frames = [poses(2, 1), no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2), poses(3, 3), poses(1, 4)]
-    table = pose_table([frames], CAMERAS)
+    table = pose_table(frames, CAMERAS)
     assert len(table) == 4
     assert table.mask.tolist() == [[True, True, False], [False] * 3, [True] * 3, [True, False, False]]
     for k, frame in enumerate(frames):
@@ -55,14 +55,14 @@ def test_every_pose_keeps_its_frame_and_rank():
 
 def test_nll_counts_from_the_best_of_its_frame():
     frames = [poses(2, 1), no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2), poses(3, 3)]
-    nll = pose_table([frames], CAMERAS).nll
+    nll = pose_table(frames, CAMERAS).nll
     assert nll[:, 0].tolist() == [0.0, 0.0, 0.0]
     assert nll[0, :2].equal(frames[0].nll - frames[0].nll[0])
     assert nll[2].equal(frames[2].nll - frames[2].nll[0])
 
 
 def test_places_not_in_use_hold_the_unit_rotation_and_zeros():
-    table = pose_table([[poses(1, 1)], [poses(3, 2)]], CAMERAS)
+    table = pose_table([poses(1, 1), poses(3, 2)], CAMERAS)
     free = ~table.mask
     assert int(free.sum()) == 2
     assert table.R_lab_body[free].equal(torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
@@ -74,13 +74,13 @@ def test_places_not_in_use_hold_the_unit_rotation_and_zeros():
 def test_cameras_and_reasons_go_with_their_frames():
     lost = (Reason.NOT_FOUND, Reason.OUTLINE)
     frames = [poses(1, 1, (Reason.OK, Reason.OUTLINE)), no_pose(CAMERAS, lost), poses(1, 2)]
-    table = pose_table([frames], CAMERAS)
+    table = pose_table(frames, CAMERAS)
     assert table.use.tolist() == [[True, False], [False, False], [True, True]]
     assert table.reason == ((Reason.OK, Reason.OUTLINE), lost, OK)
 
 
 def test_frames_that_all_lack_a_pose_make_a_table_with_one_free_place():
-    table = pose_table([[no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2)]] * 3, CAMERAS)
+    table = pose_table([no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2)] * 3, CAMERAS)
     assert table.mask.shape == (3, 1)
     assert not table.mask.any()
     assert table.R_lab_body.shape == (3, 1, 3, 3)
@@ -88,14 +88,14 @@ def test_frames_that_all_lack_a_pose_make_a_table_with_one_free_place():
 
 def test_a_single_camera_has_its_own_axis():
     frame = no_pose(1, (Reason.NOT_FOUND,))
-    table = pose_table([[frame]], 1)
+    table = pose_table([frame], 1)
     assert table.own_turn.shape == (1, 1, 1, 3)
     assert table.use.shape == (1, 1)
 
 
 def test_rows_are_the_chosen_places_and_nan_where_none_is_chosen():
     frames = [poses(2, 1), poses(3, 2), poses(1, 3), no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2)]
-    table = pose_table([frames], CAMERAS)
+    table = pose_table(frames, CAMERAS)
     rows = table.rows(torch.tensor([1, 2, -1, -1]))
     assert set(rows) == set(POSE_PARTS)
     for name, part in rows.items():
@@ -106,3 +106,27 @@ def test_rows_are_the_chosen_places_and_nan_where_none_is_chosen():
         assert part[2:].isnan().all()
     # The table itself is as before.
     assert not table.R_lab_body.isnan().any()
+
+
+def test_batches_of_several_balls_give_the_tables_of_all_their_frames():
+    one, other = [poses(1, 1), poses(3, 2), poses(2, 3)], [poses(2, 4), poses(1, 5), poses(1, 6)]
+    batches = [{"a": one[:1], "b": other[:1]}, {"a": one[1:], "b": other[1:]}]
+    tables = pose_tables(batches, "ab", CAMERAS)
+    for name, frames in (("a", one), ("b", other)):
+        whole = pose_table(frames, CAMERAS)
+        assert all(part.equal(whole.parts()[key]) for key, part in tables[name].parts().items())
+        assert tables[name].mask.equal(whole.mask) and tables[name].use.equal(whole.use)
+        assert tables[name].reason == whole.reason
+
+
+def test_exchanged_tables_are_those_of_exchanged_frames():
+    one, other = [poses(1, 1), poses(3, 2), poses(2, 3)], [poses(2, 4), poses(1, 5), poses(1, 6)]
+    row = torch.tensor([[0, 1, 0], [1, 0, 1]])
+    wanted = [pose_table(frames, CAMERAS) for frames in ([one[0], other[1], one[2]], [other[0], one[1], other[2]])]
+    for found, whole in zip(
+        exchanged([pose_table(one, CAMERAS), pose_table(other, CAMERAS)], row), wanted, strict=True
+    ):
+        most = whole.mask.shape[1]
+        assert found.mask[:, :most].equal(whole.mask) and not found.mask[:, most:].any()
+        assert all(part[found.mask].equal(whole.parts()[key][whole.mask]) for key, part in found.parts().items())
+        assert found.use.equal(whole.use) and found.reason == whole.reason

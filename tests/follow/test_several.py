@@ -14,7 +14,7 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.poses import no_pose
 from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import screened_frames
-from sphereorient.methods import several
+from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import load_settings
 from sphereorient.run.stages import run
@@ -113,7 +113,7 @@ def followed_where(movie, again, exchanged=False):
     learnt = load_learnt(movie.experiment.with_name("learnt.h5"))
     with open_recording(movie.experiment) as recording, one_thread():
         job = Job(recording=recording, settings=load_settings(None, (CHUNK,)), device=torch.device("cpu"))
-        follower = several.resume(job, learnt)
+        follower = precise.resume(job, learnt)
         scene, views = follower.tracker, next(iter(follower.appearances.values())).fitter.views
         shots = [list(screened_frames(s, v.background, 0, 20)) for s, v in zip(recording.streams, views, strict=True)]
         number = {id(shot): k for k, shot in enumerate(shots[0])}
@@ -125,7 +125,9 @@ def followed_where(movie, again, exchanged=False):
             return found | {"a": found["c"], "c": found["a"]} if exchanged and number[id(frame[0])] == again else found
 
         balls = {name: tracker if name == "b" else Astray(tracker, 8) for name, tracker in scene.balls.items()}
-        return list(Tracker(balls, start).track(shots, [20], recording.clock.tolist()))
+        tracker = Tracker(balls)
+        tracker.start = start
+        return list(tracker.track(shots, [20], recording.clock.tolist()))
 
 
 def names_of(found, movie):

@@ -19,14 +19,13 @@ TURNED = 20  # frame
 
 def tracked(monkeypatch, change):
     """The excerpt, with its measured poses changed before they are joined."""
-    whole = precise.pose_table
+    joined = precise.joined
 
-    def changed(batches, cameras):
-        table = whole(batches, cameras)
+    def changed(job, appearance, table):
         change(table)
-        return table
+        return joined(job, appearance, table)
 
-    monkeypatch.setattr(precise, "pose_table", changed)
+    monkeypatch.setattr(precise, "joined", changed)
     return run(Request(experiment=EXCERPT, settings=load_settings(None, SHORT)), MemoryStore())
 
 

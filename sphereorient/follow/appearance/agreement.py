@@ -102,7 +102,7 @@ def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
     parts = []
     for of_camera in alone:
         clear = torch.tensor([0 if k in proven(of_camera) else -1 for k in range(len(of_camera))])
-        best = pose_table([of_camera], 1).rows(clear)
+        best = pose_table(of_camera, 1).rows(clear)
         parts.append((best["position_lab_mm"], best["R_lab_body"], best["covariance"][:, :3, :3]))
     X, R, covariance = (torch.stack(part, 1) for part in zip(*parts, strict=True))
     seen = _seen_alone(fitter, X, R)

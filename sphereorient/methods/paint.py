@@ -1,0 +1,193 @@
+"""Paints of an experiment: how balls are looked for before their light is known, and the frames it is learnt from."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from sphereorient.errors import ExperimentError, refusal
+from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.follow.appearance import Among, Following
+from sphereorient.follow.follower import frames_at, frames_showing, sample_frames
+from sphereorient.follow.initialise import UNPROVEN, Initialiser
+from sphereorient.follow.poses import Poses
+from sphereorient.follow.scene_start import SceneStart
+from sphereorient.follow.settings import RefineSettings
+from sphereorient.follow.tracker import among_found
+from sphereorient.locate import Frame, find_scenes, known_diameter_px
+from sphereorient.methods.method import Job
+from sphereorient.methods.proposers import BlurMatchedSearch, finest_table
+from sphereorient.methods.settings import Settings
+from sphereorient.pose import CameraView
+from sphereorient.pose.blur import estimate_blur_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter
+from sphereorient.pose.neighbours import spoilt
+from sphereorient.sphere.texture_table import TextureTable
+
+MOSTLY_SEEN = 0.5  # share of a disk that others must leave to each camera, of the frames that light is learnt from
+MORE_FRAMES = 2  # times those of one ball: others hide it in some
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Paint:
+    """Balls of one map and diameter: no picture tells them apart."""
+
+    names: Sequence[str]
+    base: TextureTable  # finest table of the map
+    search: BlurMatchedSearch
+    first: Initialiser  # finds poses with an assumed blur and light
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Study:
+    """n frames from which the appearance of a paint is estimated."""
+
+    first: Initialiser  # of this paint
+    frames: Sequence[Sequence[Frame]]  # n of C
+    places: Sequence[int]  # n, among the frames in use
+    among: Among | None = None  # poses of balls that others are beside
+
+
+def alike(recording: Recording) -> list[list[str]]:
+    """Return the names of the balls, those of one map and diameter together."""
+    kinds: list[list[str]] = []
+    for name in recording.experiment.names:
+        own = recording.of(name)
+        for names in kinds:
+            other = recording.of(names[0])
+            same = own.experiment.radius_mm == other.experiment.radius_mm
+            if same and torch.equal(own.texture, other.texture):
+                names.append(name)
+                break
+        else:
+            kinds.append([name])
+    return kinds
+
+
+def open_views(
+    recording: Recording, stream: CameraStream, settings: Settings, progress: Progress
+) -> dict[str, CameraView]:
+    """Estimate one camera's background; return the view of each ball by name."""
+    stage = f"{stream.name}: background"
+    progress(stage, 0, 1)
+    found = find_scenes(recording, stream, settings.refine.background_frames, settings.locate)
+    progress(stage, 1, 1)
+    first = CameraView.of(stream.name, stream.camera, next(iter(found.values())))
+    # The lines of sight are computed once.
+    return {name: replace(first, diameter_px=scene.diameter_px) for name, scene in found.items()}
+
+
+def open_paints(job: Job, progress: Progress) -> list[Paint]:
+    """Estimate the cameras' backgrounds; build the finest table and the template bank of each paint meanwhile."""
+    recording, settings = job.recording, job.settings
+    blur_px = settings.refine.blur_px or FIRST_BLUR_PX
+    with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
+        opening = [pool.submit(open_views, recording, stream, settings, progress) for stream in recording.streams]
+        tables, searches = [], []
+        for names in (kinds := alike(recording)):
+            own = recording.of(names[0])
+            known = [known_diameter_px(own, stream.name, settings.locate) for stream in recording.streams]
+            sizes = [px or views.result()[names[0]].diameter_px for px, views in zip(known, opening, strict=True)]
+            cameras = [stream.camera for stream in recording.streams]
+            search = BlurMatchedSearch(own.texture, settings, list(zip(cameras, sizes, strict=True)))
+            tables.append(pool.submit(finest_table, own.texture, search.diameter_px, own.unseen))
+            searches.append((search, pool.submit(search.of, settings.refine.blur_px or 0.0)))
+        each = [views.result() for views in opening]
+        paints = []
+        for names, base, (search, bank) in zip(kinds, tables, searches, strict=True):
+            bank.result()
+            views = [of_camera[names[0]] for of_camera in each]
+            first = Initialiser(
+                fitter=first_fitter(views, recording.of(names[0]).experiment.radius_mm, base.result(), blur_px),
+                proposers=search.by_camera(views, blur_px),
+                locating=settings.locate,
+                candidates=settings.refine.candidates,
+            )
+            paints.append(Paint(names=names, base=base.result(), search=search, first=first))
+    return paints
+
+
+def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Paint]) -> Iterator[Study]:
+    """Yield the frames from which the appearance of each paint is estimated.
+
+    Raises:
+        ExperimentError: no frame shows a ball that the others mostly leave to all cameras that see it.
+    """
+    first = {name: paint.first for paint in paints for name in paint.names}
+    if len(first) == 1:
+        yield _alone(recording, refine, paints[0])
+        return
+    views = paints[0].first.fitter.views
+    frames, places = sample_frames(recording, views, MORE_FRAMES * refine.appearance_frames)
+    start = SceneStart(first)
+    found = [start(shots, list(first), {}) for shots in frames]
+    for paint in paints:
+        rows = _mostly_seen(paint, first, found)
+        # Mixed: light is judged from halves of them, and any half should hold all balls at all times.
+        rows = [rows[k] for k in np.random.default_rng(0).permutation(len(rows))]
+        if not rows:
+            do = "check the texture and diameter of this ball, and whether it is in view"
+            what = f"ball {' or '.join(paint.names)}"
+            raise ExperimentError(refusal(what, expected="some frames that show it", got="none", do=do))
+        yield Study(
+            first=paint.first,
+            frames=[frames[k] for k, _ in rows],
+            places=[places[k] for k, _ in rows],
+            among=Among(
+                found=[found[k][name] for k, name in rows],
+                neighbours=among_found([(name, found[k]) for k, name in rows], first),
+            ),
+        )
+
+
+def _alone(recording: Recording, refine: RefineSettings, paint: Paint) -> Study:
+    """Return frames that show an only ball; where no blur is given, the search is for the blur that they have."""
+    first = replace(paint.first, score_min=UNPROVEN, known={})
+    assert first.known is not None
+    views = first.fitter.views
+    frames, places = frames_showing(recording, views, refine.appearance_frames, first.disks)
+    shown = {id(shot.picture) for shots in frames for shot in shots}
+    first = replace(first, known={key: one for key, one in first.known.items() if key[0] in shown})
+    if refine.blur_px is None:
+        pairs = (pair for shots in frames for pair in zip(shots, first.disks(shots), strict=True))
+        blur_px = estimate_blur_px((shot.picture, disk) for shot, disk in pairs if disk is not None)
+        # Only blurred pictures need blurred templates; sharp ones share one first guess.
+        if defocus_radii(blur_px, paint.search.diameter_px):
+            fitter = first_fitter(views, first.fitter.radius_mm, paint.base, blur_px)
+            first = replace(first, fitter=fitter, proposers=paint.search.by_camera(views, blur_px))
+    return Study(first=first, frames=frames, places=places)
+
+
+def _mostly_seen(
+    paint: Paint, first: Mapping[str, Initialiser], found: Sequence[Mapping[str, Poses]]
+) -> list[tuple[int, str]]:
+    """Return frames and names of balls of a paint that the others mostly leave to all cameras that see them."""
+    rows = []
+    for k, there in enumerate(found):
+        for name in paint.names:
+            if name not in there or not len(there[name]):
+                continue
+            poses = there[name]
+            fitter, fine = paint.first.fitter, paint.first.fitter.optics.fine
+            X = poses.position_lab_mm[:1]
+            middle_px, radius_px, _ = fitter.disks_px(X)
+            places = fitter.places(X, fine, fitter.stencil(fine, float(radius_px)), middle_px)
+            share = spoilt(places, among_found([(name, there)], first)).left[0]
+            if bool((share[poses.use] > MOSTLY_SEEN).all()):
+                rows.append((k, name))
+    return rows
+
+
+def following(recording: Recording, study: Study, exposure_s: float) -> Following | None:
+    """Return the frames beside those studied, that tell the motion in the exposure, s; None where that is unknown."""
+    clock, places = recording.clock, study.places
+    if not exposure_s > 0 or len(clock) < 2:
+        return None
+    beside = [place + 1 if place + 1 < len(clock) else place - 1 for place in places]
+    return Following(
+        shots=lambda rows: frames_at(recording, study.first.fitter.views, [beside[k] for k in rows]),
+        open_share=exposure_s / (clock[beside] - clock[places]),
+    )
