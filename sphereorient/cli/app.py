@@ -230,10 +230,10 @@ def settings(
     method: Annotated[str | None, typer.Option(help="precise, paper, map or report; all without it.")] = None,
 ) -> None:
     """Write all settings of the methods, or those that one reads, with defaults and explanations."""
-    from sphereorient.methods.settings import BRANCHES, settings_yaml
+    from sphereorient.methods.settings import METHODS, settings_yaml
 
-    if method not in (None, *BRANCHES):
-        raise SettingsError(refusal("--method", expected=", ".join(BRANCHES), got=repr(method)[:40], do="choose one"))
+    if method not in (None, *METHODS):
+        raise SettingsError(refusal("--method", expected=", ".join(METHODS), got=repr(method)[:40], do="choose one"))
     text = settings_yaml(method=method)
     if out is None:
         typer.echo(text)

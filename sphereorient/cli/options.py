@@ -42,9 +42,9 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summ
 
 def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> "Settings":
     """Read the settings that a method reads, and print remarks on the others."""
-    from sphereorient.methods.settings import BRANCHES, read_settings
+    from sphereorient.methods.settings import METHODS, read_settings
 
-    loaded = read_settings(path, overrides or [], method if method in BRANCHES else None)
+    loaded = read_settings(path, overrides or [], method if method in METHODS else None)
     for remark in loaded.remarks:
         typer.echo(f"note: {remark}", err=True)
     return loaded.settings

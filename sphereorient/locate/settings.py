@@ -1,4 +1,6 @@
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, JsonValue
+
+OF_GAPS: dict[str, JsonValue] = {"methods": ["paper", "map"]}  # the methods that look along the movie of one camera
 
 
 class LocateSettings(BaseModel, frozen=True, extra="forbid"):
@@ -45,9 +47,21 @@ class LocateSettings(BaseModel, frozen=True, extra="forbid"):
     coverage_min: float = Field(
         0.35, gt=0, lt=1, description="share of the outline's directions that must show an edge; black paint hides some"
     )
-    gap_frames_max: int = Field(4, ge=0, description="longest gap that is interpolated, frames; the paper: under 5")
-    spline_knot_frames: int = Field(
-        12, ge=2, description="knot spacing of the least-squares spline, frames; well below the shortest motion (20 ms)"
+    gap_frames_max: int = Field(
+        4, ge=0, description="longest gap that is interpolated, frames; the paper: under 5", json_schema_extra=OF_GAPS
     )
-    outlier_px: float = Field(1.0, gt=0, description="smallest deviation from the spline that can be an outlier, px")
-    outlier_factor: float = Field(6.0, gt=0, description="an outlier deviates by this many robust sigmas of its movie")
+    spline_knot_frames: int = Field(
+        12,
+        ge=2,
+        description="knot spacing of the least-squares spline, frames; well below the shortest motion (20 ms)",
+        json_schema_extra=OF_GAPS,
+    )
+    outlier_px: float = Field(
+        1.0,
+        gt=0,
+        description="smallest deviation from the spline that can be an outlier, px",
+        json_schema_extra=OF_GAPS,
+    )
+    outlier_factor: float = Field(
+        6.0, gt=0, description="an outlier deviates by this many robust sigmas of its movie", json_schema_extra=OF_GAPS
+    )

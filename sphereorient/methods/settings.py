@@ -26,33 +26,33 @@ from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
 DEFAULT_METHOD = "precise"
-# What each method reads: branches, without the keys in NOT_READ.
-BRANCHES: dict[str, tuple[str, ...]] = {
-    "precise": ("locate", "propose", "search", "refine", "path", "smooth"),
-    "paper": ("locate", "propose", "orient", "assemble", "motion"),
-    "map": ("locate", "paint"),
-    "report": ("statistics",),
-}
-_OF_GAPS = ("locate.gap_frames_max", "locate.spline_knot_frames", "locate.outlier_px", "locate.outlier_factor")
-NOT_READ: dict[str, tuple[str, ...]] = {"precise": _OF_GAPS}
+
+
+def _branch(model: type[Model], what: str, *methods: str) -> Any:
+    """Return the field of a branch with the `methods` that read it, but for keys that name theirs."""
+    return Field(default_factory=model, description=what, json_schema_extra={"methods": list(methods)})
 
 
 class Settings(BaseModel, frozen=True, extra="forbid"):
-    """All settings, one branch a stage; `BRANCHES` holds which a method reads."""
+    """All settings, one branch a stage."""
 
-    locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere (both methods)")
-    propose: ProposeSettings = Field(
-        default_factory=ProposeSettings, description="who proposes orientations (both methods)"
-    )
-    search: GreySearchSettings = Field(default_factory=GreySearchSettings, description="where could it point (precise)")
-    refine: RefineSettings = Field(default_factory=RefineSettings, description="poses to hundredths (precise)")
-    path: PathSettings = Field(default_factory=PathSettings, description="which candidate is true (precise)")
-    smooth: SmoothSettings = Field(default_factory=SmoothSettings, description="motion from the track (precise)")
-    orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")
-    assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
-    motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")
-    paint: MapSettings = Field(default_factory=MapSettings, description="the map from the movies (`map`)")
-    statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
+    locate: LocateSettings = _branch(LocateSettings, "where is the sphere (both methods)", "precise", "paper", "map")
+    propose: ProposeSettings = _branch(ProposeSettings, "who proposes orientations (both methods)", "precise", "paper")
+    search: GreySearchSettings = _branch(GreySearchSettings, "where could it point (precise)", "precise")
+    refine: RefineSettings = _branch(RefineSettings, "poses to hundredths (precise)", "precise")
+    path: PathSettings = _branch(PathSettings, "which candidate is true (precise)", "precise")
+    smooth: SmoothSettings = _branch(SmoothSettings, "motion from the track (precise)", "precise")
+    orient: OrientSettings = _branch(OrientSettings, "where could it point (paper)", "paper")
+    assemble: AssembleSettings = _branch(AssembleSettings, "which candidate is true (paper)", "paper")
+    motion: MotionSettings = _branch(MotionSettings, "velocities, accelerations (paper)", "paper")
+    paint: MapSettings = _branch(MapSettings, "the map from the movies (`map`)", "map")
+    statistics: StatisticsSettings = _branch(StatisticsSettings, "numbers of a report", "report")
+
+
+def _methods(model: type[BaseModel], name: str) -> Any:
+    """Return the methods that a field names as its readers; None: it names none."""
+    extra = model.model_fields[name].json_schema_extra
+    return extra.get("methods") if isinstance(extra, dict) else None
 
 
 def _values(settings: Settings) -> dict[str, Any]:
@@ -61,6 +61,13 @@ def _values(settings: Settings) -> dict[str, Any]:
 
 
 DEFAULTS = _values(Settings())
+# The methods that read each key `branch.name`: those that it names itself, or its branch's.
+READERS: dict[str, list[str]] = {
+    f"{branch}.{name}": _methods(type(part), name) or _methods(Settings, branch)
+    for branch, part in Settings()
+    for name in type(part).model_fields
+}
+METHODS = tuple(dict.fromkeys(method for methods in READERS.values() for method in methods))
 # Numbers of dotted names in a key.
 DEPTHS: dict[type[BaseModel], tuple[int, ...]] = {Settings: (2,), SynthSettings: (1,), ProposerSettings: (2, 3)}
 
@@ -104,9 +111,8 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
     if method is not None and path is not None:
         check_settings(settings, method, str(path))
         given = [(branch, f"{branch}.{name}") for branch, part in tree.items() for name in part]
-        aside = sorted(
-            {key if branch in BRANCHES[method] else branch for branch, key in given if not is_read(key, method)}
-        )
+        of_method = {key.partition(".")[0] for key in READERS if is_read(key, method)}
+        aside = sorted({key if branch in of_method else branch for branch, key in given if not is_read(key, method)})
         if aside:
             remarks.append(f"{path}: method {method} does not read {', '.join(aside)}: left aside")
     return Loaded(settings, tuple(remarks))
@@ -114,7 +120,7 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
 
 def is_read(key: str, method: str) -> bool:
     """Return whether a method reads the key `branch.name`."""
-    return key.partition(".")[0] in BRANCHES[method] and key not in NOT_READ.get(method, ())
+    return method in READERS.get(key, ())
 
 
 def check_settings(settings: Settings, method: str, source: str = "settings") -> None:
@@ -130,7 +136,7 @@ def _not_read(name: str, key: str, method: str) -> str:
     leaf = key.partition(".")[2]
     unit = [name for name in known if name.rpartition("_")[2] == leaf.rpartition("_")[2]]
     near = [name for some in (unit, list(known)) for name in difflib.get_close_matches(leaf, some, 1, 0.6)]
-    others = [other for other in BRANCHES if is_read(key, other)]
+    others = READERS[key]
     instead = f"use {known[near[0]]}, " if near else ""
     do = f"leave it out, {instead}or use it with {' or '.join(others)}"
     return refusal(name, expected=f"a key that method {method} reads", got=f"one of {' and '.join(others)}", do=do)
@@ -239,9 +245,10 @@ def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
 def _tree_yaml(head: str, tree: BaseModel, method: str | None = None) -> str:
     lines = [head, ""]
     for room, field in type(tree).model_fields.items():
-        if method is None or room in BRANCHES[method]:
-            left_out = [key.partition(".")[2] for key in NOT_READ.get(method or "", ()) if key.startswith(f"{room}.")]
-            lines += [f"{room}:  # {field.description}", *_commented(getattr(tree, room), "  ", left_out), ""]
+        branch = getattr(tree, room)
+        left_out = [key for key in type(branch).model_fields if method and not is_read(f"{room}.{key}", method)]
+        if len(left_out) < len(type(branch).model_fields):
+            lines += [f"{room}:  # {field.description}", *_commented(branch, "  ", left_out), ""]
     return "\n".join(lines)
 
 
