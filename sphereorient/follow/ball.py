@@ -178,7 +178,7 @@ class BallTracker:
         readable = torch.tensor([[shot.readable for shot in row] for row in shots])
         if any(one.rough for one in expected):
             was, rough = (X, R), torch.tensor([one.rough for one in expected])
-            X, R = self._approached(frames, X, R, known & readable, precision, rough, among)
+            X, R = self._approached(frames, (X, R), known & readable, precision, rough, among)
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         disks_px = self._disks_px(X)
@@ -209,7 +209,7 @@ class BallTracker:
         fit = self._fitted(there, X, R, use, disks_px)
         if visible is None and bool((poor := self._poor(fit, use)).any()):
             # A sharp picture holds the fit where it began: once more, from coarse to fine.
-            near = self._approached(there.frames, X, R, use, there.precision, poor, None)
+            near = self._approached(there.frames, (X, R), use, there.precision, poor, None)
             again = self._fitted(there, *near, use)
             better = (again.score * use).sum(1) > (fit.score * use).sum(1)
             fit = again.where(poor & better, fit)
@@ -291,14 +291,14 @@ class BallTracker:
     def _approached(
         self,
         frames: Sequence[Sequence[Shown]],
-        X: Tensor,
-        R: Tensor,
+        poses: tuple[Tensor, Tensor],
         use: Tensor,
         precision: Tensor,
         rough: Tensor,
         among: Neighbours | None,
     ) -> tuple[Tensor, Tensor]:
-        """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
+        """Bring those poses that are rough, (B,) bool, into the basin of the finest level, through coarser ones."""
+        X, R = poses
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
             pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
             fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)

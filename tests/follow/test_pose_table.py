@@ -115,7 +115,8 @@ def test_batches_of_several_balls_give_the_tables_of_all_their_frames():
     for name, frames in (("a", one), ("b", other)):
         whole = pose_table(frames, CAMERAS)
         assert all(part.equal(whole.parts()[key]) for key, part in tables[name].parts().items())
-        assert tables[name].mask.equal(whole.mask) and tables[name].use.equal(whole.use)
+        assert tables[name].mask.equal(whole.mask)
+        assert tables[name].use.equal(whole.use)
         assert tables[name].reason == whole.reason
 
 
@@ -127,6 +128,8 @@ def test_exchanged_tables_are_those_of_exchanged_frames():
         exchanged([pose_table(one, CAMERAS), pose_table(other, CAMERAS)], row), wanted, strict=True
     ):
         most = whole.mask.shape[1]
-        assert found.mask[:, :most].equal(whole.mask) and not found.mask[:, most:].any()
+        assert found.mask[:, :most].equal(whole.mask)
+        assert not found.mask[:, most:].any()
         assert all(part[found.mask].equal(whole.parts()[key][whole.mask]) for key, part in found.parts().items())
-        assert found.use.equal(whole.use) and found.reason == whole.reason
+        assert found.use.equal(whole.use)
+        assert found.reason == whole.reason

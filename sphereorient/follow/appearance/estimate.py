@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
+from torch import Tensor
+
 from sphereorient.errors import ExperimentError
-from sphereorient.follow.appearance.agreement import agreeing_poses, limb_px, proven_poses, usual_apart_rad
+from sphereorient.follow.appearance.agreement import ProvenPoses, agreeing_poses, limb_px, proven_poses, usual_apart_rad
 from sphereorient.follow.appearance.exposure import with_motion
 from sphereorient.follow.appearance.light import (
     check_white,
@@ -26,10 +28,12 @@ from sphereorient.follow.appearance.presence import (
 from sphereorient.follow.appearance.record import Among, Appearance, Following, Studied, clear_of, soft
 from sphereorient.follow.appearance.worn import without_worn
 from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.fitter import CameraView, Fitter, Optics, widest_px
+from sphereorient.pose.fitter import CameraView, Fitter, Optics, Picture, widest_px
 from sphereorient.pose.lasting import lasting_errors
+from sphereorient.pose.neighbours import Neighbours
 from sphereorient.sphere.texture_table import TextureTable
 
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
@@ -52,18 +56,11 @@ def estimate_appearance(
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
-    search = for_blur(first)
-    if among is None:
-        search, found = find_poses(search, frames)
-        sample = agreeing_poses(search, frames, found)
-    else:
-        found = list(among.found)
-        sample = proven_poses(found)
-    fitter, given = search.fitter, settings.blur_px is not None
+    search, found, sample = _chosen(for_blur(first), frames, among)
+    given = settings.blur_px is not None
     others = None if among is None else among.neighbours.of(sample.frame)
     pictures = [[shot.picture for shot in frames[k]] for k in sample.frame]
-    whole = fitter.pixels(pictures, sample.poses[0], fitter.optics.fine, neighbours=others)
-    studied = light_and_blur(Studied.begun(fitter, base, whole, sample.poses), given=given)
+    studied = light_and_blur(_begun(search.fitter, base, pictures, sample.poses, others), given=given)
     if not given and (matched := _matched(search, studied)) is not None:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
@@ -71,11 +68,9 @@ def estimate_appearance(
             return estimate_appearance(matched, frames, base, known, following, among)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, wrong = explained(sample.found)
-    worn = None
-    if settings.learn_paint:
-        studied, worn = without_worn(studied)
-        if worn is not None:  # the blur, too, was found with it
-            studied = light_and_blur(studied, given=given)
+    studied, worn = without_worn(studied) if settings.learn_paint else (studied, None)
+    if worn is not None:  # the blur, too, was found with it
+        studied = light_and_blur(studied, given=given)
     still, sharper = studied, False
     if following is not None and sample.camera is None:
         studied, sharper = with_motion(studied, search, sample.frame, following, others)
@@ -103,6 +98,28 @@ def estimate_appearance(
         second_ball=second_ball(search, sure, len(frames)),
         worn=worn,
     )
+
+
+def _chosen(
+    search: Initialiser, frames: Sequence[Sequence[Frame]], among: Among | None
+) -> tuple[Initialiser, list[Poses], ProvenPoses]:
+    """Return the search, the poses of all frames, and those of them that are studied."""
+    if among is not None:
+        return search, list(among.found), proven_poses(among.found)
+    search, found = find_poses(search, frames)
+    return search, found, agreeing_poses(search, frames, found)
+
+
+def _begun(
+    fitter: Fitter,
+    base: TextureTable,
+    pictures: Sequence[Sequence[Picture]],
+    poses: tuple[Tensor, Tensor, Tensor],
+    others: Neighbours | None,
+) -> Studied:
+    """Fit the poses that are studied, with the light that is assumed."""
+    whole = fitter.pixels(pictures, poses[0], fitter.optics.fine, neighbours=others)
+    return Studied.begun(fitter, base, whole, poses)
 
 
 def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
