@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.bench.scenes import CLEAN, BenchmarkScene, BenchSettings, write_scene
 from sphereorient.errors import ExperimentError
-from sphereorient.evaluate.robustness.scenes import CLEAN, BenchmarkScene, BenchSettings, write_scene
 from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.follower import sample_frames

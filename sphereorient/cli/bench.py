@@ -24,8 +24,7 @@ from sphereorient.files.whole_file import write_text, writing
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sphereorient.evaluate import Score
-    from sphereorient.evaluate.robustness import BenchSettings, Results
+    from sphereorient.bench import BenchSettings, Results, Score
 
 EXIT_WORSE = 1  # a number got worse
 LARGEST_HZ = 1e5
@@ -73,8 +72,8 @@ def score(
     ] = None,
 ) -> None:
     """Print the errors of a track against the exact truth of a synthetic experiment."""
-    from sphereorient.evaluate import score_track
-    from sphereorient.evaluate.score import given_to_others, named_as_true
+    from sphereorient.bench import score_track
+    from sphereorient.bench.score import given_to_others, named_as_true
 
     tracks = tracks_in(track, None)
     for names in alike or ():
@@ -135,7 +134,7 @@ def _settings(
     path: Path | None, full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
 ) -> "BenchSettings":
     """Return the settings of a file, or the defaults, with the changes of the full run and then of the options."""
-    from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
+    from sphereorient.bench.scenes import FULL, BenchSettings
     from sphereorient.methods.settings import read_flat
 
     options: dict[str, Any] = {
@@ -165,10 +164,10 @@ def robustness(
     """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
     check_writable(out, folder_made=True)
     chosen = _settings(settings, full, degradations, levels, seeds, frames)
-    from sphereorient.evaluate.robustness import load_results, run_benchmark
-    from sphereorient.evaluate.robustness.run import trackers_of
+    from sphereorient.bench import load_results, run_benchmark
+    from sphereorient.bench.figures import robustness_figure, write_table
+    from sphereorient.bench.run import trackers_of
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.report.robustness import robustness_figure, write_table
 
     trackers = trackers_of(names_in(methods))
     older = None if baseline is None else load_results(baseline)
@@ -198,11 +197,11 @@ def balls_curve(
 ) -> None:
     """Measure errors and identity against the number density of balls that hide each other."""
     check_writable(out, folder_made=True)
-    from sphereorient.evaluate.robustness import BenchSettings, run_benchmarks
-    from sphereorient.evaluate.robustness.run import trackers_of
+    from sphereorient.bench import BenchSettings, run_benchmarks
+    from sphereorient.bench.figures import density_figure, write_table
+    from sphereorient.bench.run import trackers_of
     from sphereorient.methods.settings import read_flat
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.report.robustness import density_figure, write_table
 
     plain = {"degradations": (), "seeds": tuple(range(seeds)), "frames": frames}
     plain |= {"paints": paints, "volume_mm": volume, "velocity_time": PASSING_S}
@@ -239,7 +238,7 @@ def live_delay(
     """
     from rich.table import Table
 
-    from sphereorient.live.bench import COLUMNS, delays, neighbours
+    from sphereorient.bench.live import COLUMNS, delays, neighbours
 
     rates = [_rate_hz(part) for part in names_in(rate) or [rate]]
     options = [] if learnt is None else ["--learnt", str(learnt)]
@@ -276,7 +275,7 @@ def compare_results(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only what got worse.")] = False,
 ) -> None:
     """List the numbers that got worse by more than their scatter. Exit code 1: there are some."""
-    from sphereorient.evaluate.robustness import load_results
+    from sphereorient.bench import load_results
 
     _print_changes(load_results(now), load_results(baseline), quiet)
 
@@ -295,7 +294,7 @@ def write_scenes(
     """Render the scenes of the benchmark with their truth, for other programs (docs/robustness.md)."""
     check_writable(out, folder_made=True)
     chosen = _settings(settings, full, degradations, levels, seeds, frames)
-    from sphereorient.evaluate.robustness import scenes_of, write_scene
+    from sphereorient.bench import scenes_of, write_scene
 
     scenes = scenes_of(chosen)
     with progress_bar(quiet, unit="") as advance:
@@ -321,8 +320,8 @@ def score_result(
     """Print the errors of a track, or of another program's result, against the exact truth."""
     import numpy as np
 
-    from sphereorient.evaluate.robustness.results import WRONG_DEG
-    from sphereorient.evaluate.score import READERS, aligned_errors_deg, orientations_at, true_orientations
+    from sphereorient.bench.results import WRONG_DEG
+    from sphereorient.bench.score import READERS, aligned_errors_deg, orientations_at, true_orientations
 
     found = {}
     if of == "sphereorient":
@@ -352,7 +351,7 @@ def _print(found: "Results") -> None:
     """Print one line for each degradation, level and method."""
     from rich.table import Table
 
-    from sphereorient.evaluate.robustness.results import summaries
+    from sphereorient.bench.results import summaries
 
     table = Table(
         "degradation", "level", "method", "median", "95 %", "wrong", "lost", "first", "inside", "over sigma", "frames/s"
@@ -376,7 +375,7 @@ def _print_balls(runs: "Sequence[Results]") -> None:
     """Print one line for each number of cameras and balls."""
     from rich.table import Table
 
-    from sphereorient.evaluate.robustness.results import summaries
+    from sphereorient.bench.results import summaries
 
     table = Table(
         *("cameras", "balls", "per litre", "hidden", "valid", "degrees, median", "95 %", "mm, median", "95 %"),
@@ -397,7 +396,7 @@ def _print_balls(runs: "Sequence[Results]") -> None:
 
 def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:
     """Print the changes; exit 1 if a number got worse."""
-    from sphereorient.evaluate.robustness import compare_runs
+    from sphereorient.bench import compare_runs
 
     changes = compare_runs(now, baseline)
     worse, better = [one for one in changes if one.worse], [one for one in changes if one.better]

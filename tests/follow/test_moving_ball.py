@@ -9,7 +9,7 @@ import torch
 import yaml
 
 from sphereorient import so3
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
+from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request

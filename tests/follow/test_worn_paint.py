@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from sphereorient import so3
+from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.cli import main
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text, worn_share
 from sphereorient.run.stages import run

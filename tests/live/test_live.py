@@ -20,8 +20,8 @@ from overlay_examples import true_track
 from typer.testing import CliRunner
 
 from sphereorient import so3
+from sphereorient.bench.live import neighbours
 from sphereorient.cli import app
-from sphereorient.live.bench import neighbours
 from sphereorient.live.feed import movie_frames
 from sphereorient.live.live import measured
 from sphereorient.live.prepare import open_live
@@ -142,7 +142,7 @@ def test_neighbours_keep_cores_busy_and_end():
 
 @pytest.mark.parametrize("rate", ["0", "x", ",", "nan", "100,-5"])
 def test_the_bench_wants_rates(rate, monkeypatch):
-    monkeypatch.setattr("sphereorient.live.bench.delays", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("sphereorient.bench.live.delays", lambda *_, **__: pytest.fail("too late"))
     run = CliRunner().invoke(app, ["bench", "live", str(EXCERPT / "experiment.yaml"), "--rate", rate])
     assert run.exit_code != 0
     assert "100,200,500" in str(run.exception)

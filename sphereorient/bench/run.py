@@ -18,23 +18,23 @@ import torch
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
-from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
-from sphereorient.evaluate.score import (
-    distance_deg,
+from sphereorient.bench.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
+from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
+from sphereorient.bench.score import (
     given_to_others,
     hidden_shares,
     named_as_true,
     score_track,
     true_orientations,
 )
+from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.experiment import load_experiment
 from sphereorient.files.cache import FOLDER
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
+from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
