@@ -238,15 +238,18 @@ def live_delay(
     """
     from rich.table import Table
 
-    from sphereorient.bench.live import COLUMNS, delays, neighbours
+    from sphereorient.bench.live import COLUMNS, LiveTiming, delays, neighbours
 
     rates = [_rate_hz(part) for part in names_in(rate) or [rate]]
     options = [] if learnt is None else ["--learnt", str(learnt)]
-    found = []
+    found, names = [], cameras_of(cameras)
     with neighbours(load):
         for rate_hz in rates:
+            timing = LiveTiming(
+                experiment=experiment, rate_hz=rate_hz, seconds=seconds, options=options, cameras=names, loop=loop
+            )
             with progress_bar(quiet, unit="lines") as advance:
-                found.append(delays(experiment, rate_hz, seconds, options, cameras_of(cameras), advance, loop=loop))
+                found.append(delays(timing, advance))
     if len(found) == 1:
         echo_lines(found[0].summary())
         return

@@ -25,11 +25,11 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.online import OnlineTracker
 from sphereorient.follow.poses import Poses, supported
-from sphereorient.live.growing_map import GrowingMap, LiveMap
-from sphereorient.live.relative import RelativeTracker
 from sphereorient.locate import Frame
 from sphereorient.mapping.disks import Crop, Crops, cut_out
 from sphereorient.mapping.grid import ROUGH_SIDE, map_table
+from sphereorient.mapping.growing import GrowingMap, LiveMap
+from sphereorient.mapping.relative import RelativeTracker
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px

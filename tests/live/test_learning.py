@@ -19,11 +19,11 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.poses import Poses
-from sphereorient.live.growing_map import FIRST, FIRST_FRAMES, GrowingMap
 from sphereorient.live.learning import HANDED, LAST, LearningTracker, MapLearner
-from sphereorient.live.relative import RelativeTracker
 from sphereorient.locate import Frame, LocateSettings, screened_frames
 from sphereorient.mapping.disks import cut_out, fixed_place
+from sphereorient.mapping.growing import FIRST, FIRST_FRAMES, GrowingMap
+from sphereorient.mapping.relative import RelativeTracker
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
