@@ -20,9 +20,9 @@ from sphereorient import so3
 from sphereorient.bench.score import orientations_at
 from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.experiment.recording import Progress, open_recording, silent
-from sphereorient.live.feed import movie_frames
-from sphereorient.live.outputs import HOST
+from sphereorient.files.page_server import HOST
 from sphereorient.live.shared import SharedFrames
+from sphereorient.live.sources import movie_frames
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.trajectory.walk import FICTRAC
 

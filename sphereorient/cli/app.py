@@ -10,6 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,8 +47,23 @@ class Commands(typer.Typer):
     """Commands; those that write take --force, and replace none of their inputs."""
 
     def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
-        """Register a command as `typer.Typer.command`."""
-        return lambda function: super(Commands, self).command(name, **more)(_guarded(function, name != "map"))
+        """Register a command as `typer.Typer.command`. One whose argument is a dataclass has its fields as options."""
+        return lambda given: super(Commands, self).command(name, **more)(_guarded(_spread(given), name != "map"))
+
+
+def _spread(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that takes the fields of a record one by one, if its only argument is one."""
+    record = next((one.annotation for one in inspect.signature(function).parameters.values()), None)
+    if not isinstance(record, type) or not is_dataclass(record):
+        return function
+
+    @wraps(function)
+    def spread(**given: Any) -> None:
+        function(record(**given))
+
+    vars(spread)["__signature__"] = inspect.signature(record)
+    spread.__annotations__ = {field.name: field.type for field in fields(record)}
+    return spread
 
 
 def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., None]:

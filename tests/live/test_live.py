@@ -20,9 +20,9 @@ from typer.testing import CliRunner
 
 from sphereorient import so3
 from sphereorient.cli import app
-from sphereorient.live.feed import movie_frames
 from sphereorient.live.live import measured
-from sphereorient.live.prepare import open_live
+from sphereorient.live.loop import open_live
+from sphereorient.live.sources import movie_frames
 from sphereorient.methods.settings import Settings
 
 
