@@ -173,15 +173,16 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
         tracks = Tracks.of(tracker(experiment))
     except SphereOrientError as error:
         seconds = time.perf_counter() - begin
-        measured = dict.fromkeys(balls, no_track(scene.frames, " ".join(str(error).split())))
+        measured = dict.fromkeys(balls, no_track(scene.plan.frames, " ".join(str(error).split())))
     else:
         seconds = time.perf_counter() - begin
-        for paint in set(balls.values()) if len(balls) > 1 else ():
+        for paint in set(balls.values()):
             tracks = named_as_true(tracks, truth_path, [name for name in balls if balls[name] == paint])
-        measured = {name: measure(tracks[name], truth_path) for name in balls}
-        if len(balls) > 1:
-            for name, (given, exchanges) in given_to_others(tracks, truth_path).items():
-                measured[name] |= {"given": given, "exchanges": exchanges}
+        others = given_to_others(tracks, truth_path)
+        measured = {
+            name: measure(tracks[name], truth_path) | dict(zip(("given", "exchanges"), others[name], strict=True))
+            for name in balls
+        }
     hidden = dict.fromkeys(balls, np.zeros(1))
     if len(balls) > 1:
         radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)

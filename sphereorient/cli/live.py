@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from sphereorient.cli.app import app, command_line, echo_lines
 from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
@@ -18,23 +19,17 @@ class LiveOptions:
 
     experiment: ExperimentPath
     source: Annotated[
-        str,
-        typer.Option(
-            help="movie: the experiment's, at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE."
-        ),
+        str, Option(help="movie: at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE.")
     ] = "movie"
     to: Annotated[
         list[str] | None,
-        typer.Option(
-            help="FicTrac's line to tcp:PORT, udp:PORT, .dat; JSON to zmq:PORT, .jsonl; a track to .h5. Repeatable."
-        ),
+        Option(help="Repeatable. FicTrac: tcp:PORT, udp:PORT, .dat; JSON: zmq:PORT, .jsonl; track: .h5"),
     ] = None
-    learnt: Annotated[
-        Path | None, typer.Option(help="What `track --save-learnt` kept of this set-up: begins without looking again.")
-    ] = None
+    learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: begins at once.")] = (
+        None
+    )
     page: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Port of a page that shows all this in a browser; 0: any free one."),
+        int | None, Option(min=0, max=65535, help="Port of a page that shows all this in a browser; 0: any free one.")
     ] = None
     cameras: Cameras = None
     settings: SettingsPath = None

@@ -259,16 +259,17 @@ class TrackOutput(Output):
     def begin(self, blocks: TrackBlocks) -> None:
         """Begin the journal; raise OutputError if it cannot be written."""
         try:
-            self._file = file = self._journal.open("xb")
-            file.write(journal.head(blocks.head()))
-            file.flush()
+            self._file = self._journal.open("xb")
+            self._file.write(journal.head(blocks.head()))
+            self._file.flush()
         except OSError as error:
             raise OutputError(no_room(self._journal, error)) from None
 
         def write(frames: list[Measured]) -> None:
-            file.write(journal.rows(blocks.block(frames)))
-            file.flush()
-            os.fsync(file.fileno())  # also a power cut leaves what is older than a second
+            assert self._file is not None
+            self._file.write(journal.rows(blocks.block(frames)))
+            self._file.flush()
+            os.fsync(self._file.fileno())  # also a power cut leaves what is older than a second
 
         self._spool = DiskSpool(self._journal, write, self._tell, BLOCK_S)
 

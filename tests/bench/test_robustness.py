@@ -282,10 +282,10 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
     out = tmp_path / "scenes"
     out.mkdir()
     assert run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)[0] == 0
-    assert [(scene.name, scene.frames) for scene in seen] == [("clean-0-0-0", 12), ("defocus-2-0-0", 12)]
+    assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 12), ("defocus-2-0-0", 12)]
     seen.clear()
     run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config, "--levels", "4", "--frames", "15")
-    assert [(scene.name, scene.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
+    assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
     config.write_text("level: [2]\n")
     code, _, said = run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)
     assert (code, len(said.strip().splitlines())) == (2, 1)

@@ -23,8 +23,9 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.live.lines import JsonLines
 from sphereorient.live.live import measured
 from sphereorient.live.loop import open_live
+from sphereorient.live.outputs import TrackOutput
 from sphereorient.live.sources import movie_frames
-from sphereorient.live.track import REMARK, TrackBlocks, TrackOutput, whole_track
+from sphereorient.live.track import REMARK, TrackBlocks, whole_track
 from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Flag, Reason, Trajectory, journal
 from sphereorient.trajectory.datasets import stored_fields
