@@ -29,29 +29,22 @@ VFOV_DEG = 30.0  # of a camera of which nothing is known: its ball is far, and n
 
 
 @dataclass(frozen=True, kw_only=True)
-class InitOptions:
-    """Options of `init`."""
-
+class _InitOptions:
     movies: Annotated[list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies of the ball, one a camera.")] = (
         None
     )
     out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
     plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
-    from_fictrac: Annotated[
-        Path | None, Option(help="config.txt of FicTrac: take over movie, field of view, masks, animal frame.")
-    ] = None
-    set_: Annotated[
-        list[str] | None,
-        Option("--set", help="A key's value, e.g. --set sphere.diameter=18; asked for at a terminal without it."),
-    ] = None
-    vfov: Annotated[
-        float | None, Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees.")
-    ] = None
+    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: take over movie, view, masks, frame.")] = (
+        None
+    )
+    set_: Annotated[list[str] | None, Option("--set", help="A key, --set sphere.diameter=18; else asked for.")] = None
+    vfov: Annotated[float | None, Option(min=0.01, max=179.0, help="Vertical view of a single camera, degrees.")] = None
     quiet: Quiet = False
 
 
 @app.command()
-def init(given: InitOptions) -> None:
+def init(given: _InitOptions) -> None:
     """Look at movies or plate pictures, and write the first file: all keys explained, what can be measured measured."""
     chosen = [source for source in (given.movies, given.plate, given.from_fictrac) if source]
     if len(chosen) != 1:
@@ -71,9 +64,7 @@ def init(given: InitOptions) -> None:
 @app.command()
 def mark(
     file: Annotated[Path, Argument(metavar="FILE", help="experiment.yaml: masks; calibration.yaml: the fiducials.")],
-    port: Annotated[
-        int, Option(min=0, max=65535, help="Of this machine; 0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT.")
-    ] = 0,
+    port: Annotated[int, Option(min=0, max=65535, help="0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT.")] = 0,
     browser: Annotated[bool, Option(help="Open the page in the browser.")] = True,
 ) -> None:
     """Mark in the browser what hides the ball in the movies, or the fiducials where `calibrate` does not find them."""

@@ -68,10 +68,7 @@ def score(
     track: TrackPath,
     truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
     sphere: SphereName = None,
-    alike: Annotated[
-        list[str] | None,
-        Option(help="Balls that look alike, e.g. a,c: their names may be exchanged, all over; again for others."),
-    ] = None,
+    alike: Annotated[list[str] | None, Option(help="Balls whose names may be exchanged: a,c; repeatable.")] = None,
 ) -> None:
     """Print the errors of a track against the exact truth of a synthetic experiment."""
     from sphereorient.bench import score_track
@@ -126,9 +123,7 @@ def _numbers_in(option: str, text: str) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """Options of `bench scenes`."""
-
+class _SceneOptions:
     out: RunFolder
     degradations: Annotated[str | None, Option(help="Some of docs/degradations.md, e.g. defocus,spin; else all.")] = (
         None
@@ -158,16 +153,14 @@ class SceneOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobustnessOptions(SceneOptions):
-    """Options of `bench robustness`."""
-
+class _RobustnessOptions(_SceneOptions):
     methods: Annotated[str, Option(help="Methods to compare.")] = "precise,paper"
     baseline: Annotated[Path | None, Option(help="results.json of an older run to compare with.")] = None
     jobs: Jobs = 2
 
 
 @bench.command()
-def robustness(given: RobustnessOptions) -> None:
+def robustness(given: _RobustnessOptions) -> None:
     """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
     check_writable(given.out, folder_made=True)
     chosen = given.plan()
@@ -191,9 +184,7 @@ def robustness(given: RobustnessOptions) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BallsOptions:
-    """Options of `bench balls`."""
-
+class _BallsOptions:
     out: RunFolder
     balls: Annotated[str, Option(help="Numbers of balls, 1 to 8, all in one volume.")] = "1,2,4,8"
     cameras: Annotated[str, Option(help="Numbers of cameras, 1 to 4: a curve each.")] = "2,3"
@@ -206,7 +197,7 @@ class BallsOptions:
 
 
 @bench.command("balls")
-def balls_curve(given: BallsOptions) -> None:
+def balls_curve(given: _BallsOptions) -> None:
     """Measure errors and identity against the number density of balls that hide each other."""
     check_writable(given.out, folder_made=True)
     from sphereorient.bench import BenchSettings, run_benchmarks
@@ -235,9 +226,7 @@ def balls_curve(given: BallsOptions) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveDelayOptions:
-    """Options of `bench live`."""
-
+class _LiveDelayOptions:
     experiment: ExperimentPath
     rate: Annotated[str, Option(help="Frames a second; several, one after the other: 100,200,500.")] = "200"
     seconds: Annotated[float, Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0
@@ -249,7 +238,7 @@ class LiveDelayOptions:
 
 
 @bench.command("live")
-def live_delay(given: LiveDelayOptions) -> None:
+def live_delay(given: _LiveDelayOptions) -> None:
     """Time `live`: from a picture in memory to its line on a socket, by another process. A truth.h5 beside the
     experiment tells its errors.
     """
@@ -306,7 +295,7 @@ def compare_results(
 
 
 @bench.command("scenes")
-def write_scenes(given: SceneOptions) -> None:
+def write_scenes(given: _SceneOptions) -> None:
     """Render the scenes of the benchmark with their truth, for other programs (docs/robustness.md)."""
     check_writable(given.out, folder_made=True)
     from sphereorient.bench import scenes_of, write_scene
@@ -327,9 +316,7 @@ def score_result(
     result: Annotated[Path, Argument(metavar="RESULT", help="track.h5, or another program's file.")],
     truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the scene.")],
     of: Annotated[str, Option("--format", help="sphereorient, or fictrac for its .dat.")] = "sphereorient",
-    align: Annotated[
-        str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
-    ] = "none",
+    align: Annotated[str, Option(help="Rotations removed: none; body: of its axes; both: and of the frame.")] = "none",
 ) -> None:
     """Print the errors of a track, or of another program's result, against the exact truth."""
     import numpy as np

@@ -102,7 +102,7 @@ def check_cameras_command(
 def convert_cameras(
     sources: Annotated[
         list[Path],
-        Argument(metavar="SOURCE...", help="One file a camera: OpenCV's .yml, .yaml, .xml, .json or OpenPTV's .ori"),
+        Argument(metavar="SOURCE...", help="A file a camera: OpenCV's .yml, .yaml, .xml, .json or OpenPTV's .ori"),
     ],
     out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write.")],
     names: Annotated[str | None, Option(help="Names of the cameras, e.g. cam1,cam2; else those of the files.")] = None,

@@ -14,9 +14,7 @@ from sphereorient.errors import PaintError
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveOptions:
-    """Options of `live`."""
-
+class _LiveOptions:
     experiment: ExperimentPath
     source: Annotated[
         str, Option(help="movie: at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE.")
@@ -28,9 +26,7 @@ class LiveOptions:
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: begins at once.")] = (
         None
     )
-    page: Annotated[
-        int | None, Option(min=0, max=65535, help="Port of a page that shows all this in a browser; 0: any free one.")
-    ] = None
+    page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
     cameras: Cameras = None
     settings: SettingsPath = None
     set_: Overrides = None
@@ -38,7 +34,7 @@ class LiveOptions:
 
 
 @app.command()
-def live(given: LiveOptions) -> None:
+def live(given: _LiveOptions) -> None:
     """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
 
     The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a

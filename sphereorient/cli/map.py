@@ -40,9 +40,7 @@ PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapOptions:
-    """Options of `map`."""
-
+class _MapOptions:
     experiment: ExperimentPath
     out: Annotated[Path, Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")]
     init: Annotated[Path | None, Option(help="Old map: gives the body frame, and the texture never seen here.")] = None
@@ -58,7 +56,7 @@ class MapOptions:
 
 
 @app.command("map")
-def map_(given: MapOptions) -> None:
+def map_(given: _MapOptions) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed. Of several
     balls each gets one, OUT_NAME.png; those that wear one paint share it.
     """
@@ -177,9 +175,7 @@ def compare_maps_(
         ),
     ],
     out: Annotated[Path | None, Option("--out", "-o", help="Figure: displacements, changes of the texture.")] = None,
-    series: Annotated[
-        bool, Option("--series", help="Maps in the order of their movies: compare all with the first, show the wear.")
-    ] = False,
+    series: Annotated[bool, Option("--series", help="Maps in order of time: wear of all since the first.")] = False,
     same_frame: Annotated[
         bool, Option("--same-frame", help="Same body frame; else the rotation is estimated.")
     ] = False,

@@ -28,15 +28,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportOptions:
-    """Options of `report`."""
-
+class _ReportOptions:
     tracks: Annotated[list[Path], Argument(metavar="TRACK...", help="track.h5 of `sphereorient track`.")]
     out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
-    experiment: Annotated[
-        list[Path] | None,
-        Option(help="experiment.yaml of a track, for pictures, the sphere's size and the flow; repeatable."),
-    ] = None
+    experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
     settings: SettingsPath = None
     set_: Annotated[list[str] | None, Option("--set", help="Override a setting: --set statistics.min_frames=30.")] = (
         None
@@ -46,7 +41,7 @@ class ReportOptions:
 
 
 @app.command()
-def report(given: ReportOptions) -> None:
+def report(given: _ReportOptions) -> None:
     """Write statistics of tracks with error bars, figures, and a page with the findings."""
     check_writable(given.out, folder_made=True)
     from sphereorient.experiment import load_experiment
@@ -86,9 +81,7 @@ def _load(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
 
 
 @dataclass(frozen=True, kw_only=True)
-class OverlayOptions:
-    """Options of `overlay`."""
-
+class _OverlayOptions:
     experiment: ExperimentPath
     track: TrackPath
     out: Annotated[Path | None, Option("--out", "-o", help="Movie to write: .mp4, .mov or .mkv (H.264).")] = None
@@ -103,7 +96,7 @@ class OverlayOptions:
 
 
 @app.command()
-def overlay(given: OverlayOptions) -> None:
+def overlay(given: _OverlayOptions) -> None:
     """Draw a track on its movies: outline, body axes, re-rendered sphere, residual; and a sheet of the worst frames."""
     if given.out is None and given.worst is None:
         do = "add --out overlay.mp4 or --worst sheet.png"

@@ -27,22 +27,18 @@ HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpinOptions:
-    """Options of `spin`."""
-
+class _SpinOptions:
     photographs: Annotated[list[Path], Argument(metavar="PHOTOGRAPHS...", help="Pictures of a flight, or a folder.")]
     times: Annotated[str, Option(help="Table .csv with file,t_s; or pictures a second, e.g. 400, at equal intervals.")]
     texture: Annotated[Path, Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")]
     out: Annotated[Path, Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")]
-    dot_radius: Annotated[
-        float | None, Option(help="Radius of the dots, degrees on the ball; else it is measured in the pictures.")
-    ] = None
+    dot_radius: Annotated[float | None, Option(help="Radius of the dots on the ball, degrees; else measured.")] = None
     omega_max: Annotated[float, Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300
     quiet: Quiet = False
 
 
 @app.command()
-def spin(given: SpinOptions) -> None:
+def spin(given: _SpinOptions) -> None:
     """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
     check_ending(given.out, "--out", [".json"])
     check_writable(given.out)
@@ -138,9 +134,7 @@ def texture() -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignOptions:
-    """Options of `texture design`."""
-
+class _DesignOptions:
     map_: Annotated[Path | None, Argument(metavar="[MAP.png]", help="Map to judge; without it --make makes one.")] = (
         None
     )
@@ -160,7 +154,7 @@ class DesignOptions:
 
 
 @texture_app.command()
-def design(given: DesignOptions) -> None:
+def design(given: _DesignOptions) -> None:
     """Judge a map before it is painted, or make one; print it on strips that wrap the ball."""
     _check_design(given)
     check_writable(given.out, folder_made=True)
@@ -193,7 +187,7 @@ def design(given: DesignOptions) -> None:
         typer.echo("Wrote " + ", ".join(str(file) for file in files))
 
 
-def _check_design(given: DesignOptions) -> None:
+def _check_design(given: _DesignOptions) -> None:
     """Refuse options that contradict each other, nan and infinity."""
     if given.make == (given.map_ is not None):
         got, do = ("both", "leave one of them away") if given.make else ("neither", "name a map, or say --make")

@@ -21,38 +21,29 @@ EXIT_SOME_FAILED = 1  # of several experiments
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """Options of `track`."""
-
-    experiments: Annotated[
-        list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
-    ]
+class _TrackOptions:
+    experiments: Annotated[list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml, or several.")]
     out: Annotated[Path, Option("--out", "-o", help="HDF5 file to write; of several experiments a folder.")]
-    method: Annotated[
-        str, Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
-    ] = "precise"
+    method: Annotated[str, Option(help="precise: has covariances; paper: Zimmermann et al. 2011 corrected.")] = (
+        "precise"
+    )
     settings: SettingsPath = None
     set_: Overrides = None
     cameras: Cameras = None
     device: Annotated[str, Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu"
     jobs: Annotated[int, Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1
-    cluster: Annotated[
-        str | None, Option(help="Workers of a Dask cluster: its scheduler's address or file; local for this machine.")
-    ] = None
+    cluster: Annotated[str | None, Option(help="Dask cluster: its scheduler's address or file; or local.")] = None
     resume: Resume = False
     learnt: Annotated[Path | None, Option(help="Use what another run of these cameras learnt (--save-learnt).")] = None
     save_learnt: Annotated[Path | None, Option(help="Keep what is learnt: empty scenes, light, scores, noise.")] = None
-    proposer: Annotated[
-        str | None,
-        Option(help="A trained network proposes orientations: its checkpoint, or default (docs/proposer.md)."),
-    ] = None
+    proposer: Annotated[str | None, Option(help="Proposer's checkpoint, or default (docs/proposer.md).")] = None
     no_learn_paint: Annotated[bool, Option("--no-learn-paint", help="Use the map even where paint differs.")] = False
     no_cache: NoCache = False
     quiet: Quiet = False
 
 
 @app.command()
-def track(given: TrackOptions) -> None:
+def track(given: _TrackOptions) -> None:
     """Track the sphere of an experiment, or of many: position and orientation of every frame."""
     many = len(given.experiments) > 1 or given.out.is_dir()
     check_writable(given.out / "tracks" if many else given.out)
