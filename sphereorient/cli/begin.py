@@ -30,16 +30,17 @@ VFOV_DEG = 30.0  # of a camera of which nothing is known: its ball is far, and n
 
 @dataclass(frozen=True, kw_only=True)
 class _InitOptions:
-    movies: Annotated[list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies of the ball, one a camera.")] = (
-        None
-    )
+    movies: Annotated[list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies, one a camera.")] = None
     out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
     plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
-    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: take over movie, view, masks, frame.")] = (
-        None
-    )
-    set_: Annotated[list[str] | None, Option("--set", help="A key, --set sphere.diameter=18; else asked for.")] = None
-    vfov: Annotated[float | None, Option(min=0.01, max=179.0, help="Vertical view of a single camera, degrees.")] = None
+    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: take over movie, view, masks.")] = None
+    set_: Annotated[
+        list[str] | None,
+        Option("--set", help="A key's value, e.g. --set sphere.diameter=18; else it is asked for at a terminal."),
+    ] = None
+    vfov: Annotated[
+        float | None, Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees.")
+    ] = None
     quiet: Quiet = False
 
 

@@ -125,9 +125,7 @@ def _numbers_in(option: str, text: str) -> tuple[int, ...]:
 @dataclass(frozen=True, kw_only=True)
 class _SceneOptions:
     out: RunFolder
-    degradations: Annotated[str | None, Option(help="Some of docs/degradations.md, e.g. defocus,spin; else all.")] = (
-        None
-    )
+    degradations: Annotated[str | None, Option(help="Some of docs/degradations.md: defocus,spin; else all.")] = None
     levels: Annotated[str | None, Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")] = None
     seeds: Annotated[int | None, Option(min=1, max=100, help="Movies of each degradation and severity.")] = None
     frames: Annotated[int | None, Option(min=12, help="Of each movie.")] = None
@@ -316,7 +314,9 @@ def score_result(
     result: Annotated[Path, Argument(metavar="RESULT", help="track.h5, or another program's file.")],
     truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the scene.")],
     of: Annotated[str, Option("--format", help="sphereorient, or fictrac for its .dat.")] = "sphereorient",
-    align: Annotated[str, Option(help="Rotations removed: none; body: of its axes; both: and of the frame.")] = "none",
+    align: Annotated[
+        str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
+    ] = "none",
 ) -> None:
     """Print the errors of a track, or of another program's result, against the exact truth."""
     import numpy as np

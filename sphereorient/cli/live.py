@@ -23,9 +23,7 @@ class _LiveOptions:
         list[str] | None,
         Option(help="Repeatable. FicTrac: tcp:PORT, udp:PORT, .dat; JSON: zmq:PORT, .jsonl; track: .h5"),
     ] = None
-    learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: begins at once.")] = (
-        None
-    )
+    learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
     cameras: Cameras = None
     settings: SettingsPath = None

@@ -45,9 +45,9 @@ class _MapOptions:
     out: Annotated[Path, Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")]
     init: Annotated[Path | None, Option(help="Old map: gives the body frame, and the texture never seen here.")] = None
     cameras: Cameras = None
-    photographs: Annotated[bool, Option("--photographs", help="Unordered pictures: --set paint.unordered=true.")] = (
-        False
-    )
+    photographs: Annotated[
+        bool, Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
+    ] = False
     resume: Resume = False
     settings: SettingsPath = None
     set_: Overrides = None

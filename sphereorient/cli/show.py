@@ -33,9 +33,9 @@ class _ReportOptions:
     out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
     experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
     settings: SettingsPath = None
-    set_: Annotated[list[str] | None, Option("--set", help="Override a setting: --set statistics.min_frames=30.")] = (
-        None
-    )
+    set_: Annotated[
+        list[str] | None, Option("--set", help="Override one setting, e.g. --set statistics.min_frames=30.")
+    ] = None
     sphere: SphereName = None
     quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, only warnings.")] = False
 

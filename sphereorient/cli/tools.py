@@ -135,10 +135,8 @@ def texture() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _DesignOptions:
-    map_: Annotated[Path | None, Argument(metavar="[MAP.png]", help="Map to judge; without it --make makes one.")] = (
-        None
-    )
-    out: Annotated[Path, Option("--out", "-o", help="Folder for judgement, picture, map and strips.")] = Path("design")
+    map_: Annotated[Path | None, Argument(metavar="[MAP.png]", help="Map to judge; else --make makes one.")] = None
+    out: Annotated[Path, Option("--out", "-o", help="Folder of judgement, map and strips.")] = Path("design")
     make: Annotated[bool, Option("--make", help="Search for a map that is easy to paint and hard to confuse.")] = False
     kinds: Annotated[str, Option(help="With --make: kinds of texture to try.")] = "blobs,patches,dots"
     stroke: Annotated[float, Option(min=2, max=40, help="With --make: least width of the brush, degrees.")] = 10.0

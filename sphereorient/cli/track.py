@@ -22,11 +22,13 @@ EXIT_SOME_FAILED = 1  # of several experiments
 
 @dataclass(frozen=True, kw_only=True)
 class _TrackOptions:
-    experiments: Annotated[list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml, or several.")]
+    experiments: Annotated[
+        list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
+    ]
     out: Annotated[Path, Option("--out", "-o", help="HDF5 file to write; of several experiments a folder.")]
-    method: Annotated[str, Option(help="precise: has covariances; paper: Zimmermann et al. 2011 corrected.")] = (
-        "precise"
-    )
+    method: Annotated[
+        str, Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
+    ] = "precise"
     settings: SettingsPath = None
     set_: Overrides = None
     cameras: Cameras = None

@@ -20,9 +20,7 @@ EXAMPLES = 8  # rows of the sheet
 @app.command()
 def train(
     config: Annotated[Path, Argument(metavar="CONFIG", help="YAML with keys of configs/train_proposer.yaml.")],
-    out: Annotated[Path, Option("--out", "-o", help="Folder for the checkpoint, the log and the figures.")] = Path(
-        "proposer"
-    ),
+    out: Annotated[Path, Option("--out", "-o", help="Folder of checkpoint, log and figures.")] = Path("proposer"),
     set_: Annotated[list[str] | None, Option("--set", help="Override one key, e.g. --set training.minutes=30.")] = None,
     resume: Annotated[bool, Option("--resume", help="Continue from last.ckpt in the folder.")] = False,
     quiet: Quiet = False,
