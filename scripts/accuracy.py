@@ -22,8 +22,8 @@ import h5py
 import numpy as np
 import torch
 
-from sphereorient.evaluate import Score, score_track
-from sphereorient.evaluate.robustness.results import SceneResult, load_results, summarised
+from sphereorient.bench import Score, score_track
+from sphereorient.bench.results import SceneResult, load_results, summarised
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
 from sphereorient.motion import MotionSettings, datasets_of, measure_motion

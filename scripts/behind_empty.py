@@ -29,8 +29,8 @@ import torch
 from numpy.typing import NDArray
 from reproduce_paper import code
 
+from sphereorient.bench import score_track
 from sphereorient.cameras import Camera, sphere_disk_px
-from sphereorient.evaluate import score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.files.threads import limit_cores
 from sphereorient.movies import open_movie, write_ffv1
@@ -39,7 +39,7 @@ from sphereorient.trajectory import Trajectory
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "experiment"
 AROUND_PX = 8  # beyond the disk: blur, motion in the exposure, the ball's light on what is near
-NOT_OF_MOVIE = ("reproduce_paper", "run", "evaluate", "trajectory")
+NOT_OF_MOVIE = ("reproduce_paper", "run", "bench", "trajectory")
 PER_FRAME = ("valid", "orientation_deg", "position_mm", "orientation_sigmas", "position_sigmas")
 Grey = NDArray[np.uint8]
 Floats = NDArray[np.float32]

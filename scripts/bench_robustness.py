@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
+from sphereorient.bench import BenchSettings, Results, SceneResult, run_benchmark
+from sphereorient.bench.figures import level_labels, robustness_figure, unit_of, write_table
+from sphereorient.bench.results import WRONG_DEG, ResultSummary, save_results, summaries
+from sphereorient.bench.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult, run_benchmark
-from sphereorient.evaluate.robustness.results import WRONG_DEG, ResultSummary, save_results, summaries
-from sphereorient.evaluate.robustness.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.files.whole_file import writing
 from sphereorient.report.plots.style import write_figure
-from sphereorient.report.robustness import level_labels, robustness_figure, unit_of, write_table
 from sphereorient.statistics.reliability import reliability
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -25,10 +25,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sphereorient import so3
-from sphereorient.evaluate import cramer_rao_bound
 from sphereorient.sphere import Sampling, load_texture
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
+from sphereorient.tools.design.bound import cramer_rao_bound
 
 SEEDS = 5
 HEIGHT = 512  # of the maps

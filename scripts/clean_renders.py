@@ -22,13 +22,13 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera, R_cam_view
-from sphereorient.evaluate import Bound, cramer_rao_bound
 from sphereorient.locate import Background
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table
 from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import LinesOfSight
 from sphereorient.sphere import Sampling, SphereRenderer, load_texture
 from sphereorient.synth import random_texture
+from sphereorient.tools.design.bound import Bound, cramer_rao_bound
 
 START_RAD, START_PX = math.radians(1.2), 0.35  # standard deviation of each component of the starts' errors
 FITTED_AT_ONCE = 20

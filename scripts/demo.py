@@ -11,9 +11,9 @@ from pathlib import Path
 from demo_figure import demo_figure
 from rich.console import Console
 
+from sphereorient.bench import score_track
 from sphereorient.cli.app import progress_bar
 from sphereorient.cli.bench import error_table
-from sphereorient.evaluate import score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.run.stages import track_movies
 

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient import so3
+from sphereorient.bench import Score
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.evaluate import Score
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.timeline import timeline
 from sphereorient.report.plots.style import AXIS_COLOURS, new_figure

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from sphereorient import so3
-from sphereorient.evaluate.score import hidden_shares
+from sphereorient.bench.score import hidden_shares
 from sphereorient.experiment import load_experiment
 from sphereorient.trajectory import Flag, Tracks
 

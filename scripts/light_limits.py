@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.bench.scenes import CLEAN, BenchmarkScene, write_scene
 from sphereorient.errors import ExperimentError
-from sphereorient.evaluate.robustness.scenes import CLEAN, BenchmarkScene, BenchSettings, write_scene
 from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.follower import sample_frames
@@ -64,9 +64,7 @@ def scene(work: Path, kind: str, level: int) -> Path:
     path = work / f"{kind}-{level}" / "experiment.yaml"
     if not path.is_file():
         degradations = {} if kind == CLEAN else {kind: level}
-        one = BenchmarkScene(
-            kind=kind, level=level, seed=0, number=0, degradations=degradations, frames=BenchSettings().frames
-        )
+        one = BenchmarkScene(kind=kind, level=level, seed=0, number=0, degradations=degradations)
         write_scene(path.parent, one)
     return path
 

@@ -20,9 +20,10 @@ import numpy as np
 import torch
 
 from sphereorient import so3
-from sphereorient.live.feed import Arrival, movie_frames
+from sphereorient.live.feed import Arrival
 from sphereorient.live.live import Measured, measured
-from sphereorient.live.prepare import open_live
+from sphereorient.live.loop import open_live
+from sphereorient.live.sources import movie_frames
 from sphereorient.methods.settings import Settings
 
 FIRST, LONG_S, JUMP_DEG = 60, 0.5, 60.0

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from sphereorient.evaluate.robustness import BenchSettings
+from sphereorient.bench import BenchSettings
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.methods.settings import Settings, flat_settings_yaml, proposer_settings_yaml, settings_yaml
 from sphereorient.synth import SynthSettings

@@ -24,12 +24,13 @@ from torch import Tensor
 
 from sphereorient import assemble, so3
 from sphereorient.assemble import two_cameras
+from sphereorient.bench.score import score_track, true_orientations
 from sphereorient.cameras import R_cam_view
-from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
 from sphereorient.locate import scene
 from sphereorient.methods import paper
 from sphereorient.methods.settings import load_settings
 from sphereorient.motion import measure
+from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies
 from sphereorient.search import extraction, template_bank
 from sphereorient.trajectory import Trajectory

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from paper_movies import LAWS, TEXTURE_SEED
 
 from sphereorient import so3
+from sphereorient.bench import Score, score_track
 from sphereorient.cameras import Camera
 from sphereorient.errors import TrackError, refusal
-from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.methods.proposers import paper_proposer, precise_proposer
 from sphereorient.methods.settings import Settings

@@ -21,9 +21,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sphereorient import so3
+from sphereorient.bench import Score, score_track
 from sphereorient.calibration import calibrate_cameras, load_calibration
 from sphereorient.cameras import Camera, triangulate
-from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Trajectory

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from sphereorient.bench import BenchSettings, SceneResult
+from sphereorient.bench.results import WRONG_DEG
+from sphereorient.bench.run import CACHE, KEPT, kept_results, limit_threads, run_scene, trackers_of
+from sphereorient.bench.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.robustness import BenchSettings, SceneResult
-from sphereorient.evaluate.robustness.results import WRONG_DEG
-from sphereorient.evaluate.robustness.run import CACHE, KEPT, kept_results, limit_threads, run_scene, trackers_of
-from sphereorient.evaluate.robustness.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.severities import LEVELS
 

@@ -20,7 +20,7 @@ PACKAGE = REPO / "sphereorient"
 ORDER = (
     *("errors", "files", "so3", "cameras", "movies", "sphere", "trajectory", "calibration", "experiment", "locate"),
     *("pose", "search", "follow", "assemble", "motion", "synth", "statistics", "learn", "mapping", "methods", "run"),
-    *("preflight", "evaluate", "report", "tools", "live", "cli"),
+    *("preflight", "report", "tools", "live", "bench", "cli"),
 )
 
 

@@ -22,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 from reproduce_paper import FULL, made_by, make_movies
 
+from sphereorient.bench.score import AXES, score_track
 from sphereorient.cameras import load_cameras, sphere_disk_px
-from sphereorient.evaluate.score import AXES, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.trajectory import Flag, Trajectory
 

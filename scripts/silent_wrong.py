@@ -30,9 +30,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.bench.score import mahalanobis
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.errors import SphereOrientError
-from sphereorient.evaluate.score import mahalanobis
 from sphereorient.files.picture import write_picture
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.synth import SynthSettings, make_scene, random_texture

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.evaluate import score_track
+from sphereorient.bench import score_track
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.methods.settings import Settings
 from sphereorient.movies import write_ffv1

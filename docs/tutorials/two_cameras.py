@@ -74,7 +74,7 @@ figure
 # The truth is known here: errors in degrees and mm, and how large the track says they are.
 
 # %%
-from sphereorient.evaluate import score_track
+from sphereorient.bench import score_track
 
 score = score_track(track, folder / "truth.h5")
 p50, p95, *_ = score.percentiles_deg()

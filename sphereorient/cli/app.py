@@ -10,11 +10,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
 from sphereorient import __version__
@@ -39,33 +41,38 @@ class InOrder(TyperGroup):
 
 
 OUTPUTS = {"out", "target", "save", "save_learnt", "worst"}  # parameters; all other paths are inputs
-FORCE = typer.Option("--force", help="Replace files that sphereorient did not make, but never an input.")
+FORCE = Option("--force", help="Replace files that sphereorient did not make, but never an input.")
 
 
 class Commands(typer.Typer):
     """Commands; those that write take --force, and replace none of their inputs."""
 
     def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
-        """Register a command as `typer.Typer.command`."""
+        """Register a command as `typer.Typer.command`. Its options may be the fields of a dataclass, its argument."""
         return lambda function: super(Commands, self).command(name, **more)(_guarded(function, name != "map"))
 
 
 def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., None]:
-    """Add --force to a command that writes; `textured`: whether the texture of its experiment is an input."""
-    signature = inspect.signature(function)
-    if not OUTPUTS & signature.parameters.keys():
-        return function
+    """Give the options of a command to its record, and --force to a command that writes; `textured`: whether the
+    texture of its experiment is an input.
+    """
+    record = next((one.annotation for one in inspect.signature(function).parameters.values()), None)
+    record = record if isinstance(record, type) and is_dataclass(record) else None
+    options = list(inspect.signature(record or function).parameters.values())
+    writes = any(one.name in OUTPUTS for one in options)
 
     @wraps(function)
-    def guarded(*, force: bool, **given: Any) -> None:
+    def guarded(force: bool = False, **given: Any) -> None:
         told = [each if isinstance(each, list) else [each] for name, each in given.items() if name not in OUTPUTS]
-        paths = [path for each in told for path in each if isinstance(path, Path)]
+        paths = [path for each in told for path in each if isinstance(path, Path)] if writes else []
         with writing((file for path in paths for file in _read(path, textured)), force=force):
-            function(**given)
+            function(record(**given)) if record else function(**given)
 
-    added = inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, FORCE])
-    vars(guarded)["__signature__"] = signature.replace(parameters=[*signature.parameters.values(), added])
-    guarded.__annotations__ = function.__annotations__ | {"force": added.annotation}
+    if writes:
+        annotation = Annotated[bool, FORCE]
+        options.append(inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation))
+    vars(guarded)["__signature__"] = inspect.Signature(options)
+    guarded.__annotations__ = {one.name: one.annotation for one in options}
     return guarded
 
 
@@ -110,7 +117,7 @@ EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
 
 @app.callback(invoke_without_command=True)
 def common(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     """Measure position and absolute orientation of a painted sphere from high-speed movies."""
     if version:
@@ -226,8 +233,8 @@ def _lines(unit: str) -> Advance:
 
 @app.command()
 def settings(
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
-    method: Annotated[str | None, typer.Option(help="precise, paper, map or report; all without it.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="File to write; the screen without it.")] = None,
+    method: Annotated[str | None, Option(help="precise, paper, map or report; all without it.")] = None,
 ) -> None:
     """Write all settings of the methods, or those that one reads, with defaults and explanations."""
     from sphereorient.methods.settings import METHODS, settings_yaml

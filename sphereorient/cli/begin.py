@@ -3,11 +3,12 @@
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet
@@ -27,54 +28,45 @@ HEAD = "Made by `sphereorient init`. Remove # before the keys to use; paths are 
 VFOV_DEG = 30.0  # of a camera of which nothing is known: its ball is far, and nearly the same for any field of view
 
 
-@app.command()
-def init(
-    movies: Annotated[
-        list[Path] | None, typer.Argument(metavar="[MOVIE]...", help="Movies of the ball, one a camera.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="experiment.yaml here without it; calibration.yaml with --plate.")
-    ] = None,
-    plate: Annotated[Path | None, typer.Option(help="Folder of plate pictures: write calibration.yaml.")] = None,
-    from_fictrac: Annotated[
-        Path | None, typer.Option(help="config.txt of FicTrac: take over movie, field of view, masks, animal frame.")
-    ] = None,
+@dataclass(frozen=True, kw_only=True)
+class _InitOptions:
+    movies: Annotated[list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies, one a camera.")] = None
+    out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
+    plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
+    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: take over movie, view, masks.")] = None
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="A key's value, e.g. --set sphere.diameter=18; asked for at a terminal without it."),
-    ] = None,
+        Option("--set", help="A key's value, e.g. --set sphere.diameter=18; else it is asked for at a terminal."),
+    ] = None
     vfov: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees."),
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
+        float | None, Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees.")
+    ] = None
+    quiet: Quiet = False
+
+
+@app.command()
+def init(given: _InitOptions) -> None:
     """Look at movies or plate pictures, and write the first file: all keys explained, what can be measured measured."""
-    chosen = [source for source in (movies, plate, from_fictrac) if source]
+    chosen = [source for source in (given.movies, given.plate, given.from_fictrac) if source]
     if len(chosen) != 1:
         got, do = f"{len(chosen)} of them", "name movies, or --plate FOLDER, or --from-fictrac config.txt"
         raise SettingsError(refusal("init", expected="one source", got=got, do=do))
-    target = out or Path("calibration.yaml" if plate else "experiment.yaml")
+    target = given.out or Path("calibration.yaml" if given.plate else "experiment.yaml")
     check_ending(target, "--out", YAML)
     check_writable(target)
-    if plate:
-        _calibration(plate, target, set_ or [], quiet)
-    elif from_fictrac:
-        _fictrac(from_fictrac, target, set_ or [], quiet)
+    if given.plate:
+        _calibration(given.plate, target, given.set_ or [], given.quiet)
+    elif given.from_fictrac:
+        _fictrac(given.from_fictrac, target, given.set_ or [], given.quiet)
     else:
-        _experiment(movies or [], target, set_ or [], vfov, quiet)
+        _experiment(given.movies or [], target, given.set_ or [], given.vfov, given.quiet)
 
 
 @app.command()
 def mark(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="experiment.yaml: masks; calibration.yaml: fiducials of the plate.")
-    ],
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="Of this machine; 0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT."),
-    ] = 0,
-    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    file: Annotated[Path, Argument(metavar="FILE", help="experiment.yaml: masks; calibration.yaml: the fiducials.")],
+    port: Annotated[int, Option(min=0, max=65535, help="0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT.")] = 0,
+    browser: Annotated[bool, Option(help="Open the page in the browser.")] = True,
 ) -> None:
     """Mark in the browser what hides the ball in the movies, or the fiducials where `calibrate` does not find them."""
     from sphereorient.preflight.mark import HOST, serve

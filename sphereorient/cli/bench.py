@@ -2,10 +2,12 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import (
@@ -24,8 +26,7 @@ from sphereorient.files.whole_file import write_text, writing
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sphereorient.evaluate import Score
-    from sphereorient.evaluate.robustness import BenchSettings, Results
+    from sphereorient.bench import BenchSettings, Results, Score
 
 EXIT_WORSE = 1  # a number got worse
 LARGEST_HZ = 1e5
@@ -37,9 +38,9 @@ app.add_typer(bench, name="bench")
 
 @app.command()
 def synth(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the experiment into.")],
-    settings: Annotated[Path | None, typer.Option(help="YAML with keys of configs/synth.yaml.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write the experiment into.")],
+    settings: Annotated[Path | None, Option(help="YAML with keys of configs/synth.yaml.")] = None,
+    set_: Annotated[list[str] | None, Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Render an experiment with exact truth."""
@@ -65,16 +66,13 @@ def synth(
 @app.command()
 def score(
     track: TrackPath,
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
+    truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
     sphere: SphereName = None,
-    alike: Annotated[
-        list[str] | None,
-        typer.Option(help="Balls that look alike, e.g. a,c: their names may be exchanged, all over; again for others."),
-    ] = None,
+    alike: Annotated[list[str] | None, Option(help="Balls whose names may be exchanged: a,c; repeatable.")] = None,
 ) -> None:
     """Print the errors of a track against the exact truth of a synthetic experiment."""
-    from sphereorient.evaluate import score_track
-    from sphereorient.evaluate.score import given_to_others, named_as_true
+    from sphereorient.bench import score_track
+    from sphereorient.bench.score import given_to_others, named_as_true
 
     tracks = tracks_in(track, None)
     for names in alike or ():
@@ -112,15 +110,8 @@ def error_table(found: "Score", ball: str = "") -> "Table":
     return table
 
 
-RunFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
-Degradations = Annotated[
-    str | None, typer.Option(help="Some of docs/degradations.md, e.g. defocus,spin; all without it.")
-]
-Levels = Annotated[str | None, typer.Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")]
-Seeds = Annotated[int | None, typer.Option(min=1, max=100, help="Movies of each degradation and severity.")]
-Frames = Annotated[int | None, typer.Option(min=12, help="Of each movie.")]
-Full = Annotated[bool, typer.Option("--full", help="All severities, three movies of 60 frames each: hours.")]
-BenchFile = Annotated[Path | None, typer.Option(help="YAML with keys of configs/robustness.yaml; options win.")]
+RunFolder = Annotated[Path, Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
+Jobs = Annotated[int, Option("--jobs", "-j", min=1, help="Processes.")]
 
 
 def _numbers_in(option: str, text: str) -> tuple[int, ...]:
@@ -131,127 +122,147 @@ def _numbers_in(option: str, text: str) -> tuple[int, ...]:
     return tuple(map(int, names_in(text)))
 
 
-def _settings(
-    path: Path | None, full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
-) -> "BenchSettings":
-    """Return the settings of a file, or the defaults, with the changes of the full run and then of the options."""
-    from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
-    from sphereorient.methods.settings import read_flat
+@dataclass(frozen=True, kw_only=True)
+class _SceneOptions:
+    out: RunFolder
+    degradations: Annotated[str | None, Option(help="Some of docs/degradations.md: defocus,spin; else all.")] = None
+    levels: Annotated[str | None, Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")] = None
+    seeds: Annotated[int | None, Option(min=1, max=100, help="Movies of each degradation and severity.")] = None
+    frames: Annotated[int | None, Option(min=12, help="Of each movie.")] = None
+    full: Annotated[bool, Option("--full", help="All severities, three movies of 60 frames each: hours.")] = False
+    settings: Annotated[Path | None, Option(help="YAML with keys of configs/robustness.yaml; options win.")] = None
+    quiet: Quiet = False
 
-    options: dict[str, Any] = {
-        "degradations": None if degradations is None else tuple(names_in(degradations)),
-        "levels": None if levels is None else _numbers_in("--levels", levels),
-        "seeds": None if seeds is None else tuple(range(seeds)),
-        "frames": frames,
-    }
-    changes = {name: value for name, value in options.items() if value is not None}
-    return read_flat(BenchSettings, path, (FULL.model_dump(exclude_unset=True) if full else {}) | changes)
+    def plan(self) -> "BenchSettings":
+        """Return the settings: of the file, or the defaults, changed by the full run and then by the options."""
+        from sphereorient.bench.scenes import FULL, BenchSettings
+        from sphereorient.methods.settings import read_flat
+
+        changes: dict[str, Any] = FULL.model_dump(exclude_unset=True) if self.full else {}
+        if self.degradations is not None:
+            changes["degradations"] = tuple(names_in(self.degradations))
+        if self.levels is not None:
+            changes["levels"] = _numbers_in("--levels", self.levels)
+        if self.seeds is not None:
+            changes["seeds"] = tuple(range(self.seeds))
+        if self.frames is not None:
+            changes["frames"] = self.frames
+        return read_flat(BenchSettings, self.settings, changes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RobustnessOptions(_SceneOptions):
+    methods: Annotated[str, Option(help="Methods to compare.")] = "precise,paper"
+    baseline: Annotated[Path | None, Option(help="results.json of an older run to compare with.")] = None
+    jobs: Jobs = 2
 
 
 @bench.command()
-def robustness(
-    out: RunFolder,
-    degradations: Degradations = None,
-    levels: Levels = None,
-    seeds: Seeds = None,
-    frames: Frames = None,
-    full: Full = False,
-    settings: BenchFile = None,
-    quiet: Quiet = False,
-    methods: Annotated[str, typer.Option(help="Methods to compare.")] = "precise,paper",
-    baseline: Annotated[Path | None, typer.Option(help="results.json of an older run to compare with.")] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2,
-) -> None:
+def robustness(given: _RobustnessOptions) -> None:
     """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
-    check_writable(out, folder_made=True)
-    chosen = _settings(settings, full, degradations, levels, seeds, frames)
-    from sphereorient.evaluate.robustness import load_results, run_benchmark
-    from sphereorient.evaluate.robustness.run import trackers_of
+    check_writable(given.out, folder_made=True)
+    chosen = given.plan()
+    from sphereorient.bench import load_results, run_benchmark
+    from sphereorient.bench.figures import robustness_figure, write_table
+    from sphereorient.bench.run import trackers_of
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.report.robustness import robustness_figure, write_table
 
-    trackers = trackers_of(names_in(methods))
-    older = None if baseline is None else load_results(baseline)
-    with progress_bar(quiet, unit="") as advance:
-        found = run_benchmark(out, chosen, trackers, jobs=jobs, progress=lambda *at: advance("scenes", *at))
+    trackers = trackers_of(names_in(given.methods))
+    older = None if given.baseline is None else load_results(given.baseline)
+    with progress_bar(given.quiet, unit="") as advance:
+        found = run_benchmark(given.out, chosen, trackers, jobs=given.jobs, progress=lambda *at: advance("scenes", *at))
     with writing(force=True):  # its plan says that the folder is of this run
-        write_table([found], out / "results.csv")
-        write_figure(robustness_figure(found), out / "robustness")
-    if not quiet:
+        write_table([found], given.out / "results.csv")
+        write_figure(robustness_figure(found), given.out / "robustness")
+    if not given.quiet:
         _print(found)
-        typer.echo(f"Wrote {out}: results.json, results.csv, robustness.png, .pdf")
+        typer.echo(f"Wrote {given.out}: results.json, results.csv, robustness.png, .pdf")
     if older is not None:
-        _print_changes(found, older, quiet)
+        _print_changes(found, older, given.quiet)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _BallsOptions:
+    out: RunFolder
+    balls: Annotated[str, Option(help="Numbers of balls, 1 to 8, all in one volume.")] = "1,2,4,8"
+    cameras: Annotated[str, Option(help="Numbers of cameras, 1 to 4: a curve each.")] = "2,3"
+    paints: Annotated[int, Option(min=1, max=8, help="Fewer than balls: some look alike.")] = 2
+    volume: Annotated[float, Option(help="Balls stay within about this distance of the origin, mm.")] = 45.0
+    seeds: Annotated[int, Option(min=1, max=100, help="Movies of each point of a curve.")] = 1
+    frames: Annotated[int, Option(min=12, help="Of each movie.")] = 48
+    jobs: Jobs = 2
+    quiet: Quiet = False
 
 
 @bench.command("balls")
-def balls_curve(
-    out: RunFolder,
-    balls: Annotated[str, typer.Option(help="Numbers of balls, 1 to 8, all in one volume.")] = "1,2,4,8",
-    cameras: Annotated[str, typer.Option(help="Numbers of cameras, 1 to 4: a curve each.")] = "2,3",
-    paints: Annotated[int, typer.Option(min=1, max=8, help="Fewer than balls: some look alike.")] = 2,
-    volume: Annotated[float, typer.Option(help="Balls stay within about this distance of the origin, mm.")] = 45.0,
-    seeds: Annotated[int, typer.Option(min=1, max=100, help="Movies of each point of a curve.")] = 1,
-    frames: Annotated[int, typer.Option(min=12, help="Of each movie.")] = 48,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2,
-    quiet: Quiet = False,
-) -> None:
+def balls_curve(given: _BallsOptions) -> None:
     """Measure errors and identity against the number density of balls that hide each other."""
-    check_writable(out, folder_made=True)
-    from sphereorient.evaluate.robustness import BenchSettings, run_benchmarks
-    from sphereorient.evaluate.robustness.run import trackers_of
+    check_writable(given.out, folder_made=True)
+    from sphereorient.bench import BenchSettings, run_benchmarks
+    from sphereorient.bench.figures import density_figure, write_table
+    from sphereorient.bench.run import trackers_of
     from sphereorient.methods.settings import read_flat
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.report.robustness import density_figure, write_table
 
-    plain = {"degradations": (), "seeds": tuple(range(seeds)), "frames": frames}
-    plain |= {"paints": paints, "volume_mm": volume, "velocity_time": PASSING_S}
+    plain = {"degradations": (), "seeds": tuple(range(given.seeds)), "frames": given.frames}
+    plain |= {"paints": given.paints, "volume_mm": given.volume, "velocity_time": PASSING_S}
     plans = {
         f"{b}-balls-{c}-cameras": read_flat(BenchSettings, None, plain | {"balls": b, "cameras": c})
-        for c in _numbers_in("--cameras", cameras)
-        for b in _numbers_in("--balls", balls)
+        for c in _numbers_in("--cameras", given.cameras)
+        for b in _numbers_in("--balls", given.balls)
     }
-    with progress_bar(quiet, unit="") as advance:
+    with progress_bar(given.quiet, unit="") as advance:
         runs = run_benchmarks(
-            out, plans, trackers_of(["precise"]), jobs=jobs, progress=lambda *at: advance("scenes", *at)
+            given.out, plans, trackers_of(["precise"]), jobs=given.jobs, progress=lambda *at: advance("scenes", *at)
         )
     with writing(force=True):  # its plans say that the folder is of this run
-        write_table(runs, out / "results.csv")
-        write_figure(density_figure(runs), out / "density")
-    if not quiet:
+        write_table(runs, given.out / "results.csv")
+        write_figure(density_figure(runs), given.out / "density")
+    if not given.quiet:
         _print_balls(runs)
-        typer.echo(f"Wrote {out}: results.csv, density.png, .pdf, and a folder of each point")
+        typer.echo(f"Wrote {given.out}: results.csv, density.png, .pdf, and a folder of each point")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LiveDelayOptions:
+    experiment: ExperimentPath
+    rate: Annotated[str, Option(help="Frames a second; several, one after the other: 100,200,500.")] = "200"
+    seconds: Annotated[float, Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0
+    loop: Annotated[bool, Option("--loop", help="Show it from its begin again: it has no seam.")] = False
+    load: Annotated[int, Option(min=0, max=64, help="Other programs, each of which keeps a core busy.")] = 0
+    learnt: Annotated[Path | None, Option(help="As of `live`.")] = None
+    cameras: Cameras = None
+    quiet: Quiet = False
 
 
 @bench.command("live")
-def live_delay(
-    experiment: ExperimentPath,
-    rate: Annotated[str, typer.Option(help="Frames a second; several, one after the other: 100,200,500.")] = "200",
-    seconds: Annotated[float, typer.Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Show it from its begin again: it has no seam.")] = False,
-    load: Annotated[int, typer.Option(min=0, max=64, help="Other programs, each of which keeps a core busy.")] = 0,
-    learnt: Annotated[Path | None, typer.Option(help="As of `live`.")] = None,
-    cameras: Cameras = None,
-    quiet: Quiet = False,
-) -> None:
+def live_delay(given: _LiveDelayOptions) -> None:
     """Time `live`: from a picture in memory to its line on a socket, by another process. A truth.h5 beside the
     experiment tells its errors.
     """
     from rich.table import Table
 
-    from sphereorient.live.bench import COLUMNS, delays, neighbours
+    from sphereorient.bench.live import COLUMNS, LiveTiming, delays, neighbours
 
-    rates = [_rate_hz(part) for part in names_in(rate) or [rate]]
-    options = [] if learnt is None else ["--learnt", str(learnt)]
-    found = []
-    with neighbours(load):
+    rates = [_rate_hz(part) for part in names_in(given.rate) or [given.rate]]
+    options = [] if given.learnt is None else ["--learnt", str(given.learnt)]
+    found, names = [], cameras_of(given.cameras)
+    with neighbours(given.load):
         for rate_hz in rates:
-            with progress_bar(quiet, unit="lines") as advance:
-                found.append(delays(experiment, rate_hz, seconds, options, cameras_of(cameras), advance, loop=loop))
+            timing = LiveTiming(
+                experiment=given.experiment,
+                rate_hz=rate_hz,
+                seconds=given.seconds,
+                options=options,
+                cameras=names,
+                loop=given.loop,
+            )
+            with progress_bar(given.quiet, unit="lines") as advance:
+                found.append(delays(timing, advance))
     if len(found) == 1:
         echo_lines(found[0].summary())
         return
-    table = Table("Hz", *COLUMNS, title=f"From a picture in memory to its line, other busy programs: {load}")
+    table = Table("Hz", *COLUMNS, title=f"From a picture in memory to its line, other busy programs: {given.load}")
     for rate_hz, one in zip(rates, found, strict=True):
         table.add_row(f"{rate_hz:g}", *one.row())
     print_table(table)
@@ -271,58 +282,47 @@ def _rate_hz(text: str) -> float:
 
 @bench.command("compare")
 def compare_results(
-    now: Annotated[Path, typer.Argument(metavar="NOW", help="results.json of a run.")],
-    baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="results.json of an older one.")],
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only what got worse.")] = False,
+    now: Annotated[Path, Argument(metavar="NOW", help="results.json of a run.")],
+    baseline: Annotated[Path, Argument(metavar="BASELINE", help="results.json of an older one.")],
+    quiet: Annotated[bool, Option("--quiet", "-q", help="Only what got worse.")] = False,
 ) -> None:
     """List the numbers that got worse by more than their scatter. Exit code 1: there are some."""
-    from sphereorient.evaluate.robustness import load_results
+    from sphereorient.bench import load_results
 
     _print_changes(load_results(now), load_results(baseline), quiet)
 
 
 @bench.command("scenes")
-def write_scenes(
-    out: RunFolder,
-    degradations: Degradations = None,
-    levels: Levels = None,
-    seeds: Seeds = None,
-    frames: Frames = None,
-    full: Full = False,
-    settings: BenchFile = None,
-    quiet: Quiet = False,
-) -> None:
+def write_scenes(given: _SceneOptions) -> None:
     """Render the scenes of the benchmark with their truth, for other programs (docs/robustness.md)."""
-    check_writable(out, folder_made=True)
-    chosen = _settings(settings, full, degradations, levels, seeds, frames)
-    from sphereorient.evaluate.robustness import scenes_of, write_scene
+    check_writable(given.out, folder_made=True)
+    from sphereorient.bench import scenes_of, write_scene
 
-    scenes = scenes_of(chosen)
-    with progress_bar(quiet, unit="") as advance:
+    scenes = scenes_of(given.plan())
+    with progress_bar(given.quiet, unit="") as advance:
         for done, scene in enumerate(scenes, start=1):
-            write_scene(out / scene.name, scene)
+            write_scene(given.out / scene.name, scene)
             advance("scenes", done, len(scenes))
     index = [{"name": scene.name, "degradations": dict(scene.degradations), "seed": scene.seed} for scene in scenes]
-    write_text(out / "scenes.json", json.dumps(index, indent=1) + "\n")
-    if not quiet:
-        typer.echo(f"Wrote {out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
+    write_text(given.out / "scenes.json", json.dumps(index, indent=1) + "\n")
+    if not given.quiet:
+        typer.echo(f"Wrote {given.out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
 
 
 @bench.command("score")
 def score_result(
-    result: Annotated[Path, typer.Argument(metavar="RESULT", help="track.h5, or another program's file.")],
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the scene.")],
-    of: Annotated[str, typer.Option("--format", help="sphereorient, or fictrac for its .dat.")] = "sphereorient",
+    result: Annotated[Path, Argument(metavar="RESULT", help="track.h5, or another program's file.")],
+    truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the scene.")],
+    of: Annotated[str, Option("--format", help="sphereorient, or fictrac for its .dat.")] = "sphereorient",
     align: Annotated[
-        str,
-        typer.Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too."),
+        str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
     ] = "none",
 ) -> None:
     """Print the errors of a track, or of another program's result, against the exact truth."""
     import numpy as np
 
-    from sphereorient.evaluate.robustness.results import WRONG_DEG
-    from sphereorient.evaluate.score import READERS, aligned_errors_deg, orientations_at, true_orientations
+    from sphereorient.bench.results import WRONG_DEG
+    from sphereorient.bench.score import READERS, aligned_errors_deg, orientations_at, true_orientations
 
     found = {}
     if of == "sphereorient":
@@ -352,7 +352,7 @@ def _print(found: "Results") -> None:
     """Print one line for each degradation, level and method."""
     from rich.table import Table
 
-    from sphereorient.evaluate.robustness.results import summaries
+    from sphereorient.bench.results import summaries
 
     table = Table(
         "degradation", "level", "method", "median", "95 %", "wrong", "lost", "first", "inside", "over sigma", "frames/s"
@@ -376,7 +376,7 @@ def _print_balls(runs: "Sequence[Results]") -> None:
     """Print one line for each number of cameras and balls."""
     from rich.table import Table
 
-    from sphereorient.evaluate.robustness.results import summaries
+    from sphereorient.bench.results import summaries
 
     table = Table(
         *("cameras", "balls", "per litre", "hidden", "valid", "degrees, median", "95 %", "mm, median", "95 %"),
@@ -397,7 +397,7 @@ def _print_balls(runs: "Sequence[Results]") -> None:
 
 def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:
     """Print the changes; exit 1 if a number got worse."""
-    from sphereorient.evaluate.robustness import compare_runs
+    from sphereorient.bench import compare_runs
 
     changes = compare_runs(now, baseline)
     worse, better = [one for one in changes if one.worse], [one for one in changes if one.better]

@@ -1,13 +1,15 @@
 """`sphereorient calibrate`, `check-cameras` and `convert-cameras`."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import ExperimentPath, SphereName, cameras_of, tracks_in
+from sphereorient.cli.options import ExperimentPath, SphereName, names_in, tracks_in
 from sphereorient.errors import CameraError, ExperimentError, refusal
 from sphereorient.files.whole_file import check_ending, put_aside
 
@@ -21,14 +23,10 @@ MADE_BY = "X_cam = R X_lab + T, mm; made by"
 
 @app.command()
 def calibrate(
-    source: Annotated[
-        Path, typer.Argument(metavar="FILE", help="calibration.yaml; with --refine-with the cameras.yaml to repair.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="cameras.yaml to write; its picture goes beside it.")],
-    refine_with: Annotated[
-        Path | None, typer.Option(help="track.h5 made with these cameras: repair them by the sphere itself.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables.")] = False,
+    source: Annotated[Path, Argument(metavar="FILE", help="calibration.yaml; with --refine-with: cameras.yaml.")],
+    out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write; its picture goes beside it.")],
+    refine_with: Annotated[Path | None, Option(help="track.h5 of these cameras: repair them by the sphere.")] = None,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, no tables.")] = False,
 ) -> None:
     """Calibrate cameras from pictures of a plate, or repair cameras that moved, from a track of both."""
     check_ending(out, "--out", YAML)
@@ -74,10 +72,10 @@ def _repair(cameras: Path, track: Path, out: Path, quiet: bool) -> None:
 def check_cameras_command(
     experiment: ExperimentPath,
     track: Annotated[
-        Path | None, typer.Option(help="track.h5 of this experiment; without it the movies are tracked first.")
+        Path | None, Option(help="track.h5 of this experiment; else the movies are tracked first.")
     ] = None,
     sphere: SphereName = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Report how far the cameras' lines of sight to the sphere miss each other, over a movie."""
     from sphereorient.calibration import check_cameras
@@ -104,20 +102,12 @@ def check_cameras_command(
 def convert_cameras(
     sources: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="SOURCE...", help="One file a camera: OpenCV's .yml, .yaml, .xml, .json or OpenPTV's .ori"
-        ),
+        Argument(metavar="SOURCE...", help="A file a camera: OpenCV's .yml, .yaml, .xml, .json or OpenPTV's .ori"),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="cameras.yaml to write.")],
-    names: Annotated[
-        str | None, typer.Option(help="Names of the cameras, such as cam1,cam2; otherwise those of the files.")
-    ] = None,
-    image_size: Annotated[
-        str | None, typer.Option(metavar="W,H", help="Picture size, px, for OpenCV files without it.")
-    ] = None,
-    par: Annotated[
-        Path | None, typer.Option(help="OpenPTV's ptv.par: sensor, indices, thickness of the wall. Needed for .ori.")
-    ] = None,
+    out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write.")],
+    names: Annotated[str | None, Option(help="Names of the cameras, e.g. cam1,cam2; else those of the files.")] = None,
+    image_size: Annotated[str | None, Option(metavar="W,H", help="Size, px, for OpenCV files without it.")] = None,
+    par: Annotated[Path | None, Option(help="OpenPTV's ptv.par (sensor, indices, wall), needed for .ori.")] = None,
 ) -> None:
     """Convert cameras of OpenCV or OpenPTV to cameras.yaml. A .addpar beside its .ori is read too."""
     check_ending(out, "--out", YAML)
@@ -146,10 +136,8 @@ def _load(source: Path, image_size: tuple[int, int] | None, par: Path | None) ->
     return load_openptv(source, load_ptv_par(par), addpar if addpar.exists() else None)
 
 
-def _names(sources: list[Path], text: str | None) -> list[str]:
-    names = cameras_of(text)
-    if names is None:
-        names = [source.name.partition(".")[0] for source in sources]
+def _names(sources: list[Path], text: str | None) -> Sequence[str]:
+    names = [source.name.partition(".")[0] for source in sources] if text is None else names_in(text)
     if len(names) != len(sources):
         got, do = f"{len(names)} for {len(sources)} files", "name every camera once, in the order of the files"
         raise CameraError(refusal("--names", expected="one name a file", got=got, do=do))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, NoCache, Overrides, Quiet, SettingsPath, frames_of
@@ -22,10 +23,8 @@ if TYPE_CHECKING:
     from sphereorient.movies.survey import Survey
     from sphereorient.preflight import Finding
 
-Source = Annotated[
-    str, typer.Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")
-]
-Flip = Annotated[str, typer.Option(help="Mirror: none, vertical (rows), horizontal (columns), both.")]
+Source = Annotated[str, Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")]
+Flip = Annotated[str, Option(help="Mirror: none, vertical (rows), horizontal (columns), both.")]
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
 UNEVEN = 1e-3  # of the usual time between frames
@@ -37,14 +36,11 @@ MARK, TITLE = 9, 25  # columns of the list
 @app.command()
 def check(
     experiment: ExperimentPath,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Figure to write (.png, .pdf); EXPERIMENT.check.png here without it."),
-    ] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Figure (.png, .pdf); else EXPERIMENT.check.png.")] = None,
     settings: SettingsPath = None,
     set_: Overrides = None,
     no_cache: NoCache = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
 ) -> None:
     """Check an experiment in seconds before tracking: findings, and what to do. Exit code 1: there is a fault."""
     picture = Path(f"{experiment.stem}.check.png") if out is None else out
@@ -86,12 +82,12 @@ def _print_findings(findings: "Sequence[Finding]", quiet: bool) -> None:
 def show_movie(
     source: Source,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Contact sheet (.png, .pdf); FILE.contact.png here without it.")
+        Path | None, Option("--out", "-o", help="Contact sheet (.png, .pdf); else FILE.contact.png.")
     ] = None,
-    count: Annotated[int, typer.Option(min=1, max=240, help="Frames on the sheet.")] = 24,
-    every: Annotated[bool, typer.Option("--all", help="Examine every frame, not only those of the sheet.")] = False,
+    count: Annotated[int, Option(min=1, max=240, help="Frames on the sheet.")] = 24,
+    every: Annotated[bool, Option("--all", help="Examine every frame, not only those of the sheet.")] = False,
     flip: Flip = "none",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Print what is in a movie, and draw a contact sheet of it."""
     # the name of the movie without characters that file names cannot have
@@ -116,10 +112,10 @@ def show_movie(
 @app.command()
 def convert(
     source: Source,
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
-    frames: Annotated[str, typer.Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
+    target: Annotated[Path, Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
+    frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
     flip: Flip = "none",
-    rate: Annotated[float, typer.Option(min=1.0e-3, max=1.0e6, help="Frames per second of .mkv, for players.")] = 25.0,
+    rate: Annotated[float, Option(min=1.0e-3, max=1.0e6, help="Frames per second of .mkv, for players.")] = 25.0,
     quiet: Quiet = False,
 ) -> None:
     """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""

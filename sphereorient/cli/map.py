@@ -3,10 +3,12 @@
 import json
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import (
@@ -15,8 +17,10 @@ from sphereorient.cli.options import (
     NoCache,
     Overrides,
     Quiet,
+    Resume,
     SettingsPath,
     cameras_of,
+    file_of,
     settings_of,
 )
 from sphereorient.errors import PaintError, refusal
@@ -35,61 +39,59 @@ PAINT_MIN = 0.7  # correlation of held-out pictures below which a map is doubted
 PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
-@app.command("map")
-def map_(
-    experiment: ExperimentPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")],
-    init: Annotated[
-        Path | None, typer.Option(help="An old map: gives the body frame, and the texture of what is never seen.")
-    ] = None,
-    cameras: Cameras = None,
+@dataclass(frozen=True, kw_only=True)
+class _MapOptions:
+    experiment: ExperimentPath
+    out: Annotated[Path, Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")]
+    init: Annotated[Path | None, Option(help="Old map: gives the body frame, and the texture never seen here.")] = None
+    cameras: Cameras = None
     photographs: Annotated[
-        bool, typer.Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
-    ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what a run that was cut off has left beside --out.")
-    ] = False,
-    settings: SettingsPath = None,
-    set_: Overrides = None,
-    no_cache: NoCache = False,
-    quiet: Quiet = False,
-) -> None:
+        bool, Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
+    ] = False
+    resume: Resume = False
+    settings: SettingsPath = None
+    set_: Overrides = None
+    no_cache: NoCache = False
+    quiet: Quiet = False
+
+
+@app.command("map")
+def map_(given: _MapOptions) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed. Of several
     balls each gets one, OUT_NAME.png; those that wear one paint share it.
     """
-    check_ending(out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
+    check_ending(given.out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
     from sphereorient.experiment import load_experiment
     from sphereorient.methods.map import learn_map
     from sphereorient.run.store import FolderStore, Request
     from sphereorient.sphere import load_texture
 
-    spheres = load_experiment(experiment).names
-    outs = {name: out.with_name(f"{out.stem}_{name}{out.suffix}") if name else out for name in spheres}
+    outs = {name: file_of(given.out, name) for name in load_experiment(given.experiment).names}
     for one in outs.values():
         for path in _files_of(one):
             check_writable(path)
-    overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
-    chosen, begun = settings_of(settings, overrides, "map"), time.perf_counter()
-    old = None if init is None else load_texture(init)
-    named, command = cameras_of(cameras), command_line()
-    names = None if named is None else tuple(named)
-    request = Request(experiment=experiment, out=out, method="map", settings=chosen, cameras=names)
+    overrides = [*(given.set_ or []), *(["paint.unordered=true"] if given.photographs else [])]
+    chosen, begun = settings_of(given.settings, overrides, "map"), time.perf_counter()
+    old = None if given.init is None else load_texture(given.init)
+    names, command = cameras_of(given.cameras), command_line()
+    request = Request(experiment=given.experiment, out=given.out, method="map", settings=chosen, cameras=names)
     store = FolderStore(request.parts)
-    with store.held(request, resume=resume), progress_bar(quiet, unit="iterations") as advance:
+    with store.held(request, resume=given.resume), progress_bar(given.quiet, unit="iterations") as advance:
         kept = store.folder / "map.h5"
-        found = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command)
-        results = found if isinstance(found, dict) else {"": found}
+        found = learn_map(
+            given.experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command
+        )
+        results, files = found if isinstance(found, dict) else {"": found}, []
         advance("figure", 0, len(results))
-        files = []
         for done, (name, result) in enumerate(results.items(), start=1):
             files += _write(result, old, outs[name])
             advance("figure", done, len(results))
         store.remove()
-    if quiet:
+    if given.quiet:
         return
     echo_lines(f"note: {remark}" for remark in next(iter(results.values())).remarks)
     for name, result in results.items():
-        _print_result(name, result, init)
+        _print_result(name, result, given.init)
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in files))
     for name, result in results.items():
@@ -167,22 +169,17 @@ def _print(learnt: "LearntMap") -> None:
 def compare_maps_(
     maps: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             metavar="NEW.png OLD.png",
             help="Two maps; NEW_seen.png beside one marks its unknown texels. With --series: FIRST.png SECOND.png ...",
         ),
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Figure: displacements, and where the texture changed.")
-    ] = None,
-    series: Annotated[
-        bool,
-        typer.Option("--series", help="Maps in the order of their movies: compare all with the first, show the wear."),
-    ] = False,
+    out: Annotated[Path | None, Option("--out", "-o", help="Figure: displacements, changes of the texture.")] = None,
+    series: Annotated[bool, Option("--series", help="Maps in order of time: wear of all since the first.")] = False,
     same_frame: Annotated[
-        bool, typer.Option("--same-frame", help="The body frames are the same; else the rotation is estimated.")
+        bool, Option("--same-frame", help="Same body frame; else the rotation is estimated.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Compare texture maps of one ball: displacement of the texture, and wear."""
     if out is not None:

@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 if TYPE_CHECKING:
     from sphereorient.methods.settings import Settings
     from sphereorient.trajectory import Tracks
 
-ExperimentPath = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
-TrackPath = Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
-SphereName = Annotated[str | None, typer.Option("--sphere", help="Of several balls, only this one.")]
-Cameras = Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
-SettingsPath = Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")]
-Overrides = Annotated[
-    list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")
-]
+ExperimentPath = Annotated[Path, Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
+TrackPath = Annotated[Path, Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
+SphereName = Annotated[str | None, Option("--sphere", help="Of several balls, only this one.")]
+Cameras = Annotated[str | None, Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
+SettingsPath = Annotated[Path | None, Option(help="YAML as `sphereorient settings` writes it.")]
+Overrides = Annotated[list[str] | None, Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")]
 
 
 def _without_cache(chosen: bool) -> bool:
@@ -31,13 +30,14 @@ def _without_cache(chosen: bool) -> bool:
 
 NoCache = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--no-cache",
         callback=_without_cache,
         help="Compute what earlier runs kept in the user's cache folder, and keep nothing.",
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+Resume = Annotated[bool, Option("--resume", help="Go on with what a run that was cut off left beside --out.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no summary.")]
 
 
 def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> "Settings":
@@ -62,9 +62,14 @@ def names_in(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def cameras_of(text: str | None) -> list[str] | None:
+def cameras_of(text: str | None) -> tuple[str, ...] | None:
     """Return the names in cam1,cam2; None without a text: all."""
-    return None if text is None else names_in(text)
+    return None if text is None else tuple(names_in(text))
+
+
+def file_of(out: Path, ball: str) -> Path:
+    """Return the file of a ball: `out` of the only one without name, else out_NAME."""
+    return out.with_name(f"{out.stem}_{ball}{out.suffix}") if ball else out
 
 
 def frames_of(text: str) -> tuple[int | None, int | None] | None:

@@ -1,10 +1,12 @@
 """`sphereorient report`, `overlay` and `export`: what a track is looked at with."""
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import (
@@ -14,6 +16,7 @@ from sphereorient.cli.options import (
     SphereName,
     TrackPath,
     cameras_of,
+    file_of,
     frames_of,
     settings_of,
     tracks_in,
@@ -24,37 +27,37 @@ if TYPE_CHECKING:
     from sphereorient.trajectory import Tracks, Trajectory
 
 
-@app.command()
-def report(
-    tracks: Annotated[list[Path], typer.Argument(metavar="TRACK...", help="track.h5 of `sphereorient track`.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write: index.html, figures, tables.")],
-    experiment: Annotated[
-        list[Path] | None,
-        typer.Option(help="experiment.yaml of a track, for pictures, the sphere's size and the flow; repeatable."),
-    ] = None,
-    settings: SettingsPath = None,
+@dataclass(frozen=True, kw_only=True)
+class _ReportOptions:
+    tracks: Annotated[list[Path], Argument(metavar="TRACK...", help="track.h5 of `sphereorient track`.")]
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
+    experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
+    settings: SettingsPath = None
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set statistics.min_frames=30.")
-    ] = None,
-    sphere: SphereName = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, only warnings.")] = False,
-) -> None:
+        list[str] | None, Option("--set", help="Override one setting, e.g. --set statistics.min_frames=30.")
+    ] = None
+    sphere: SphereName = None
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, only warnings.")] = False
+
+
+@app.command()
+def report(given: _ReportOptions) -> None:
     """Write statistics of tracks with error bars, figures, and a page with the findings."""
-    check_writable(out, folder_made=True)
+    check_writable(given.out, folder_made=True)
     from sphereorient.experiment import load_experiment
     from sphereorient.report.build import write_report
 
-    chosen = settings_of(settings, set_, "report").statistics
-    known = [load_experiment(path) for path in experiment or ()]
-    loaded, command = _load(tracks, sphere), command_line()
-    with progress_bar(quiet, unit="") as advance:
-        words = write_report(loaded, out, experiments=known, settings=chosen, progress=advance, command=command)
+    chosen = settings_of(given.settings, given.set_, "report").statistics
+    known = [load_experiment(path) for path in given.experiment or ()]
+    loaded, command = _load(given.tracks, given.sphere), command_line()
+    with progress_bar(given.quiet, unit="") as advance:
+        words = write_report(loaded, given.out, experiments=known, settings=chosen, progress=advance, command=command)
     for verdict in words:
         doubt = verdict.grade == "doubt"
-        if doubt or not quiet:
+        if doubt or not given.quiet:
             typer.echo(f"{verdict.title}: {verdict.words}", err=doubt)
-    if not quiet:
-        typer.echo(f"Wrote {out / 'index.html'}")
+    if not given.quiet:
+        typer.echo(f"Wrote {given.out / 'index.html'}")
 
 
 def _load(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
@@ -77,58 +80,61 @@ def _load(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
     }
 
 
+@dataclass(frozen=True, kw_only=True)
+class _OverlayOptions:
+    experiment: ExperimentPath
+    track: TrackPath
+    out: Annotated[Path | None, Option("--out", "-o", help="Movie to write: .mp4, .mov or .mkv (H.264).")] = None
+    cameras: Annotated[str | None, Option(help="Show only these, e.g. cam1 or cam1,cam2.")] = None
+    frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":"
+    every: Annotated[int, Option(min=1, help="Show one of so many frames.")] = 1
+    fps: Annotated[float, Option(min=0.1, max=240.0, help="Frames a second of the movie.")] = 25.0
+    worst: Annotated[Path | None, Option(help="Contact sheet of the worst frames, with reasons (.png, .pdf).")] = None
+    count: Annotated[int, Option(min=1, max=120, help="Frames on that sheet.")] = 24
+    sphere: SphereName = None
+    quiet: Quiet = False
+
+
 @app.command()
-def overlay(
-    experiment: ExperimentPath,
-    track: TrackPath,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Movie to write: .mp4, .mov or .mkv (H.264).")] = None,
-    cameras: Annotated[str | None, typer.Option(help="Show only these, e.g. cam1 or cam1,cam2.")] = None,
-    frames: Annotated[str, typer.Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
-    every: Annotated[int, typer.Option(min=1, help="Show one of so many frames.")] = 1,
-    fps: Annotated[float, typer.Option(min=0.1, max=240.0, help="Frames a second of the movie.")] = 25.0,
-    worst: Annotated[
-        Path | None, typer.Option(help="Contact sheet to write of the worst frames, with the reasons (.png, .pdf).")
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, max=120, help="Frames on that sheet.")] = 24,
-    sphere: SphereName = None,
-    quiet: Quiet = False,
-) -> None:
+def overlay(given: _OverlayOptions) -> None:
     """Draw a track on its movies: outline, body axes, re-rendered sphere, residual; and a sheet of the worst frames."""
-    if out is None and worst is None:
+    if given.out is None and given.worst is None:
         do = "add --out overlay.mp4 or --worst sheet.png"
         raise OutputError(refusal("overlay", expected="something to write", got="neither --out nor --worst", do=do))
-    if out is not None:
-        check_writable(out)
-    first, last = frames_of(frames) or (0, 0)
+    if given.out is not None:
+        check_writable(given.out)
+    first, last = frames_of(given.frames) or (0, 0)
     if first is not None and last is not None and first >= last:
         do = "write e.g. --frames 100:200"
-        raise SettingsError(refusal(f"--frames {frames}", expected="A:B, A below B", got=f"'{frames}'", do=do))
+        raise SettingsError(
+            refusal(f"--frames {given.frames}", expected="A:B, A below B", got=f"'{given.frames}'", do=do)
+        )
     from sphereorient.experiment import load_experiment
     from sphereorient.report.gallery import worst_frames
     from sphereorient.report.overlay import FrameSelection, overlay_movie
 
-    loaded, seen = load_experiment(experiment), tracks_in(track, sphere)
-    names, sheets = cameras_of(cameras), {} if worst is None else _paths(worst, seen)
+    loaded, seen = load_experiment(given.experiment), tracks_in(given.track, given.sphere)
+    names, sheets = cameras_of(given.cameras), {} if given.worst is None else _paths(given.worst, seen)
     bad = {}
-    with progress_bar(quiet) as advance:
-        if out is not None:
-            chosen = FrameSelection(cameras=names, first=first, last=last, every=every)
-            shown = overlay_movie(seen, loaded, out, chosen, fps, lambda *at: advance("overlay", *at))
+    with progress_bar(given.quiet) as advance:
+        if given.out is not None:
+            chosen = FrameSelection(cameras=names, first=first, last=last, every=given.every)
+            shown = overlay_movie(seen, loaded, given.out, chosen, given.fps, lambda *at: advance("overlay", *at))
         for ball, sheet in sheets.items():
             told = partial(advance, f"worst {ball}".strip())
-            bad[sheet] = len(worst_frames(seen[ball], loaded, sheet, count, cameras=names, progress=told))
-    if not quiet and out is not None:
-        typer.echo(f"Wrote {out}: {shown} frames")
-    for sheet, frames_shown in bad.items() if not quiet else ():
+            bad[sheet] = len(worst_frames(seen[ball], loaded, sheet, given.count, cameras=names, progress=told))
+    if not given.quiet and given.out is not None:
+        typer.echo(f"Wrote {given.out}: {shown} frames")
+    for sheet, frames_shown in bad.items() if not given.quiet else ():
         typer.echo(f"Wrote {sheet}: {frames_shown} frames" + ("" if frames_shown else "; none is bad"))
 
 
 def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
-    """Return the file of each sphere by name, checked: `out` of the only one without name, else out_NAME."""
+    """Return the file of each sphere by name, checked."""
     from sphereorient.report.columns import plain_names
 
     plain = plain_names(tracks, "ball")
-    paths = {name: out.with_name(f"{out.stem}_{plain[name]}{out.suffix}") if name else out for name in tracks}
+    paths = {name: file_of(out, plain[name] if name else "") for name in tracks}
     for path in paths.values():
         check_writable(path)
     return paths
@@ -137,17 +143,15 @@ def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
 @app.command()
 def export(
     track: TrackPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
+    out: Annotated[Path, Option("--out", "-o", help="File to write.")],
     to: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="csv, parquet, mat, fictrac, tum, vtk, nwb or netcdf; default: by the suffix of the name.",
             metavar="FORMAT",
         ),
     ] = None,
-    experiment: Annotated[
-        Path | None, typer.Option(help="experiment.yaml of the track: FicTrac's table needs the camera.")
-    ] = None,
+    experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None,
     sphere: SphereName = None,
     quiet: Quiet = False,
 ) -> None:

@@ -2,10 +2,13 @@
 
 import json
 import math
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import Quiet, names_in
@@ -23,48 +26,45 @@ SPREAD = ("min", "median", "max")
 HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
 
 
+@dataclass(frozen=True, kw_only=True)
+class _SpinOptions:
+    photographs: Annotated[list[Path], Argument(metavar="PHOTOGRAPHS...", help="Pictures of a flight, or a folder.")]
+    times: Annotated[str, Option(help="Table .csv with file,t_s; or pictures a second, e.g. 400, at equal intervals.")]
+    texture: Annotated[Path, Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")]
+    out: Annotated[Path, Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")]
+    dot_radius: Annotated[float | None, Option(help="Radius of the dots on the ball, degrees; else measured.")] = None
+    omega_max: Annotated[float, Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300
+    quiet: Quiet = False
+
+
 @app.command()
-def spin(
-    photographs: Annotated[
-        list[Path], typer.Argument(metavar="PHOTOGRAPHS...", help="Pictures of one flight, or a folder of them.")
-    ],
-    times: Annotated[
-        str, typer.Option(help="Table .csv with file,t_s; or pictures a second, e.g. 400, at equal intervals.")
-    ],
-    texture: Annotated[Path, typer.Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")],
-    dot_radius: Annotated[
-        float | None, typer.Option(help="Radius of the dots, degrees on the ball; else it is measured in the pictures.")
-    ] = None,
-    omega_max: Annotated[float, typer.Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300,
-    quiet: Quiet = False,
-) -> None:
+def spin(given: _SpinOptions) -> None:
     """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
-    check_ending(out, "--out", [".json"])
-    check_writable(out)
-    check_writable(out.with_suffix(".png"))
+    check_ending(given.out, "--out", [".json"])
+    check_writable(given.out)
+    check_writable(given.out.with_suffix(".png"))
     from sphereorient.report.plots.style import write_figure
     from sphereorient.tools.spin.disks import load_ball, load_photographs
     from sphereorient.tools.spin.dots import DotTable
     from sphereorient.tools.spin.spin import SpinSettings, spin_figure, spin_of
 
-    ball = load_ball(texture, dot_radius)
-    loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)
-    with progress_bar(quiet, unit="photographs") as advance:
+    ball = load_ball(given.texture, given.dot_radius)
+    loaded, settings = load_photographs(given.photographs, given.times), SpinSettings(omega_max_rad_s=given.omega_max)
+    with progress_bar(given.quiet, unit="photographs") as advance:
         found = spin_of(loaded, ball, settings, advance)
-        if isinstance(ball, DotTable) and dot_radius is None:
+        if isinstance(ball, DotTable) and given.dot_radius is None:
             ball = ball.measured(found.disks, found.R_view_body)
             found = spin_of(loaded, ball, settings, lambda stage, *rest: advance(f"{stage}, dots measured", *rest))
     result = _spin_document(found, loaded)
     if isinstance(ball, DotTable):
         result["dot_radius_deg"] = ball.radius_deg
-    write_text(out, json.dumps(result, indent=2) + "\n")
+    write_text(given.out, json.dumps(result, indent=2) + "\n")
     drawn = ball.texture() if isinstance(ball, DotTable) else ball
     names = [Path(name).stem for name in loaded.names]
-    write_figure(spin_figure(found, drawn, loaded.time_s, names), out.with_suffix(".png"))
-    if not quiet:
+    write_figure(spin_figure(found, drawn, loaded.time_s, names), given.out.with_suffix(".png"))
+    if not given.quiet:
         _print_spin(result)
-        typer.echo(f"Wrote {out}, {out.with_suffix('.png')}")
+        typer.echo(f"Wrote {given.out}, {given.out.with_suffix('.png')}")
 
 
 def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, Any]:
@@ -133,73 +133,67 @@ def texture() -> None:
     """Judge, make and print a texture map (docs/paint-design.md)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _DesignOptions:
+    map_: Annotated[Path | None, Argument(metavar="[MAP.png]", help="Map to judge; else --make makes one.")] = None
+    out: Annotated[Path, Option("--out", "-o", help="Folder of judgement, map and strips.")] = Path("design")
+    make: Annotated[bool, Option("--make", help="Search for a map that is easy to paint and hard to confuse.")] = False
+    kinds: Annotated[str, Option(help="With --make: kinds of texture to try.")] = "blobs,patches,dots"
+    stroke: Annotated[float, Option(min=2, max=40, help="With --make: least width of the brush, degrees.")] = 10.0
+    tries: Annotated[int, Option(min=1, max=1000, help="With --make: maps of each kind.")] = 24
+    seed: Annotated[int, Option(help="With --make: the same seed gives the same map.")] = 0
+    diameter_px: Annotated[float, Option(min=12, max=400, help="Diameter of the ball's picture, px.")] = 80.0
+    noise: Annotated[float, Option(min=0.001, max=1, help="Noise of a pixel over the step from black to white.")] = 0.05
+    views: Annotated[int, Option(min=12, max=2000, help="Views that are judged.")] = 96
+    gores: Annotated[int | None, Option(help="Print so many strips, e.g. 12; needs --diameter-mm.")] = None
+    diameter_mm: Annotated[float | None, Option(help="Diameter of the ball, mm.")] = None
+    as_json: Annotated[bool, Option("--json", help="Print the judgement as JSON.")] = False
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, no table.")] = False
+
+
 @texture_app.command()
-def design(
-    map_: Annotated[
-        Path | None, typer.Argument(metavar="[MAP.png]", help="Map to judge; without it --make makes one.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for judgement, picture, map and strips.")] = Path(
-        "design"
-    ),
-    make: Annotated[
-        bool, typer.Option("--make", help="Search for a map that is easy to paint and hard to confuse.")
-    ] = False,
-    kinds: Annotated[str, typer.Option(help="With --make: kinds of texture to try.")] = "blobs,patches,dots",
-    stroke: Annotated[
-        float, typer.Option(min=2, max=40, help="With --make: least width of the brush, degrees on the ball.")
-    ] = 10.0,
-    tries: Annotated[int, typer.Option(min=1, max=1000, help="With --make: maps of each kind.")] = 24,
-    seed: Annotated[int, typer.Option(help="With --make: the same seed gives the same map.")] = 0,
-    diameter_px: Annotated[float, typer.Option(min=12, max=400, help="Diameter of the ball's picture, px.")] = 80.0,
-    noise: Annotated[
-        float, typer.Option(min=0.001, max=1, help="Noise of a pixel over the step from black to white.")
-    ] = 0.05,
-    views: Annotated[int, typer.Option(min=12, max=2000, help="Views that are judged.")] = 96,
-    gores: Annotated[int | None, typer.Option(help="Print so many strips, e.g. 12; needs --diameter-mm.")] = None,
-    diameter_mm: Annotated[float | None, typer.Option(help="Diameter of the ball, mm.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the judgement as JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
-) -> None:
+def design(given: _DesignOptions) -> None:
     """Judge a map before it is painted, or make one; print it on strips that wrap the ball."""
-    _check_design(
-        map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm
-    )
-    check_writable(out, folder_made=True)
+    _check_design(given)
+    check_writable(given.out, folder_made=True)
     from sphereorient.sphere import load_texture, reduced_texture
     from sphereorient.tools.design.gores import Gores, write_gores
     from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
 
-    strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
-    settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
-    if map_ is not None:
-        title, drawn = map_.name, load_texture(map_)
+    strips = None
+    if given.gores is not None and given.diameter_mm is not None:
+        strips = Gores(count=given.gores, diameter_mm=given.diameter_mm)
+    settings = DesignSettings(diameter_px=given.diameter_px, noise_share=given.noise, views=given.views)
+    if given.map_ is not None:
+        title, drawn = given.map_.name, load_texture(given.map_)
         if len(drawn) > HEIGHT_MAX:
             drawn = reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
         judgement = judge_texture(drawn, settings)
     else:
-        with progress_bar(quiet or as_json, unit="maps") as advance:
+        with progress_bar(given.quiet or given.as_json, unit="maps") as advance:
+            told, kinds = partial(advance, "search"), names_in(given.kinds)
             drawn, judgement, title = design_texture(
-                names_in(kinds), stroke, settings, tries=tries, seed=seed, advance=lambda *at: advance("search", *at)
+                kinds, given.stroke, settings, tries=given.tries, seed=given.seed, advance=told
             )
-    files = _written(out, drawn, judgement, title, make=map_ is None)
+    files = _written(given.out, drawn, judgement, title, make=given.map_ is None)
     if strips is not None:
-        files += write_gores(drawn, strips, out)
-    if as_json:
+        files += write_gores(drawn, strips, given.out)
+    if given.as_json:
         typer.echo(json.dumps({"map": title, **judgement.as_dict()}))
-    elif not quiet:
+    elif not given.quiet:
         _print_judgement(judgement, title)
         typer.echo("Wrote " + ", ".join(str(file) for file in files))
 
 
-def _check_design(map_: Path | None, make: bool, gores: int | None, diameter_mm: float | None, *numbers: float) -> None:
+def _check_design(given: _DesignOptions) -> None:
     """Refuse options that contradict each other, nan and infinity."""
-    if make == (map_ is not None):
-        got, do = ("both", "leave one of them away") if make else ("neither", "name a map, or say --make")
+    if given.make == (given.map_ is not None):
+        got, do = ("both", "leave one of them away") if given.make else ("neither", "name a map, or say --make")
         raise TextureError(refusal("texture design", expected="a map to judge or --make", got=got, do=do))
-    if (gores is None) != (diameter_mm is None):
-        got = "--gores alone" if diameter_mm is None else "--diameter-mm alone"
+    if (given.gores is None) != (given.diameter_mm is None):
+        got = "--gores alone" if given.diameter_mm is None else "--diameter-mm alone"
         raise TextureError(refusal("strips", expected="--gores and --diameter-mm", got=got, do="give both"))
-    if not all(math.isfinite(number) for number in numbers):
+    if not all(map(math.isfinite, (given.stroke, given.diameter_px, given.noise, given.diameter_mm or 0.0))):
         do = "correct the option"
         raise TextureError(refusal("texture design", expected="numbers", got="nan or infinity", do=do))
 

@@ -2,13 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import Cameras, NoCache, Overrides, Quiet, SettingsPath, cameras_of, settings_of
+from sphereorient.cli.options import Cameras, NoCache, Overrides, Quiet, Resume, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -18,85 +20,70 @@ if TYPE_CHECKING:
 EXIT_SOME_FAILED = 1  # of several experiments
 
 
-@app.command()
-def track(
+@dataclass(frozen=True, kw_only=True)
+class _TrackOptions:
     experiments: Annotated[
-        list[Path], typer.Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="HDF5 file to write; for several experiments the folder of their tracks."),
-    ],
+        list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
+    ]
+    out: Annotated[Path, Option("--out", "-o", help="HDF5 file to write; of several experiments a folder.")]
     method: Annotated[
-        str, typer.Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
-    ] = "precise",
-    settings: SettingsPath = None,
-    set_: Overrides = None,
-    cameras: Cameras = None,
-    device: Annotated[str, typer.Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu",
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1,
-    cluster: Annotated[
-        str | None,
-        typer.Option(help="Workers of a Dask cluster: its scheduler's address or file; local for this machine."),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what a run that was cut off has left beside --out.")
-    ] = False,
-    learnt: Annotated[
-        Path | None, typer.Option(help="Measure with what another run of these cameras learnt (--save-learnt).")
-    ] = None,
-    save_learnt: Annotated[
-        Path | None, typer.Option(help="Keep what was learnt: empty scenes, light, scores, process noise.")
-    ] = None,
-    proposer: Annotated[
-        str | None,
-        typer.Option(help="A trained network proposes orientations: its checkpoint, or default (docs/proposer.md)."),
-    ] = None,
-    no_learn_paint: Annotated[
-        bool, typer.Option("--no-learn-paint", help="Use the whole map, even where the ball wears other paint.")
-    ] = False,
-    no_cache: NoCache = False,
-    quiet: Quiet = False,
-) -> None:
+        str, Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
+    ] = "precise"
+    settings: SettingsPath = None
+    set_: Overrides = None
+    cameras: Cameras = None
+    device: Annotated[str, Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu"
+    jobs: Annotated[int, Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1
+    cluster: Annotated[str | None, Option(help="Dask cluster: its scheduler's address or file; or local.")] = None
+    resume: Resume = False
+    learnt: Annotated[Path | None, Option(help="Use what another run of these cameras learnt (--save-learnt).")] = None
+    save_learnt: Annotated[Path | None, Option(help="Keep what is learnt: empty scenes, light, scores, noise.")] = None
+    proposer: Annotated[str | None, Option(help="Proposer's checkpoint, or default (docs/proposer.md).")] = None
+    no_learn_paint: Annotated[bool, Option("--no-learn-paint", help="Use the map even where paint differs.")] = False
+    no_cache: NoCache = False
+    quiet: Quiet = False
+
+
+@app.command()
+def track(given: _TrackOptions) -> None:
     """Track the sphere of an experiment, or of many: position and orientation of every frame."""
-    many = len(experiments) > 1 or out.is_dir()
-    check_writable(out / "tracks" if many else out)
-    if save_learnt is not None:
-        check_writable(save_learnt)
+    many = len(given.experiments) > 1 or given.out.is_dir()
+    check_writable(given.out / "tracks" if many else given.out)
+    if given.save_learnt is not None:
+        check_writable(given.save_learnt)
         if many:
-            name, do = f"--save-learnt {save_learnt}", "track them one by one"
+            name, do = f"--save-learnt {given.save_learnt}", "track them one by one"
             raise SettingsError(refusal(name, expected="one experiment", got="several", do=do))
     from sphereorient.run import FolderStore, Request, run
     from sphereorient.run.many import tracks_of
     from sphereorient.run.stages import with_proposer
-    from sphereorient.trajectory import Trajectory
+    from sphereorient.trajectory import Tracks
 
-    overrides = [*(set_ or ()), *(["refine.learn_paint=false"] if no_learn_paint else ())]
-    chosen = with_proposer(settings_of(settings, overrides, method), proposer)
-    names = cameras_of(cameras)
+    overrides = [*(given.set_ or ()), *(["refine.learn_paint=false"] if given.no_learn_paint else ())]
+    chosen = with_proposer(settings_of(given.settings, overrides, given.method), given.proposer)
     requests = [
         Request(
             experiment=experiment,
             out=path,
-            method=method,
+            method=given.method,
             settings=chosen,
-            cameras=None if names is None else tuple(names),
-            device=device,
-            learnt=learnt,
-            save_learnt=save_learnt,
+            cameras=cameras_of(given.cameras),
+            device=given.device,
+            learnt=given.learnt,
+            save_learnt=given.save_learnt,
             command=command_line(),
         )
-        for experiment, path in zip(experiments, tracks_of(experiments, out), strict=True)
+        for experiment, path in zip(given.experiments, tracks_of(given.experiments, given.out), strict=True)
     ]
-    if many or jobs > 1 or cluster is not None:
-        _track_side_by_side(requests, jobs, cluster, resume, quiet)
+    if many or given.jobs > 1 or given.cluster is not None:
+        _track_side_by_side(requests, given.jobs, given.cluster, given.resume, given.quiet)
         return
-    with _kept(requests), progress_bar(quiet) as advance:
-        result = run(requests[0], FolderStore(requests[0].parts), resume=resume, progress=advance)
-    if not quiet:
-        for name, track in ({"": result} if isinstance(result, Trajectory) else result).items():
+    with _kept(requests), progress_bar(given.quiet) as advance:
+        result = run(requests[0], FolderStore(requests[0].parts), resume=given.resume, progress=advance)
+    if not given.quiet:
+        for name, track in Tracks.of(result).items():
             _print_summary(track, name)
-        typer.echo(f"Wrote {out}")
+        typer.echo(f"Wrote {given.out}")
 
 
 @contextmanager

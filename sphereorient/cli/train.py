@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, print_table, progress_bar
 from sphereorient.cli.options import Quiet
@@ -18,14 +19,10 @@ EXAMPLES = 8  # rows of the sheet
 
 @app.command()
 def train(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML with keys of configs/train_proposer.yaml.")],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the checkpoint, the log and the figures.")
-    ] = Path("proposer"),
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one key, e.g. --set training.minutes=30.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue from last.ckpt in the folder.")] = False,
+    config: Annotated[Path, Argument(metavar="CONFIG", help="YAML with keys of configs/train_proposer.yaml.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder of checkpoint, log and figures.")] = Path("proposer"),
+    set_: Annotated[list[str] | None, Option("--set", help="Override one key, e.g. --set training.minutes=30.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Continue from last.ckpt in the folder.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
@@ -60,13 +57,11 @@ def train(
 
 @app.command()
 def evaluate(
-    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="proposer.ckpt of `sphereorient train`.")],
-    config: Annotated[
-        Path | None, typer.Option(help="YAML with the `pictures` to use; without: those of its training.")
-    ] = None,
-    pictures: Annotated[int, typer.Option(min=1, help="Pictures of each degradation and level.")] = 240,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    checkpoint: Annotated[Path, Argument(metavar="CHECKPOINT", help="proposer.ckpt of `sphereorient train`.")],
+    config: Annotated[Path | None, Option(help="YAML with the `pictures` to use; else those of its training.")] = None,
+    pictures: Annotated[int, Option(min=1, help="Pictures of each degradation and level.")] = 240,
+    as_json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
+    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Measure the recall of a proposer's checkpoint on balls that no training sees, one degradation at a time."""
     from sphereorient.learn.checkpoint import load_checkpoint

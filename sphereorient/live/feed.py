@@ -1,4 +1,4 @@
-"""Frames as they come: from movies, from raw bytes of another program, from a camera; in a thread of its own."""
+"""Frames as they come, read in a thread of their own."""
 
 import math
 import time
@@ -6,20 +6,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from threading import Condition, Thread
-from typing import BinaryIO
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import MovieError, refusal
-from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream
-from sphereorient.movies.movie import luma
 
 Picture = NDArray[np.generic]
 Tell = Callable[[str], object]  # gets what is wrong, in one line
-AGAIN_S = 1.0  # between attempts to open a camera
 STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
 USUAL_FRAMES = 16  # over which the interval is averaged
 
@@ -32,22 +26,6 @@ class Arrival:
     time_s: float
     pictures: Sequence[Picture | None]
     arrived_s: float  # by the clock of time.perf_counter
-
-
-def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
-    """Yield the frames of an experiment's movies; `paced`: at the times of the recording."""
-    pictures = zip(*(stream.pictures() for stream in recording.streams), strict=True)
-    begun, first_s = time.perf_counter(), float(recording.timeline.time_s[0])
-    for number, (row, time_s) in enumerate(zip(pictures, recording.timeline.time_s.tolist(), strict=True)):
-        if paced:
-            time.sleep(max(0.0, begun + time_s - first_s - time.perf_counter()))
-        shown = [picture for picture, _ in row]
-        yield Arrival(number=number, time_s=time_s, pictures=shown, arrived_s=time.perf_counter())
-
-
-def rate_of(recording: Recording) -> float:
-    """Return the frame rate of an experiment, Hz."""
-    return float(1 / np.median(np.diff(recording.timeline.time_s)))
 
 
 class FrameBytes:
@@ -65,83 +43,6 @@ class FrameBytes:
             np.frombuffer(content, dtype, shape[0] * shape[1], begin).reshape(shape)
             for (shape, dtype), begin in zip(self._kinds, self._ends[:-1], strict=True)
         ]
-
-
-def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float) -> Iterator[Arrival]:
-    """Yield frames of bytes without a header, see `FrameBytes`.
-
-    Raises:
-        MovieError: the source ends within a frame.
-    """
-    layout, number = FrameBytes(streams), 0
-    while content := source.read(layout.size):
-        arrived_s = time.perf_counter()
-        if len(content) < layout.size:
-            expected, got = f"{layout.size} bytes a frame", f"{len(content)} bytes at the end"
-            do = "write whole pictures of the size and type of the experiment's movies"
-            raise MovieError(refusal(f"frame {number}", expected=expected, got=got, do=do))
-        pictures = layout.pictures(content)
-        yield Arrival(number=number, time_s=number / rate_hz, pictures=pictures, arrived_s=arrived_s)
-        number += 1
-
-
-def camera_pictures(
-    device: int | str, open_device: Callable[..., cv2.VideoCapture] = cv2.VideoCapture
-) -> Iterator[Picture]:
-    """Yield grey pictures of a camera that OpenCV knows by number or address, until it gives none.
-
-    Raises:
-        MovieError: no such camera.
-    """
-    capture = open_device(device)
-    try:
-        if not capture.isOpened():
-            do = "connect it, or name another number"
-            raise MovieError(refusal(f"camera {device}", expected="a camera", got="none that opens", do=do))
-        while True:
-            there, picture = capture.read()
-            if not there:
-                return
-            yield picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
-    finally:
-        capture.release()
-
-
-def device_frames(
-    name: str, open_pictures: Callable[[], Iterator[Picture]], stream: CameraStream, tell: Tell | None
-) -> Iterator[Arrival]:
-    """Yield frames of a camera with the time of their arrival. With `tell`, which gets what is wrong in one line, a
-    camera that ends, fails or changes its pictures after its first frame is opened again, each second.
-
-    Raises:
-        MovieError: no camera, or pictures of another size or type than the experiment's movie.
-    """
-    (height, width), kind = stream.movie.frame_shape, stream.movie.dtype
-    begun, number, fault = time.perf_counter(), 0, ""
-    while True:
-        found = f"{name}: no picture comes any more."
-        try:
-            for picture in open_pictures():
-                arrived_s = time.perf_counter()
-                if (*picture.shape, picture.dtype) != (height, width, kind):
-                    got = f"{picture.shape[1]} x {picture.shape[0]} px {picture.dtype}"
-                    do = "set the camera to the size and depth of the movie that the experiment names"
-                    raise MovieError(refusal(name, expected=f"{width} x {height} px {kind}", got=got, do=do))
-                if fault and tell is not None:
-                    tell(f"{name}: pictures come again.")
-                fault = ""
-                yield Arrival(number=number, time_s=arrived_s - begun, pictures=[picture], arrived_s=arrived_s)
-                number += 1
-        except MovieError as error:
-            if tell is None or not number:
-                raise
-            found = str(error)
-        if tell is None or not number:
-            return
-        if not fault:
-            tell(f"{found} It is opened again each second.")
-        fault = found
-        time.sleep(AGAIN_S)
 
 
 class Feed:

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.queues import Queue, SimpleQueue
 from queue import Empty
 from typing import Any
@@ -25,11 +25,11 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.online import OnlineTracker
 from sphereorient.follow.poses import Poses, supported
-from sphereorient.live.growing_map import GrowingMap, LiveMap
-from sphereorient.live.relative import RelativeTracker
 from sphereorient.locate import Frame
 from sphereorient.mapping.disks import Crop, Crops, cut_out
 from sphereorient.mapping.grid import ROUGH_SIDE, map_table
+from sphereorient.mapping.growing import GrowingMap, LiveMap
+from sphereorient.mapping.relative import RelativeTracker
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
@@ -44,10 +44,7 @@ PIPE_S = 0.004  # in which a full pipe is filled again
 SAVED_S = 120.0  # in which a map is finished
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Handed:
-    crops: Sequence[Crop]  # one of each camera
-    R_lab_body: NDArray[np.float64]  # (3, 3)
+_Handed = tuple[Sequence[Crop], NDArray[np.float64]]  # one crop of each camera, R_lab_body (3, 3)
 
 
 class MapLearner:
@@ -79,8 +76,7 @@ class MapLearner:
         if self._place is None or still or self._count >= HANDED or not all(shot.usable for shot in shots):
             return
         self._last, self._count = R_lab_body, self._count + 1
-        crops = cut_out(self._place, [shot.picture for shot in shots])
-        self._frames.put(_Handed(crops=crops, R_lab_body=R_lab_body.numpy()))
+        self._frames.put((cut_out(self._place, [shot.picture for shot in shots]), R_lab_body.numpy()))
 
     def paint(self) -> tuple[Tensor, Tensor]:
         """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H); the body frame
@@ -125,7 +121,7 @@ def _learn(frames: "Queue[Any]", maps: "SimpleQueue[Any]") -> None:
                     growing.iterate()
                 maps.put(growing.paint() if growing.done else None)
             else:
-                growing.add(one.crops, torch.from_numpy(one.R_lab_body))
+                growing.add(one[0], torch.from_numpy(one[1]))
         found = growing.grown(idle=not waiting)
         if found is not None:
             maps.put(found)

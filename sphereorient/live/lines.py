@@ -2,6 +2,8 @@
 
 import json
 import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,7 +17,6 @@ from sphereorient.trajectory.walk import arcs, fictrac_rows, rotation_vectors, t
 
 Floats = NDArray[np.float64]
 DIGITS = 14
-OF_JSON = ("jsonl", "zmq")
 
 
 class FicTracLines:
@@ -128,11 +129,33 @@ def _states_errors(now: Measured) -> bool:
     return now.map_number > 0 and bool(np.isfinite(now.covariance).all())
 
 
-def worded(kind: str, now: Measured, fictrac: str, as_json: str) -> object:
-    """Return what an output of a kind takes of a frame, whose lines are known where they are wanted."""
-    if kind == "h5":
-        return now
-    return as_json if kind in OF_JSON else fictrac if kind == "dat" else f"FT, {fictrac}"
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A frame in the forms that outputs take; each is made where one takes it."""
+
+    now: Measured
+    table: FicTracLines
+    json_lines: JsonLines
+
+    @cached_property
+    def columns(self) -> Floats:
+        """FicTrac's columns (25,)."""
+        return self.table.columns(self.now)
+
+    @cached_property
+    def fictrac(self) -> str:
+        """A line of FicTrac's file."""
+        return fictrac_line(self.columns)
+
+    @property
+    def marked(self) -> str:
+        """A line of FicTrac's socket."""
+        return f"FT, {self.fictrac}"
+
+    @cached_property
+    def json(self) -> str:
+        """A line of JSON."""
+        return self.json_lines.line(self.now)
 
 
 def without_nan(value: object) -> object:

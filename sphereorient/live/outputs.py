@@ -1,27 +1,38 @@
-"""Where lines go: TCP, UDP, ZeroMQ, a file. A slow or dead reader loses lines; it never holds up who writes."""
+"""Where lines and frames go: TCP, UDP, ZeroMQ, files. A slow or dead reader loses lines; it never holds up who writes.
 
+A new output is a class, and a line of `SOCKETS` or `FILES`.
+"""
+
+import os
 import socket
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
-from sphereorient.errors import OutputError, error_words, refusal
+from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
+from sphereorient.files.page_server import HOST
 from sphereorient.live.feed import Tell
+from sphereorient.live.live import Measured
+from sphereorient.live.track import TrackBlocks, whole_track
+from sphereorient.trajectory import journal
 
-HOST = "127.0.0.1"
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
 MOST_ROWS = 100_000  # likewise, for a disk: minutes
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
+BLOCK_S = 0.5  # from one write of a track's rows to the next
 
 
-class Output(Protocol):
+class Output:
     """Takes lines, or frames."""
 
-    def send(self, thing: Any, /) -> None:
+    def begin(self, blocks: TrackBlocks) -> None:
+        """Begin; `blocks` makes tracks of frames."""
+
+    def send(self, thing: Any) -> None:
         """Take one, and return at once."""
 
     def close(self) -> None:
@@ -81,12 +92,28 @@ class Spool:
                 self._changed.wait_for(lambda: self._ends, self._pause_s)
 
 
-class UdpOutput:
-    """A datagram a line, to one address.
+class DiskSpool(Spool):
+    """Of a file: far more may wait. `tell` gets one line where the disk takes no more, or was too slow."""
 
-    Raises:
-        OutputError: no such host.
-    """
+    def __init__(self, path: Path, write: Callable[[list[Any]], object], tell: Tell, pause_s: float = 0.0) -> None:
+        super().__init__(write, lambda error: tell(no_room(path, error)), MOST_ROWS, pause_s)
+        self._path, self._tell = path, tell
+
+    def close(self, limit_s: float = DISK_S) -> None:
+        """Write what waits, within a limit, and end."""
+        super().close(limit_s)
+        if self.lost and not self.gone:
+            self._tell(f"{self._path}: the disk was too slow for {self.lost} frames; they are missing.")
+
+
+def no_room(path: Path, error: OSError) -> str:
+    """Return the words for a file that the disk does not take."""
+    do = "make room; tracking goes on without this file"
+    return refusal(str(path), expected="a disk with room", got=error_words(error), do=do)
+
+
+class UdpOutput(Output):
+    """A datagram a line, to one address. Raise OutputError: no such host."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -107,11 +134,9 @@ class UdpOutput:
         self._socket.close()
 
 
-class ZmqOutput:
+class ZmqOutput(Output):
     """A PUB socket of ZeroMQ: each program that subscribes gets all further lines, less those that it is too slow for.
-
-    Raises:
-        OutputError: the package pyzmq is missing, or the port is in use.
+    Raise OutputError: the package pyzmq is missing, or the port is in use.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -144,12 +169,8 @@ class ZmqOutput:
         self._context.term()
 
 
-class TcpOutput:
-    """A server: each program that connects gets all further lines.
-
-    Raises:
-        OutputError: the port is in use.
-    """
+class TcpOutput(Output):
+    """A server: each program that connects gets all further lines. Raise OutputError: the port is in use."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -192,19 +213,17 @@ def _send_all(connection: socket.socket, lines: list[str]) -> None:
     connection.sendall("".join(f"{line}\n" for line in lines).encode())
 
 
-class FileOutput:
+class FileOutput(Output):
     """A new text file that grows by a line a frame; what is in it survives the end of the program.
     `tell` gets one line where the disk takes no more.
-
-    Raises:
-        OutputError: there is such a file, or no folder for it.
+    Raise OutputError: there is such a file, or no folder for it.
     """
 
     def __init__(self, path: Path, tell: Tell) -> None:
         check_new(path)
-        self._path, self._tell = path, tell
+        self._path = path
         self._file: IO[bytes] | None = None
-        self._spool = Spool(self._write, self._full, MOST_ROWS)
+        self._spool = DiskSpool(path, self._write, tell)
 
     def send(self, line: str) -> None:
         """Take a line; after a fault nothing more is written."""
@@ -216,18 +235,61 @@ class FileOutput:
         self._file.write(b"".join(lines))
         self._file.flush()
 
-    def _full(self, error: OSError) -> None:
-        do, got = "make room; tracking goes on without this file", error_words(error)
-        self._tell(refusal(str(self._path), expected="a disk with room", got=got, do=do))
-
     def close(self) -> None:
         """Write what waits, and close the file."""
-        self._spool.close(DISK_S)
-        if self._spool.lost and not self._spool.gone:
-            self._tell(f"{self._path}: the disk was too slow for {self._spool.lost} lines.")
+        self._spool.close()
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
+
+
+class TrackOutput(Output):
+    """A new track.h5 (docs/data-format.md): rows in a journal beside it until it is written whole at the end.
+    `tell` gets one line where the disk takes no more; the frames go on.
+    Raise OutputError: there is such a file or journal, or no folder for it.
+    """
+
+    def __init__(self, path: Path, tell: Tell) -> None:
+        self._path, self._tell, self._journal = path, tell, journal.journal_path(path)
+        check_new(path)
+        check_new(self._journal)
+        self._file: IO[bytes] | None = None
+        self._spool: DiskSpool | None = None
+
+    def begin(self, blocks: TrackBlocks) -> None:
+        """Begin the journal; raise OutputError if it cannot be written."""
+        try:
+            self._file = self._journal.open("xb")
+            self._file.write(journal.head(blocks.head()))
+            self._file.flush()
+        except OSError as error:
+            raise OutputError(no_room(self._journal, error)) from None
+
+        def write(frames: list[Measured]) -> None:
+            assert self._file is not None
+            self._file.write(journal.rows(blocks.block(frames)))
+            self._file.flush()
+            os.fsync(self._file.fileno())  # also a power cut leaves what is older than a second
+
+        self._spool = DiskSpool(self._journal, write, self._tell, BLOCK_S)
+
+    def send(self, now: Measured) -> None:
+        """Take a frame; after a fault nothing more is written."""
+        if self._spool is not None:
+            self._spool.send(now)
+
+    def close(self) -> None:
+        """Write the track, and remove the journal; where that fails, tell it and keep the journal."""
+        if self._spool is None or self._file is None:
+            return
+        self._spool.close()
+        with suppress(OSError):
+            self._file.close()
+        try:
+            whole_track(self._journal).save(self._path)
+            self._journal.unlink()
+        except (SphereOrientError, OSError) as error:
+            self._tell(f"{error} What was measured is in {self._journal}.")
 
 
 def check_new(path: Path) -> None:
@@ -235,3 +297,31 @@ def check_new(path: Path) -> None:
     if path.exists() or not path.parent.is_dir():
         got = "one that is there" if path.exists() else f"no folder {path.parent}"
         raise OutputError(refusal(str(path), expected="a new file", got=got, do="name another one"))
+
+
+# By the part before ":" or the suffix: the class, and what it takes of a frame, an attribute of `lines.Told`.
+SOCKETS: Mapping[str, tuple[Callable[[str, int], Output], str]] = {
+    "tcp": (TcpOutput, "marked"),
+    "udp": (UdpOutput, "marked"),
+    "zmq": (ZmqOutput, "json"),
+}
+FILES: Mapping[str, tuple[Callable[[Path, Tell], Output], str]] = {
+    ".dat": (FileOutput, "fictrac"),
+    ".jsonl": (FileOutput, "json"),
+    ".h5": (TrackOutput, "now"),
+}
+
+
+def open_output(name: str, tell: Tell) -> tuple[Output, str]:
+    """Open an output by its name, and return what it takes of a frame too; raise SettingsError for an unknown one."""
+    kind, _, address = name.partition(":")
+    host, between, port = address.rpartition(":")
+    if kind in SOCKETS and port.isdigit() and int(port) < 1 << 16:
+        to_socket, form = SOCKETS[kind]
+        return to_socket(host if between else HOST, int(port)), form
+    if (suffix := Path(name).suffix) in FILES:
+        to_file, form = FILES[suffix]
+        return to_file(Path(name), tell), form
+    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *(f"NAME{suffix}" for suffix in FILES)])
+    do = "choose one of these; another machine is tcp:HOST:PORT"
+    raise SettingsError(refusal("--to", expected=expected, got=name, do=do))

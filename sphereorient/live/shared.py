@@ -78,9 +78,7 @@ class SharedFrames:
 def shared_frames(path: Path, streams: Sequence[CameraStream]) -> Iterator[Arrival]:
     """Yield the frames of a ring, each once; of those that were written over before they were read the numbers are left
     out. Where another ring of this name takes its place, the numbers go on with that.
-
-    Raises:
-        MovieError: no such ring, or one of frames of another size.
+    Raise MovieError: no such ring, or one of frames of another size.
     """
     before = 0  # frames of former rings
     again = True

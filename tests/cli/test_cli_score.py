@@ -11,9 +11,9 @@ import pytest
 from conftest import REPO
 from typer.testing import CliRunner
 
+from sphereorient.bench import score_track
 from sphereorient.cli import app
 from sphereorient.errors import TrackError
-from sphereorient.evaluate import score_track
 from sphereorient.trajectory import Tracks, Trajectory
 
 TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"

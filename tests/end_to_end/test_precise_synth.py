@@ -30,8 +30,8 @@ from precise_examples import (
 )
 
 from sphereorient import so3
+from sphereorient.bench import score_track
 from sphereorient.errors import ExperimentError
-from sphereorient.evaluate import score_track
 from sphereorient.follow import Poses, Tracker
 from sphereorient.follow.ball import BallTracker
 from sphereorient.locate import Frame

@@ -13,9 +13,9 @@ from excerpt_examples import EXCERPT, shortened
 from typer.testing import CliRunner
 
 from sphereorient import track_movies
+from sphereorient.bench import score_track
 from sphereorient.cli.app import app
 from sphereorient.errors import CheckpointError, ShapeError
-from sphereorient.evaluate import score_track
 from sphereorient.files.provenance import sha256
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.network import DEFAULT_CHECKPOINT, LearnedProposer, probability_of

@@ -14,8 +14,8 @@ import yaml
 from precise_examples import SMALL
 
 from sphereorient import so3
+from sphereorient.bench import score_track
 from sphereorient.cameras import TsaiCamera, load_cameras, save_cameras
-from sphereorient.evaluate import score_track
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_synthetic_experiment

@@ -20,8 +20,8 @@ import pytest
 import yaml
 from excerpt_examples import EXCERPT, shortened
 
+from sphereorient.bench import score_track
 from sphereorient.cli import main
-from sphereorient.evaluate import score_track
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run.stages import track_movies

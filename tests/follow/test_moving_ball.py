@@ -9,7 +9,7 @@ import torch
 import yaml
 
 from sphereorient import so3
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
+from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
@@ -24,7 +24,7 @@ def off_deg(track, experiment) -> np.ndarray:
 
 @pytest.mark.slow
 def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
-    scene = BenchmarkScene(kind="moving", level=3, seed=0, number=0, degradations={"motion_blur": 3}, frames=24)
+    scene = BenchmarkScene(kind="moving", level=3, seed=0, number=0, degradations={"motion_blur": 3})
     experiment, known = write_scene(tmp_path, scene), tmp_path / "learnt.h5"
     track = run(Request(experiment=experiment, save_learnt=known), MemoryStore())
     learnt = Learnt.load(known)

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from sphereorient import so3
+from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.cli import main
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text, worn_share
 from sphereorient.run.stages import run
@@ -23,7 +23,7 @@ from sphereorient.trajectory import Flag, Trajectory
 @pytest.fixture(scope="module")
 def worn(tmp_path_factory):
     """A movie of a ball that has lost an eighth of its paint."""
-    scene = BenchmarkScene(kind="wear", level=3, seed=0, number=0, degradations={"paint_wear": 3}, frames=24)
+    scene = BenchmarkScene(kind="wear", level=3, seed=0, number=0, degradations={"paint_wear": 3})
     return write_scene(tmp_path_factory.mktemp("worn"), scene)
 
 
@@ -60,7 +60,7 @@ def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_ball_that_has_lost_half_of_its_paint_is_in_doubt(tmp_path):
-    scene = BenchmarkScene(kind="wear", level=5, seed=0, number=0, degradations={"paint_wear": 5}, frames=24)
+    scene = BenchmarkScene(kind="wear", level=5, seed=0, number=0, degradations={"paint_wear": 5})
     track = run(Request(experiment=write_scene(tmp_path, scene)), MemoryStore())
     assert track.valid.all()
     assert (track.flags[track.valid] & int(Flag.DOUBTFUL_FIT)).all()

@@ -18,8 +18,9 @@ from live_examples import EXCERPT, LIMIT_S, arrivals, until
 from sphereorient.errors import MovieError
 from sphereorient.experiment.recording import open_recording
 from sphereorient.live import shared
-from sphereorient.live.feed import Arrival, Feed, camera_pictures, device_frames, movie_frames, raw_frames
+from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
+from sphereorient.live.sources import camera_pictures, device_frames, movie_frames, raw_frames
 
 
 def test_a_feed_that_waits_gives_all_frames_in_order():
@@ -189,7 +190,7 @@ def test_a_camera_gives_grey_pictures_of_the_size_of_the_movie(stream):
 
 
 def test_a_camera_that_ends_or_changes_its_pictures_is_told_once_and_taken_up_again(stream, monkeypatch):
-    monkeypatch.setattr("sphereorient.live.feed.AGAIN_S", 0.001)
+    monkeypatch.setattr("sphereorient.live.sources.AGAIN_S", 0.001)
     told: list[str] = []
     devices = [
         FakeDevice([grey(stream), grey(stream)]),
@@ -213,7 +214,7 @@ def test_a_camera_that_ends_or_changes_its_pictures_is_told_once_and_taken_up_ag
 
 
 def test_a_camera_that_changes_its_size_is_told(stream, monkeypatch):
-    monkeypatch.setattr("sphereorient.live.feed.AGAIN_S", 0.001)
+    monkeypatch.setattr("sphereorient.live.sources.AGAIN_S", 0.001)
     told: list[str] = []
     devices = [FakeDevice([grey(stream), grey(stream)[:-1]]), FakeDevice([grey(stream)])]
     frames = frames_of(stream, *devices, tell=told.append)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sphereorient.errors import MovieError
-from sphereorient.live.genicam import genicam_pictures
+from sphereorient.live.sources import genicam_pictures
 
 
 class TimeoutException(Exception):

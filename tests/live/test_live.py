@@ -8,7 +8,6 @@ import re
 import socket
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -21,10 +20,9 @@ from typer.testing import CliRunner
 
 from sphereorient import so3
 from sphereorient.cli import app
-from sphereorient.live.bench import neighbours
-from sphereorient.live.feed import movie_frames
 from sphereorient.live.live import measured
-from sphereorient.live.prepare import open_live
+from sphereorient.live.loop import open_live
+from sphereorient.live.sources import movie_frames
 from sphereorient.methods.settings import Settings
 
 
@@ -104,48 +102,6 @@ def test_what_live_does_not_know_is_refused(options, message, monkeypatch):
     run = CliRunner().invoke(app, ["live", str(EXCERPT / "experiment.yaml"), *options])
     assert run.exit_code != 0
     assert message in str(run.exception)
-
-
-@pytest.mark.slow  # two programs
-def test_the_bench_times_each_line(tmp_path):
-    run = CliRunner().invoke(app, ["bench", "live", str(EXCERPT / "experiment.yaml"), "--rate", "20", "--seconds", "2"])
-    assert run.exit_code == 0, run.output
-    came, written = (int(number) for number in re.findall(r"(\d+) lines of (\d+) frames", run.output)[0])
-    assert came > 20
-    assert came <= written
-    assert 0 < float(re.findall(r"delay: ([0-9.]+) ms", run.output)[0]) < 5000
-    assert float(re.findall(r"([0-9.]+)° in the last", run.output)[0]) < 0.2, "against the excerpt's truth"
-
-
-@pytest.mark.slow  # two programs, twice
-def test_the_bench_prints_a_row_for_each_rate_beside_other_programs(tmp_path):
-    command = ["bench", "live", str(EXCERPT / "experiment.yaml"), "--rate", "10,20", "--seconds", "2", "--load", "1"]
-    run = CliRunner().invoke(app, [*command, "--cameras", "cam1"], env={"COLUMNS": "200"})
-    assert run.exit_code == 0, run.output
-    assert "other busy programs: 1" in run.output
-    rows = [re.findall(r"[0-9.]+", line) for line in run.output.splitlines() if re.match(r"\W*[12]0 +\W", line)]
-    assert [row[0] for row in rows] == ["10", "20"]
-    for (_, frames, dropped, lost, middle, slow, slowest, error, *_), least in zip(rows, (10, 20), strict=True):
-        assert least <= int(frames) - int(dropped)
-        assert int(lost) == 0
-        assert 0 < float(middle) <= float(slow) <= float(slowest)
-        assert float(error) < 0.2
-
-
-def test_neighbours_keep_cores_busy_and_end():
-    before = os.times()
-    with neighbours(2):
-        time.sleep(2.0)
-    after = os.times()
-    assert after.children_user - before.children_user > 0.5
-
-
-@pytest.mark.parametrize("rate", ["0", "x", ",", "nan", "100,-5"])
-def test_the_bench_wants_rates(rate, monkeypatch):
-    monkeypatch.setattr("sphereorient.live.bench.delays", lambda *_, **__: pytest.fail("too late"))
-    run = CliRunner().invoke(app, ["bench", "live", str(EXCERPT / "experiment.yaml"), "--rate", rate])
-    assert run.exit_code != 0
-    assert "100,200,500" in str(run.exception)
 
 
 @pytest.mark.slow  # a program of its own, and its ball

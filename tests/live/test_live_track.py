@@ -20,11 +20,12 @@ from typer.testing import CliRunner
 from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.live.feed import movie_frames
 from sphereorient.live.lines import JsonLines
 from sphereorient.live.live import measured
-from sphereorient.live.prepare import open_live
-from sphereorient.live.track import REMARK, TrackBlocks, TrackOutput, whole_track
+from sphereorient.live.loop import open_live
+from sphereorient.live.outputs import TrackOutput
+from sphereorient.live.sources import movie_frames
+from sphereorient.live.track import REMARK, TrackBlocks, whole_track
 from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Flag, Reason, Trajectory, journal
 from sphereorient.trajectory.datasets import stored_fields
@@ -62,13 +63,13 @@ def test_a_frame_that_one_camera_measured_is_flagged_at_once_and_doubtful_if_the
 
 
 def blocks_of(run) -> TrackBlocks:
-    return TrackBlocks(recording=run[0], tracker=run[1], even=True)
+    return TrackBlocks(recording=run[0], tracker=run[1], even=True, settings=Settings(), command="sphereorient live")
 
 
 def test_the_track_says_of_each_frame_what_was_measured(run, tmp_path):
     blocks, path = blocks_of(run), tmp_path / "track.h5"
     output = TrackOutput(path, pytest.fail)
-    output.begin(blocks, blocks.head(Settings(), "sphereorient live"))
+    output.begin(blocks)
     for now in run[2]:
         output.send(now)
     output.close()
@@ -121,7 +122,7 @@ def test_a_jump_begins_a_segment(run):
 
 def test_a_journal_that_was_cut_anywhere_is_the_track_until_there(run, tmp_path):
     blocks, path = blocks_of(run), tmp_path / "track.h5"
-    head, whole = blocks.head(Settings(), "sphereorient live"), blocks.block(run[2])
+    head, whole = blocks.head(), blocks.block(run[2])
     content = journal.rows(whole)
     size = len(content) // 40
     for cut, frames in ((0, 0), (1, 0), (size, 1), (17 * size - 1, 16), (len(content), 40)):
@@ -156,7 +157,7 @@ def test_a_full_disk_is_told_and_the_rows_before_it_stay(run, tmp_path):
     told: list[str] = []
     blocks = blocks_of(run)
     output = TrackOutput(tmp_path / "track.h5", told.append)
-    output.begin(blocks, blocks.head(Settings(), "sphereorient live"))
+    output.begin(blocks)
     output.send(run[2][0])
     until(lambda: len(Trajectory.load(tmp_path / "track.h5")) == 1)
     output._file.close()

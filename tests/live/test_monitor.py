@@ -14,10 +14,11 @@ import torch
 from live_examples import EXCERPT, LIMIT_S, rows, until
 from overlay_examples import true_track
 
-from sphereorient.live.feed import Arrival, Feed, movie_frames
+from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.live import Measured, measured
+from sphereorient.live.loop import open_live
 from sphereorient.live.monitor import LOST_S, Monitor
-from sphereorient.live.prepare import open_live
+from sphereorient.live.sources import movie_frames
 from sphereorient.methods.method import Learnt
 from sphereorient.methods.settings import Settings
 from sphereorient.report.texture_map import write_texture

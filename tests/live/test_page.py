@@ -23,10 +23,11 @@ from overlay_examples import true_track
 from sphereorient.errors import OutputError
 from sphereorient.experiment.recording import open_recording
 from sphereorient.files.page_server import HOST
-from sphereorient.live.feed import Arrival, Feed, movie_frames
+from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.lines import FicTracLines
 from sphereorient.live.monitor import Monitor
 from sphereorient.live.page import LivePage, address, open_page
+from sphereorient.live.sources import movie_frames
 from sphereorient.trajectory import Reason
 
 pytest_plugins = ["browser_examples"]

@@ -13,8 +13,8 @@ import yaml
 from conftest import REPO
 from pydantic import BaseModel, ValidationError
 
+from sphereorient.bench import BenchSettings
 from sphereorient.errors import SettingsError
-from sphereorient.evaluate.robustness import BenchSettings
 from sphereorient.experiment import input_files, load_experiment
 from sphereorient.files.provenance import provenance, sha256, versions
 from sphereorient.locate import LocateSettings

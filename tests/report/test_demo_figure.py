@@ -13,8 +13,8 @@ from conftest import REPO
 from demo_figure import demo_figure
 from matplotlib.figure import Figure
 
+from sphereorient.bench import score_track
 from sphereorient.errors import ExperimentError
-from sphereorient.evaluate import score_track
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.trajectory import CameraTrack, Trajectory
 

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.evaluate.bound import cramer_rao_bound
 from sphereorient.report.plots.style import GREY, SHADE, WIDTH_IN, in_style, new_figure
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import Sampling, orthographic_view, reduced_texture
 from sphereorient.sphere.texture import texture_coordinates
+from sphereorient.tools.design.bound import cramer_rao_bound
 from sphereorient.tools.design.patterns import (
     SIZES_DEG,
     border_length,

@@ -17,9 +17,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from sphereorient import cli, so3
 from sphereorient.errors import PaintError
-from sphereorient.evaluate import cramer_rao_bound
 from sphereorient.sphere import Sampling, load_texture, sample_texture
 from sphereorient.sphere.texture import map_directions
+from sphereorient.tools.design.bound import cramer_rao_bound
 from sphereorient.tools.design.gores import Gores, gores_figure, instructions
 from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture, most_similar_views
 from sphereorient.tools.design.patterns import (

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from sphereorient import so3
 from sphereorient.cameras import Camera, centre_lab_mm, sphere_disk_px
 from sphereorient.errors import BenchError, TrackError, refusal
+from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.walk import FICTRAC
 
@@ -214,12 +215,6 @@ def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
         got = f"{time_s[0]:.6g} .. {time_s[-1]:.6g} s"
         raise TrackError(refusal(f"truth {path}", expected="times of the track", got=got, do=DO))
     return row
-
-
-def distance_deg(A: Floats, B: Floats) -> Floats:
-    """Return the angle between orientations (N, 3, 3), (N,), degrees; NaN where either is."""
-    distance = so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
-    return np.asarray(np.rad2deg(distance), np.float64)
 
 
 def read_fictrac(path: Path) -> tuple[Frames, Floats]:

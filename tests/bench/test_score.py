@@ -14,8 +14,8 @@ import pytest
 from conftest import REPO, SHARED
 from scipy.spatial.transform import Rotation
 
+from sphereorient.bench import score_track
 from sphereorient.errors import TrackError
-from sphereorient.evaluate import score_track
 from sphereorient.trajectory import Trajectory
 
 TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"

@@ -1,7 +1,9 @@
-"""What is known before the first frame: light and blur of the set-up, learnt from a movie of it, or only its place."""
+"""`live`: the set-up learnt from its movie, or only its place, and the loop over the frames of a source."""
 
+import gc
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +14,20 @@ from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.files.whole_file import writing
 from sphereorient.follow.online import OnlineTracker
-from sphereorient.live.live import LiveTracker
+from sphereorient.live.feed import Feed, Tell
+from sphereorient.live.lines import FicTracLines, JsonLines, Told
+from sphereorient.live.live import LiveTracker, measured
+from sphereorient.live.monitor import Monitor
+from sphereorient.live.outputs import Output
+from sphereorient.live.page import LivePage
+from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
 from sphereorient.sphere.texture import seen_path
 
+SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
+WAITING = 64  # frames of a camera that wait at most
 MAP = "texture.png"  # beside the experiment, where that names none
 
 
@@ -87,3 +97,35 @@ def _learning(
             yield LiveSetUp(recording=recording, tracker=LearningTracker(place, settings, learner), save_map=save)
         finally:
             learner.close()
+
+
+def run_live(
+    opened: LiveSetUp, source: Source, outputs: Sequence[tuple[Output, str]], page: LivePage | None, tell: Tell
+) -> Monitor:
+    """Track the frames of a source until it ends, or Ctrl-C, and return what was counted. `outputs`: with what each
+    takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines.
+    """
+    recording, tracker = opened.recording, opened.tracker
+    views, number = tracker.appearance.fitter.views, tracker.number
+    table, json_lines = FicTracLines(views[0].camera), JsonLines(recording.experiment.fixed)
+    gc.collect()
+    gc.freeze()  # what is here stays: no pause looks through it
+    sys.setswitchinterval(SWITCH_S)
+    feed = Feed(source.frames(recording), WAITING, wait=source.waits, tell=tell)
+    monitor = Monitor(feed, tell)
+    if page is not None:
+        page.views, page.radius_mm, page.save_map = views, recording.experiment.radius_mm, opened.save_map
+        page.monitor = monitor  # last: now it has begun
+    try:
+        with suppress(KeyboardInterrupt):
+            for now in measured(tracker, views, monitor):
+                told = Told(now, table, json_lines)
+                for output, form in outputs:
+                    output.send(getattr(told, form))
+                monitor.saw(now, None if page is None else told.columns)
+                if number == 0 < now.map_number:
+                    number = now.map_number
+                    tell(f"frame {now.number}: orientations are by the map from here on")
+    finally:
+        feed.close()
+    return monitor

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from sphereorient.bench.scenes import BenchSettings
 from sphereorient.errors import BenchError, refusal
-from sphereorient.evaluate.robustness.scenes import BenchSettings
 from sphereorient.files.whole_file import write_text
 
 SCHEMA = "sphereorient-robustness/1"

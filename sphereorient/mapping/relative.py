@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,7 +20,18 @@ from sphereorient.trajectory import Reason
 NEAREST = 3  # keyframes that a picture is compared with, beside the one before
 KEYFRAMES = 200  # at most: a ball has shown its sides by then
 ROUNDS = 2  # of the mean of rotations
-ONE = torch.zeros(1, dtype=torch.int64)
+STILL = torch.zeros(3, dtype=torch.float64)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Before:
+    """The frame with which the next one is compared."""
+
+    time_s: float
+    shots: Sequence[Frame]
+    disks: Disks | None  # None: not needed yet
+    R_lab_body: Tensor  # (3, 3)
+    rate: Tensor = STILL  # (3,), rad/s, lab; zero where it is not known
 
 
 class RelativeTracker:
@@ -33,10 +44,7 @@ class RelativeTracker:
     def __init__(self, place: Crops, settings: MapSettings) -> None:
         self._place, self._settings = place, settings
         self._keys: list[tuple[Disks, Tensor]] = []  # with R_lab_body (3, 3)
-        self._last: tuple[Disks, Tensor] | None = None
-        self._last_s = 0.0
-        self._known: tuple[float, Sequence[Frame], Tensor] | None = None  # instead of the last one
-        self._rate = torch.zeros(3, dtype=torch.float64)  # rad/s, lab
+        self._before: _Before | None = None
 
     def forget(self) -> None:
         """Forget the keyframes: their orientations have drifted from what is known now."""
@@ -44,9 +52,8 @@ class RelativeTracker:
 
     def know(self, time_s: float, shots: Sequence[Frame], R_lab_body: Tensor) -> None:
         """Go on from a frame whose orientation (3, 3) is known by a map."""
-        self._known = time_s, shots, R_lab_body
-        if self._is_far(R_lab_body):
-            self._keys.append((self._disks(shots), R_lab_body))
+        disks = self._disks(shots) if self._is_far(R_lab_body) else None
+        self._go_on(_Before(time_s=time_s, shots=shots, disks=disks, R_lab_body=R_lab_body))
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the pose of the frame of a time, and whether it was searched for; no pose where nothing agrees."""
@@ -54,32 +61,31 @@ class RelativeTracker:
         use = torch.tensor([shot.usable for shot in shots])
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
-        if self._known is not None:
-            self._last_s, before, R_before = self._known
-            self._last, self._known = (self._disks(before), R_before), None
-            self._rate = torch.zeros_like(self._rate)
-        now = self._disks(shots)
-        searched, R = True, torch.eye(3, dtype=torch.float64)
-        if self._last is not None:
-            step_s = time_s - self._last_s
-            found, searched = self._compared(now, so3.exp(max(step_s, 0.0) * self._rate) @ self._last[1])
+        now, before = self._disks(shots), self._before
+        searched, R, rate = True, torch.eye(3, dtype=torch.float64), STILL
+        if before is not None:
+            step_s, last = time_s - before.time_s, before.R_lab_body
+            disks = self._disks(before.shots) if before.disks is None else before.disks
+            found, searched = self._compared(now, (disks, last), so3.exp(max(step_s, 0.0) * before.rate) @ last)
             if found is None:
                 return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason]), True
             R = found
-            known = step_s > 0 and not searched
-            self._rate = so3.log(R @ self._last[1].mT) / step_s if known else torch.zeros_like(self._rate)
-        self._last, self._last_s = (now, R), time_s
-        if self._is_far(R):
-            self._keys.append((now, R))
+            rate = so3.log(R @ last.mT) / step_s if step_s > 0 and not searched else STILL
+        self._go_on(_Before(time_s=time_s, shots=shots, disks=now, R_lab_body=R, rate=rate))
         parts = blank_parts(len(shots), 1)
         parts |= {"R_lab_body": R[None], "position_lab_mm": self._place.position_lab_mm[:1]}
         parts["covariance"][..., :3, :3] = SCALE_RAD**2 / 3 * torch.eye(3)
         return Poses(**parts, use=use, reason=tuple(reason)), searched
 
-    def _compared(self, now: Disks, expected: Tensor) -> tuple[Tensor | None, bool]:
+    def _go_on(self, now: _Before) -> None:
+        """Compare the next frame with this one, and later ones too if it is far from all keyframes."""
+        self._before = now
+        if now.disks is not None and self._is_far(now.R_lab_body):
+            self._keys.append((now.disks, now.R_lab_body))
+
+    def _compared(self, now: Disks, last: tuple[Disks, Tensor], expected: Tensor) -> tuple[Tensor | None, bool]:
         """Return the orientation (3, 3) near the one expected, or else near that of the frame before; and which."""
-        assert self._last is not None
-        members = [*self._nearest(now, expected), self._last]
+        members = [*self._nearest(now, expected), last]
         disks, R = Disks.joined([*(one for one, _ in members), now]), torch.stack([R for _, R in members])
         first, second = torch.arange(len(R)), torch.full((len(R),), len(R))
         pairs = self._good(refine_pairs(disks, first, second, expected @ R.mT, ITERATIONS, EVERY))
@@ -118,11 +124,7 @@ class RelativeTracker:
         return len(self._keys) < KEYFRAMES and not bool((near < math.radians(self._settings.keyframe_deg)).any())
 
     def _disks(self, shots: Sequence[Frame]) -> Disks:
-        return disks_of(crops_of(self._place, shots), ONE, self._settings)
-
-
-def crops_of(place: Crops, shots: Sequence[Frame]) -> Crops:
-    """Return the record of one frame of a ball in a known place."""
-    crops = [[Crop(grey=shot.picture, top=0, left=0)] for shot in shots]
-    seen = torch.tensor([[shot.usable for shot in shots]])
-    return replace(place, crops=crops, seen=seen)
+        """Return the disks of one frame of the ball in its place."""
+        crops = [[Crop(grey=shot.picture, top=0, left=0)] for shot in shots]
+        seen = torch.tensor([[shot.usable for shot in shots]])
+        return disks_of(replace(self._place, crops=crops, seen=seen), torch.tensor([0]), self._settings)

@@ -1,6 +1,6 @@
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Self
@@ -19,6 +19,7 @@ CLEAN, TOGETHER = "clean", "together"
 SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of an only ball's volume: small, for speed
 VELOCITY_S = 0.12  # correlation time of the velocity
 MM3_PER_LITRE = 1e6
+OF_MOVIES = {"frames", "cameras", "balls", "paints", "volume_mm", "velocity_time"}  # settings that `synth` has too
 MIXED_SEED = 20110  # of the random combinations
 
 
@@ -72,12 +73,7 @@ class BenchmarkScene:
     seed: int
     number: int  # among those of the same kind, level and seed
     degradations: Mapping[str, int]  # level by name
-    frames: int
-    cameras: int = 2
-    balls: int = 1
-    paints: int = 8
-    volume_mm: float = VOLUME_MM
-    velocity_time: float = VELOCITY_S
+    plan: BenchSettings = field(default_factory=BenchSettings)
 
     @property
     def name(self) -> str:
@@ -87,35 +83,14 @@ class BenchmarkScene:
     @property
     def base(self) -> SynthSettings:
         """Settings of the movie, before the degradations."""
-        return SynthSettings(
-            name=self.name,
-            frames=self.frames,
-            cameras=self.cameras,
-            balls=self.balls,
-            paints=self.paints,
-            image_size=(SIDE_PX, SIDE_PX),
-            volume_mm=self.volume_mm,
-            velocity_time=self.velocity_time,
-            seed=self.seed,
-        )
+        own = self.plan.model_dump(include=OF_MOVIES)
+        return SynthSettings(name=self.name, image_size=(SIDE_PX, SIDE_PX), seed=self.seed, **own)
 
 
 def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
     """Return all scenes, clean ones first; the same settings give the same scenes."""
     return [
-        BenchmarkScene(
-            kind=kind,
-            level=level,
-            seed=seed,
-            number=number,
-            degradations=mixed,
-            frames=settings.frames,
-            cameras=settings.cameras,
-            balls=settings.balls,
-            paints=settings.paints,
-            volume_mm=settings.volume_mm,
-            velocity_time=settings.velocity_time,
-        )
+        BenchmarkScene(kind=kind, level=level, seed=seed, number=number, degradations=mixed, plan=settings)
         for seed in settings.seeds
         for kind, level, number, mixed in _of_seed(settings, seed)
     ]

@@ -18,23 +18,23 @@ import torch
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
-from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
-from sphereorient.evaluate.score import (
-    distance_deg,
+from sphereorient.bench.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
+from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
+from sphereorient.bench.score import (
     given_to_others,
     hidden_shares,
     named_as_true,
     score_track,
     true_orientations,
 )
+from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.experiment import load_experiment
 from sphereorient.files.cache import FOLDER
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
+from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
@@ -173,15 +173,16 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
         tracks = Tracks.of(tracker(experiment))
     except SphereOrientError as error:
         seconds = time.perf_counter() - begin
-        measured = dict.fromkeys(balls, no_track(scene.frames, " ".join(str(error).split())))
+        measured = dict.fromkeys(balls, no_track(scene.plan.frames, " ".join(str(error).split())))
     else:
         seconds = time.perf_counter() - begin
-        for paint in set(balls.values()) if len(balls) > 1 else ():
+        for paint in set(balls.values()):
             tracks = named_as_true(tracks, truth_path, [name for name in balls if balls[name] == paint])
-        measured = {name: measure(tracks[name], truth_path) for name in balls}
-        if len(balls) > 1:
-            for name, (given, exchanges) in given_to_others(tracks, truth_path).items():
-                measured[name] |= {"given": given, "exchanges": exchanges}
+        others = given_to_others(tracks, truth_path)
+        measured = {
+            name: measure(tracks[name], truth_path) | dict(zip(("given", "exchanges"), others[name], strict=True))
+            for name in balls
+        }
     hidden = dict.fromkeys(balls, np.zeros(1))
     if len(balls) > 1:
         radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)

@@ -12,17 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 
-import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from sphereorient import so3
+from sphereorient.bench.score import orientations_at
 from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.experiment.recording import Progress, open_recording, silent
-from sphereorient.live.feed import movie_frames
-from sphereorient.live.outputs import HOST
+from sphereorient.files.page_server import HOST
 from sphereorient.live.shared import SharedFrames
+from sphereorient.live.sources import movie_frames
+from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.trajectory.walk import FICTRAC
 
 BEGIN_S = 120.0  # until the tracker's first line
@@ -40,15 +41,41 @@ while os.getppid() == int(sys.argv[1]):
 """
 
 
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveTiming:
+    """How long and at which rate pictures are written, and what `live` is told."""
+
+    experiment: Path
+    rate_hz: float
+    seconds: float
+    options: Sequence[str] = ()
+    cameras: Sequence[str] | None = None
+    loop: bool = False  # the movie is shown from its begin again: it has no seam; else there and back again
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that count."""
+        return round(self.seconds * self.rate_hz)
+
+    def command(self, ring: Path, port: int) -> list[str]:
+        """Return the command that tracks the pictures of a ring and sends lines to a port."""
+        words = ["live", str(self.experiment), "--source", f"shared:{ring}", "--to", f"udp:{port}", "-q"]
+        named = [] if self.cameras is None else ["--cameras", ",".join(self.cameras)]
+        return [sys.executable, "-m", "sphereorient.cli", *words, *named, *self.options]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delays:
     """What came of the frames that were written."""
 
     written: int
-    delay_s: NDArray[np.float64]  # (n,), of the lines that came, in order
+    delay_s: Floats  # (n,), of the lines that came, in order
     lost: int  # of these, lines without a pose
-    error_deg: NDArray[np.float64]  # (n,), of the rotation since the stretch began; NaN without pose or truth
-    memory_mb: NDArray[np.float64]  # of the tracker, every so often; empty where the system does not tell
+    error_deg: Floats  # (n,), of the rotation since the stretch began; NaN without pose or truth
+    memory_mb: Floats  # of the tracker, every so often; empty where the system does not tell
 
     def delays_ms(self) -> list[str]:
         """Return the delays that half of the lines keep, 99 and 99.9 % of them, ms, in words."""
@@ -96,81 +123,77 @@ def neighbours(count: int) -> Iterator[None]:
             one.wait()
 
 
-def delays(
-    experiment: Path,
-    rate_hz: float,
-    seconds: float,
-    options: Sequence[str] = (),
-    cameras: Sequence[str] | None = None,
-    progress: Progress = silent,
-    *,
-    loop: bool = False,
-) -> Delays:
-    """Write an experiment's pictures into memory at a rate, and time the lines of `live`. The movie is shown there and
-    back again, or with `loop` from its begin again: then it has no seam. A truth.h5 beside it tells the errors.
+class _Writer(Thread):
+    """Writes pictures into a ring at a rate, again and again, until the time is over since the first line came."""
+
+    def __init__(self, ring: SharedFrames, pictures: Sequence[Sequence[NDArray[np.generic]]], timing: LiveTiming):
+        super().__init__(daemon=True)
+        self.written_s: list[float] = []  # by the clock of time.perf_counter
+        self.begun, self.ended = Event(), Event()
+        self._ring, self._pictures, self._rate_hz = ring, pictures, timing.rate_hz
+        self._count = FIRST + timing.frames
+
+    def run(self) -> None:
+        first_s, number, left = time.perf_counter(), 0, self._count
+        while left > 0 and not self.ended.is_set():
+            self.written_s.append(time.perf_counter())
+            # The time as a camera's clock tells it; this program may be late.
+            self._ring.write(first_s + number / self._rate_hz, self._pictures[number % len(self._pictures)])
+            number, left = number + 1, left - self.begun.is_set()
+            time.sleep(max(0.0, first_s + number / self._rate_hz - time.perf_counter()))
+
+
+def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
+    """Write an experiment's pictures into memory at a rate, and time the lines of `live`. A truth.h5 beside it tells
+    the errors.
 
     Raises:
         SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
     """
-    with open_recording(experiment, cameras) as recording:
-        pictures = [one.pictures for one in movie_frames(recording, paced=False)]
+    with open_recording(timing.experiment, timing.cameras) as recording:
+        pictures = [[part for part in one.pictures if part is not None] for one in movie_frames(recording, paced=False)]
         R_cam_lab = recording.streams[0].camera.R_cam_lab.numpy()
-    size = sum(picture.nbytes for picture in pictures[0] if picture is not None)
-    order = [*range(len(pictures)), *(() if loop else range(len(pictures) - 2, 0, -1))]
-    memory: list[float] = []
-    written_s: list[float] = []
+    order = [*range(len(pictures)), *(() if timing.loop else range(len(pictures) - 2, 0, -1))]
+    memory_mb: list[float] = []
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lines:
         lines.bind((HOST, 0))
         lines.settimeout(QUIET_S)
-        path, ended, begun = Path(folder) / "ring", Event(), Event()
-        words = ["live", str(experiment), "--source", f"shared:{path}", "--to", f"udp:{lines.getsockname()[1]}", "-q"]
-        named = [word for name in cameras or () for word in ("--cameras", name)]
-
-        def write(ring: SharedFrames) -> None:
-            first_s, number, left = time.perf_counter(), 0, FIRST + round(seconds * rate_hz)
-            while left > 0 and not ended.is_set():
-                row = pictures[order[number % len(order)]]
-                written_s.append(time.perf_counter())
-                # The time as a camera's clock tells it; this program may be late.
-                ring.write(first_s + number / rate_hz, [part for part in row if part is not None])
-                number, left = number + 1, left - begun.is_set()
-                time.sleep(max(0.0, first_s + number / rate_hz - time.perf_counter()))
-
-        with SharedFrames(path, size) as ring:
-            command = [sys.executable, "-m", "sphereorient.cli", *words, *named, *options]
+        path = Path(folder) / "ring"
+        with SharedFrames(path, sum(picture.nbytes for picture in pictures[0])) as ring:
+            command = timing.command(path, lines.getsockname()[1])
             tracker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-            writer = Thread(target=write, args=(ring,), daemon=True)
+            writer = _Writer(ring, [pictures[k] for k in order], timing)
             writer.start()
 
             def saw(count: int) -> None:
+                writer.begun.set()
                 if count % EVERY == 0:
-                    memory.extend(_memory_mb(tracker.pid))
-                progress("live", count, round(seconds * rate_hz))
+                    memory_mb.extend(_memory_mb(tracker.pid))
+                progress("live", count, timing.frames)
 
             try:
-                found = _received(lines, tracker, begun, saw)
+                table = _received(lines, tracker, saw)
             finally:
-                ended.set()
+                writer.ended.set()
                 writer.join()
-        if tracker.wait(BEGIN_S) and not len(found):
+        if tracker.wait(BEGIN_S) and not len(table):
             said = (tracker.stderr.read() if tracker.stderr else "").strip().splitlines()
             got = said[-1] if said else f"status {tracker.returncode}"
             raise SphereOrientError(refusal("live", expected="a line a frame", got=got, do="correct that"))
-    number, came_s, *_ = table = np.array(found).reshape(-1, 6)[FIRST:].T
+    error_deg = _errors_deg(table, order, R_cam_lab, timing.experiment.parent / "truth.h5")[FIRST:]
+    number, came_s, *_ = table = table[FIRST:].T
     return Delays(
         written=int(number[-1] - number[0]) + 1 if len(number) else 0,
-        delay_s=came_s - np.array(written_s)[number.astype(int) - 1],
+        delay_s=came_s - np.array(writer.written_s)[number.astype(int) - 1],
         lost=int(np.isnan(table[2]).sum()),
-        error_deg=_errors_deg(np.array(found).reshape(-1, 6), order, R_cam_lab, experiment.parent / "truth.h5")[FIRST:],
-        memory_mb=np.array(memory),
+        error_deg=error_deg,
+        memory_mb=np.array(memory_mb),
     )
 
 
-def _received(
-    lines: socket.socket, tracker: "subprocess.Popen[str]", begun: Event, saw: Callable[[int], None]
-) -> list[tuple[float, ...]]:
+def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Callable[[int], None]) -> Floats:
     """Return of each line, until none comes: number, time (s), rotation since the stretch began (3), rad, in the
-    camera's axes, and place in the stretch.
+    camera's axes, and place in the stretch; (n, 6).
     """
     found: list[tuple[float, ...]] = []
     begin = time.monotonic()
@@ -179,30 +202,22 @@ def _received(
             parts = lines.recv(4096).decode().split(", ")
         except TimeoutError:
             if found or tracker.poll() is not None or time.monotonic() - begin > BEGIN_S:
-                return found
+                return np.array(found).reshape(-1, 6)
             continue
         now = time.perf_counter()
-        begun.set()
         row = list(map(float, parts[1:]))  # behind "FT"
         found.append((row[0], now, *row[FICTRAC["rotation_cam"]], *row[FICTRAC["sequence"]]))
         saw(len(found))
 
 
-def _errors_deg(
-    table: NDArray[np.float64], order: Sequence[int], R_cam_lab: NDArray[np.float64], truth: Path
-) -> NDArray[np.float64]:
+def _errors_deg(table: Floats, order: Sequence[int], R_cam_lab: Floats, truth: Path) -> Floats:
     """Return the error of the rotation since the stretch began, (n,), degrees; NaN where it is not known."""
     if not truth.is_file() or not len(table):
         return np.full(len(table), np.nan)
-    with h5py.File(truth, "r") as file:
-        R = np.asarray(file["orientation"][()])
-    row = np.array(order)[(table[:, 0].astype(int) - 1) % len(order)]
+    R = orientations_at(truth, np.array(order)[(table[:, 0].astype(int) - 1) % len(order)])
     begins = np.maximum.accumulate(np.where(table[:, 5] == 1, np.arange(len(table)), 0))
-    true = torch.from_numpy(R_cam_lab @ R[row] @ R[row[begins]].transpose(0, 2, 1) @ R_cam_lab.T)
-    error: NDArray[np.float64] = np.degrees(
-        so3.geodesic_distance(so3.exp(torch.from_numpy(table[:, 2:5])), true).numpy()
-    )
-    return error
+    true = R_cam_lab @ R @ R[begins].transpose(0, 2, 1) @ R_cam_lab.T
+    return distance_deg(so3.exp(torch.from_numpy(table[:, 2:5])).numpy(), true)
 
 
 def _memory_mb(process: int) -> list[float]:

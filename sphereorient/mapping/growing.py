@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import torch
 from torch import Tensor
@@ -37,18 +38,18 @@ from sphereorient.sphere.texture_table import texture_table
 MOST_PIXELS = 1200  # of a disk
 MOST_FITTED = 48  # frames of an iteration, evenly spread
 FIRST = 2  # iterations before the first map
-MORE = 2.0  # times the frames of an iteration from which another one is due
-SIZED = 2  # times that the distance of the ball is sought
+MORE = 2.0  # another iteration is due at so many times the frames of the last one
+SIZED = 2  # iterations that estimate the distance of the ball
 COARSER = 2 / 3  # rows of the map over those of a whole movie's: an iteration must not take long
-FIRST_FRAMES, FIRST_TURN = 24, math.radians(40.0)  # from which a map is begun
-HELD_ITERATIONS = 2  # in which the place stays as the outline gave it
-BLUR_ITERATIONS = 5  # in which the blur is estimated: a place found with a wrong one is off
+FIRST_FRAMES, FIRST_TURN = 24, math.radians(40.0)  # of the first iteration, at least
+HELD_ITERATIONS = 2  # in which the position stays that of the outline
+BLUR_ITERATIONS = 5  # in which the blur is estimated: a wrong blur shifts the position
 SIZE_STEP = 0.01  # of the distances that are tried
 LATER = 4  # number, as `iterate` counts, of the later iterations: smoothness has settled
-TRIED = 6  # number, as `iterate` counts, of iterations that try a size: light and poses anew
-MOST_LEFT = 20.0  # grey levels: what an occluder leaves counts no more
-RECENT = 6  # frames by which the body frame of those that come is known
-FITTED = 3  # iterations of such frames
+TRIED = 6  # number, as `iterate` counts, of iterations that try a distance: light and poses anew
+MOST_LEFT = 20.0  # grey levels at which residuals are cut off: occluders
+RECENT = 6  # frames that give the rotation from the orientations handed over to those of the map
+FITTED = 3  # iterations of a fit to the map
 MOST_NEW = 12  # frames by which the map is extended at once, evenly spread
 TABLE_SIDE = 256  # cells of the table of the paint: 0.8 degrees, below a texel
 UNSEEN_SIDE = 128  # cells of the table of what is unseen: 1.6 degrees
@@ -61,13 +62,29 @@ class LiveMap:
     """All that following the ball with a map needs; made by `GrowingMap`."""
 
     number: int  # 1, 2 .. of the maps of one run
+    iterations: int  # before it
     appearance: Appearance
     centre: FixedCentre
     search: GreySearch | None  # with its bank made; None: there was no time for it yet
-    R_map_body: Tensor  # (3, 3): the body frame of the orientations handed over is that of the map times this
-    R_recent_map: Tensor  # (3, 3): likewise its inverse, by the last frames: orientations without a map drift
+    R_map_body: Tensor  # (3, 3), from the body frame of the orientations handed over to that of the map
+    R_recent_map: Tensor  # (3, 3), its inverse by the last frames: orientations without a map drift
     seen_share: float  # of the sphere
     trusted: bool  # whether it explains pictures clearly better at right orientations than at wrong ones
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Learnt:
+    """The result of the last iteration, extended by later frames."""
+
+    state: State
+    iterations: int
+    fitted: int  # frames that had come before the last iteration
+    shown: int  # frames that had come before it was extended
+    moved_rad: float  # by the last iteration
+    tie: float  # of the last iteration's map, see `State`
+    rows: Tensor  # (n,), frames that were fitted to the map
+    R_lab_map: Tensor  # (n, 3, 3), their orientations
+    R_map_body: Tensor  # (3, 3), see `LiveMap`
 
 
 class GrowingMap:
@@ -78,34 +95,32 @@ class GrowingMap:
 
     def __init__(self, place: Crops, settings: MapSettings) -> None:
         rows = round(COARSER * map_height(place.views, settings) / ROW) * ROW
-        height, pixels = settings.height or max(ROW, rows), min(settings.pixels, MOST_PIXELS)
-        self._settings = settings.model_copy(update={"height": height, "pixels": pixels})
+        self._height = settings.height or max(ROW, rows)
+        pixels = min(settings.pixels, MOST_PIXELS)
+        self._settings = settings.model_copy(update={"height": self._height, "pixels": pixels})
         self._place, self._crops = place, replace(place, position_lab_mm=place.position_lab_mm[:0])
         self._R = torch.zeros(0, 3, 3, dtype=torch.float64)  # R_lab_body as handed over
-        self._pixels: list[Pixels] = []
-        self._state: State | None = None
-        self._R_map_body = torch.eye(3, dtype=torch.float64)
-        self._rows = torch.zeros(0, dtype=torch.int64)  # of the frames that were fitted to the map
-        self._R_lab_map = self._R  # their orientations
-        self._shown = 0  # frames that are in the map
-        self._tie = 0.0  # of the last iteration's map, as the state's
+        self._pixels: list[Pixels] = []  # of the frames, as far as they were needed
+        self._learnt: _Learnt | None = None
         self._found: LiveMap | None = None  # the last one
-        self._number = 0
-        self._iterated, self._sized, self._trusted = 0, 0, False
         self._iterating: Iterator[None] | None = None  # in progress
-        self._judged = 0  # iterations before the last map that was judged
-        self.done = 0  # iterations
-        self.moved_rad = math.inf  # by the last iteration; infinite where frames came since
+        self._sized = 0  # iterations that estimated the distance
 
     @property
-    def arrived(self) -> bool:
-        """Whether all frames are in the map, and the last iteration moved them by less than the setting."""
-        return self.moved_rad < math.radians(self._settings.arrived_deg)
+    def done(self) -> int:
+        """Number of iterations."""
+        return 0 if self._learnt is None else self._learnt.iterations
 
     @property
     def whole(self) -> bool:
         """Whether no frame came since the last iteration."""
-        return math.isfinite(self.moved_rad)
+        return self._learnt is not None and self._learnt.fitted == len(self)
+
+    @property
+    def arrived(self) -> bool:
+        """Whether all frames are in the map, and the last iteration moved them by less than the setting."""
+        limit_rad = math.radians(self._settings.arrived_deg)
+        return self._learnt is not None and self.whole and self._learnt.moved_rad < limit_rad
 
     def __len__(self) -> int:
         return len(self._R)
@@ -120,107 +135,102 @@ class GrowingMap:
             seen=torch.ones(len(self) + 1, len(crops), dtype=torch.bool),
         )
         self._R = torch.cat([self._R, R_lab_body[None]])
-        self.moved_rad = math.inf
 
     def ready(self) -> bool:
         """Whether the frames are enough for a map."""
         return len(self) >= FIRST_FRAMES and bool((so3.geodesic_distance(self._R, self._R[0]) > FIRST_TURN).any())
 
     def grown(self, *, idle: bool) -> LiveMap | None:
-        """Return the map with all frames, None: not yet, or nothing has changed. While frames come, each call extends
-        the map by them; once they are twice as many as in the last iteration, it does a part of another one as well.
-        `idle`: there is time for a whole one.
+        """Return the map with all frames; None: not yet, or nothing has changed. While frames come, each call extends
+        the map by them, and does a part of another iteration once there are twice as many frames as in the last one.
+        `idle`: there is time for a whole iteration.
         """
-        due = idle or not self._trusted or len(self) >= MORE * self._iterated
+        learnt, done = self._learnt, self.done
+        trusted = self._found is not None and self._found.trusted
+        due = idle or not trusted or learnt is None or len(self) >= MORE * learnt.fitted
         if self._iterating is None and self.ready() and not self.arrived and due:
-            size = idle and self.done >= FIRST and self._sized < SIZED
+            size = idle and done >= FIRST and self._sized < SIZED
             self._sized += size
-            self._iterating = self.iterating(size=size)
-        done = self.done
-        if self._iterating is not None and (idle or not self._trusted):
-            self.finish()
-        elif self._iterating is not None:
-            next(self._iterating, None)
-        if self.done > done:
-            self._iterating = None
-        if self._trusted and self._shown < len(self):
-            self.extend()
+            self._iterating = self._iteration(size=size)
+        for _ in islice(self._iterating or (), None if idle or not trusted else 1):
+            pass
+        learnt = self._learnt
+        if learnt is not None and trusted and learnt.shown < len(self):
+            self._extend(learnt)
         elif self.done == done:
             return None
-        if self.done < FIRST:
-            return None
-        found = self.live_map(searched=idle)
-        self._trusted = found.trusted
-        return found if found.trusted else None
-
-    def finish(self) -> None:
-        """Finish the iteration that is in progress."""
-        for _ in self._iterating or ():
-            pass
-        self._iterating = None
+        found = None if self.done < FIRST else self.live_map(searched=idle)
+        return found if found is not None and found.trusted else None
 
     def iterate(self, *, size: bool = False) -> None:
         """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
         three times as long.
         """
-        self._iterating = self.iterating(size=size)
-        self.finish()
+        for _ in self._iteration(size=size):
+            pass
 
-    def iterating(self, *, size: bool) -> Iterator[None]:
+    def _iteration(self, *, size: bool) -> Iterator[None]:
         """Do what `iterate` does, with pauses in which frames may come and extend the map so far."""
         state, k, count = self._with_all_frames(), self.done, len(self)
-        before = state.R_lab_body
+        before, settings = state.R_lab_body, self._settings
+        if k >= BLUR_ITERATIONS:
+            settings = settings.model_copy(update={"blur_px": state.blur_px})
         if size and state.use.shape[1] == 1:
-            state = _better_size(state, self._settings_of(state))
-        after, iteration = yield from iterating(state, self._settings_of(state), SEPARATE_ITERATIONS + min(k, LATER))
+            state = _better_size(state, settings)
+        after, iteration = yield from iterating(state, settings, SEPARATE_ITERATIONS + min(k, LATER))
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
-        self._state, self._tie, self.done = after, after.tie, k + 1
-        self._shown = self._iterated = count
-        self.moved_rad = iteration.moved_rad if len(self) == count else math.inf
-        self._rows, self._R_lab_map = after.frames, after.R_lab_body
-        # The body frame goes on: an iteration moves that of the map.
-        self._R_map_body = so3.nearest_rotation((after.R_lab_body.mT @ before @ self._R_map_body).mean(0))
+        R_map_body = torch.eye(3, dtype=torch.float64) if self._learnt is None else self._learnt.R_map_body
+        self._learnt = _Learnt(
+            state=after,
+            iterations=k + 1,
+            fitted=count,
+            shown=count,
+            moved_rad=iteration.moved_rad,
+            tie=after.tie,
+            rows=after.frames,
+            R_lab_map=after.R_lab_body,
+            # The body frame handed over stays: an iteration moves that of the map.
+            R_map_body=so3.nearest_rotation((after.R_lab_body.mT @ before @ R_map_body).mean(0)),
+        )
+        self._iterating = None
 
-    def extend(self) -> None:
-        """Let the map show what the frames since then show, fitted to what it shows already."""
-        assert self._state is not None
+    def _extend(self, learnt: _Learnt) -> None:
+        """Extend the map by the frames since then, whose poses are fitted to it."""
         assert self._found is not None
-        rows, self._shown = evenly_spread(torch.arange(self._shown, len(self)), MOST_NEW), len(self)
-        if len(rows):
-            fitter, level = self._found.appearance.fitter, self._found.appearance.fitter.optics.fine
-            new = self._of(rows, self._R_aligned(rows), self._state)
-            held = self._found.centre.precision.expand(len(rows), 3, 3)
-            fit = fitter.fit(new.pixels, new.position_lab_mm, new.R_lab_body, new.use, level, FITTED, held)
-            good = ((fit.score > self._found.appearance.score_min) | ~new.use).all(1)
-            self._rows = torch.cat([self._rows, rows[good]])
-            self._R_lab_map = torch.cat([self._R_lab_map, fit.R_lab_body[good]])
-            R = torch.where(good[:, None, None], fit.R_lab_body, self._R_aligned(rows))
-            self._state = extended(self._state, replace(new, R_lab_body=R), self._tie, level.paint.unseen)
-
-    def _settings_of(self, state: State) -> MapSettings:
-        blur_px = self._settings.blur_px if self.done < BLUR_ITERATIONS else state.blur_px
-        return self._settings.model_copy(update={"blur_px": blur_px})
+        appearance = self._found.appearance
+        rows = evenly_spread(torch.arange(learnt.shown, len(self)), MOST_NEW)
+        fitter, level, R_aligned = appearance.fitter, appearance.fitter.optics.fine, self._R_aligned(learnt)[rows]
+        new = self._of(rows, R_aligned, learnt.state)
+        held = self._found.centre.precision.expand(len(rows), 3, 3)
+        fit = fitter.fit(new.pixels, new.position_lab_mm, R_aligned, new.use, level, FITTED, held)
+        good = ((fit.score > appearance.score_min) | ~new.use).all(1)
+        new = replace(new, R_lab_body=torch.where(good[:, None, None], fit.R_lab_body, R_aligned))
+        self._learnt = replace(
+            learnt,
+            state=extended(learnt.state, new, learnt.tie, level.paint.unseen),
+            shown=len(self),
+            rows=torch.cat([learnt.rows, rows[good]]),
+            R_lab_map=torch.cat([learnt.R_lab_map, fit.R_lab_body[good]]),
+        )
 
     def _with_all_frames(self) -> State:
-        rows, before = evenly_spread(torch.arange(len(self)), MOST_FITTED), self._state
-        if before is None:
+        rows, learnt = evenly_spread(torch.arange(len(self)), MOST_FITTED), self._learnt
+        if learnt is None:
             disks = disks_of(self._crops, rows, self._settings)
-            assert self._settings.height is not None
-            first = first_map(disks, self._R[rows], self._settings.height)
+            first = first_map(disks, self._R[rows], self._height)
             state = first_state(self._crops, rows, self._R[rows], first, self._settings)
             return self._of(rows, self._R[rows], state)
-        R = interpolated(self._R_aligned(torch.arange(len(self))), self._rows, self._R_lab_map)
-        return self._of(rows, R[rows], before)
+        R = interpolated(self._R_aligned(learnt), learnt.rows, learnt.R_lab_map)
+        return self._of(rows, R[rows], learnt.state)
 
-    def _R_aligned(self, rows: Tensor) -> Tensor:
-        """Return R_lab_body (n, 3, 3) as handed over, in the body frame of the map by the last frames fitted to it."""
-        return self._R[rows] @ self._R_recent_map
+    def _R_aligned(self, learnt: _Learnt) -> Tensor:
+        """Return all R_lab_body (n, 3, 3) as handed over, in the body frame of the map."""
+        return self._R @ self._R_recent_map(learnt)
 
-    @property
-    def _R_recent_map(self) -> Tensor:
-        last = self._rows[-RECENT:]
-        return so3.nearest_rotation((self._R[last].mT @ self._R_lab_map[-RECENT:]).mean(0))
+    def _R_recent_map(self, learnt: _Learnt) -> Tensor:
+        last = learnt.rows[-RECENT:]
+        return so3.nearest_rotation((self._R[last].mT @ learnt.R_lab_map[-RECENT:]).mean(0))
 
     def _of(self, rows: Tensor, R_lab_map: Tensor, state: State) -> State:
         """Return a state of some frames, by number, at their orientations."""
@@ -239,25 +249,28 @@ class GrowingMap:
         """Return what following the ball with the present map needs; `searched`: with a search of it, else with the
         one before. A map that was only extended is trusted as that of the last iteration.
         """
-        assert self._state is not None
-        unseen = _unseen(self._state)
-        optics = _optics(self._state, unseen)
-        areas = texel_areas(len(unseen))
-        self._number += 1
-        if self._found is None or self._judged < self.done:
-            search = None if self._found is None else self._found.search
-            self._found, self._judged = replace(_judged(self._state, optics), search=search), self.done
+        learnt, found = self._learnt, self._found
+        assert learnt is not None
+        optics, seen_share = _optics(learnt.state)
+        search = None if found is None else found.search
+        if found is None or found.iterations < learnt.iterations:
+            appearance, centre, trusted = _judged(learnt.state, optics)
             if searched:
-                self._found = replace(self._found, search=_search(self._state))
-        appearance = self._found.appearance
+                search = GreySearch(learnt.state.texture.clamp(0, 1))
+                search.prepare()
+        else:
+            appearance, centre, trusted = found.appearance, found.centre, found.trusted
         fitter = replace(appearance.fitter, optics=optics)
-        self._found = replace(
-            self._found,
-            number=self._number,
+        self._found = LiveMap(
+            number=1 if found is None else found.number + 1,
+            iterations=learnt.iterations,
             appearance=replace(appearance, fitter=fitter, still=fitter),
-            R_map_body=self._R_map_body,
-            R_recent_map=self._R_recent_map,
-            seen_share=float((areas * ~unseen).sum() / areas.sum()),
+            centre=centre,
+            search=search,
+            R_map_body=learnt.R_map_body,
+            R_recent_map=self._R_recent_map(learnt),
+            seen_share=seen_share,
+            trusted=trusted,
         )
         return self._found
 
@@ -265,8 +278,8 @@ class GrowingMap:
         """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H) each, in the
         body frame of the orientations handed over.
         """
-        assert self._state is not None
-        texture, seen, _ = final_map(self._state, self._R_map_body.mT)
+        assert self._learnt is not None
+        texture, seen, _ = final_map(self._learnt.state, self._learnt.R_map_body.mT)
         return texture, seen
 
 
@@ -298,24 +311,23 @@ def _left(state: State) -> float:
     return float((torch.cat(squares) * torch.cat(seen)).sum() / torch.cat(seen).sum())
 
 
-def _unseen(state: State) -> Tensor:
-    """Return which texels no picture shows well, (H, 2 H) bool."""
+def _optics(state: State) -> tuple[Optics, float]:
+    """Return the optics of the map, whose texels that no picture shows well are unseen, and the share of the others."""
     assert state.weight is not None
-    return state.weight < LEAST_WEIGHT * state.weight[state.weight > 0].median()
-
-
-def _optics(state: State, unseen: Tensor) -> Optics:
-    optics = optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE)
+    unseen = state.weight < LEAST_WEIGHT * state.weight[state.weight > 0].median()
+    optics, areas = optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE), texel_areas(len(unseen))
     if bool(unseen.any()):
         optics.fine.paint.unseen = texture_table(unseen.float(), optics.fine.paint.blur_rad, UNSEEN_SIDE)
-    return optics
+    return optics, float((areas * ~unseen).sum() / areas.sum())
 
 
-def _judged(state: State, optics: Optics) -> LiveMap:
-    """Return what following needs of a map whose pictures are fitted anew."""
+def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool]:
+    """Return the appearance of the ball and its centre by a fit of the map's pictures, and whether the map is trusted:
+    explains them clearly better than at wrong orientations.
+    """
     fitter = replace(state.fitter, optics=optics)
     X, use = state.position_lab_mm, state.use
-    fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, 3)
+    fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, FITTED)
     fitter = replace(fitter, widest_px=WIDER * float(fitter.largest_px(X).max()))
     right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
     appearance = Appearance(
@@ -325,22 +337,7 @@ def _judged(state: State, optics: Optics) -> LiveMap:
         score_min=0.5 * (right + min(wrong, right)),
         right_score=right,
     )
-    return LiveMap(
-        number=0,
-        appearance=appearance,
-        centre=centre_of(fitter, state.pixels, fit, use, X[0]),
-        search=None,
-        R_map_body=torch.eye(3, dtype=torch.float64),
-        R_recent_map=torch.eye(3, dtype=torch.float64),
-        seen_share=0.0,
-        trusted=right > wrong + NO_BETTER,
-    )
-
-
-def _search(state: State) -> GreySearch:
-    search = GreySearch(state.texture.clamp(0, 1))
-    search.prepare()
-    return search
+    return appearance, centre_of(fitter, state.pixels, fit, use, X[0]), right > wrong + NO_BETTER
 
 
 def _wrong_score(fitter: Fitter, state: State) -> float:

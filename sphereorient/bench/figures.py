@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sphereorient.evaluate.robustness.results import Results, ResultSummary, summaries
-from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
+from sphereorient.bench.results import Results, ResultSummary, summaries
+from sphereorient.bench.scenes import CLEAN, TOGETHER
 from sphereorient.files.whole_file import put_aside
 from sphereorient.report.columns import plain_cell
 from sphereorient.report.plots.style import new_figure, plain_logarithms

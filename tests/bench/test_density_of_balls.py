@@ -13,14 +13,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 from test_robustness import outcome, run_command
 
+from sphereorient.bench import BenchSettings, Results, run_benchmarks, scenes_of
+from sphereorient.bench.figures import density_figure, write_table
+from sphereorient.bench.results import compare_runs, summaries
+from sphereorient.bench.run import track_scene
+from sphereorient.bench.scenes import BenchmarkScene
+from sphereorient.bench.score import given_to_others, hidden_shares, named_as_true, score_track
 from sphereorient.cameras import PinholeCamera, save_cameras
 from sphereorient.errors import BenchError, SettingsError, TrackError
-from sphereorient.evaluate.robustness import BenchSettings, Results, run_benchmarks, scenes_of
-from sphereorient.evaluate.robustness.results import compare_runs, summaries
-from sphereorient.evaluate.robustness.run import track_scene
-from sphereorient.evaluate.robustness.scenes import BenchmarkScene
-from sphereorient.evaluate.score import given_to_others, hidden_shares, named_as_true, score_track
-from sphereorient.report.robustness import density_figure, write_table
 from sphereorient.synth.write import default_cameras, experiment_document
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -199,7 +199,7 @@ def test_plans_run_one_after_the_other_in_folders_of_their_names(tmp_path, monke
         progress(2, 2)
         return folder.name, plan.balls
 
-    monkeypatch.setattr("sphereorient.evaluate.robustness.run.run_benchmark", run)
+    monkeypatch.setattr("sphereorient.bench.run.run_benchmark", run)
     plans = {str(n): BenchSettings(degradations=(), seeds=(0, 1), balls=n, volume_mm=45.0) for n in (1, 3)}
     seen: list[tuple[int, int]] = []
     assert run_benchmarks(tmp_path, plans, {}, progress=lambda *at: seen.append(at)) == [("1", 1), ("3", 3)]
@@ -213,7 +213,7 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
         asked.update(plans)
         return curve()
 
-    monkeypatch.setattr("sphereorient.evaluate.robustness.run_benchmarks", planned)
+    monkeypatch.setattr("sphereorient.bench.run_benchmarks", planned)
     code, told, _ = run_command(monkeypatch, capsys, "balls", "--out", tmp_path / "run", "--balls", "1,4")
     assert code == 0
     assert "density.png" in told

@@ -10,11 +10,10 @@ from conftest import SHARED, assert_close
 
 from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError
-from sphereorient.evaluate import Bound, cramer_rao_bound
-from sphereorient.evaluate.bound import disk_renderer, jacobian
 from sphereorient.sphere import Sampling, load_texture
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
+from sphereorient.tools.design.bound import Bound, cramer_rao_bound, disk_renderer, jacobian
 
 WHITE = torch.ones(32, 64)
 GREY = {grey: Sampling(outside=grey, supersampling=6) for grey in (0.5, 2.0)}  # backgrounds
@@ -103,7 +102,7 @@ def test_finer_samples_and_wider_steps_do_not_move_the_bound(patches, attitudes,
         cramer_rao_bound(patches, attitudes[:2], diameter_px=40, sampling=Sampling(supersampling=s)).orientation_rms_rad
         for s in (6, 12)
     )
-    monkeypatch.setattr("sphereorient.evaluate.bound.STEP_PX", 0.05)
+    monkeypatch.setattr("sphereorient.tools.design.bound.STEP_PX", 0.05)
     halved = cramer_rao_bound(patches, attitudes[:2], diameter_px=40).orientation_rms_rad
     for other in (finer, halved):
         assert_close(usual / other, torch.ones(2, dtype=torch.float64), atol=0.03)

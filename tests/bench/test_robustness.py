@@ -10,9 +10,7 @@ import pytest
 from bench_robustness import markdown
 from scipy.spatial.transform import Rotation
 
-from sphereorient.cli import main
-from sphereorient.errors import BenchError, OutputError, SettingsError, TrackError
-from sphereorient.evaluate.robustness import (
+from sphereorient.bench import (
     BenchSettings,
     Results,
     SceneResult,
@@ -20,8 +18,9 @@ from sphereorient.evaluate.robustness import (
     load_results,
     scenes_of,
 )
-from sphereorient.evaluate.robustness.results import save_results, summaries, summarised
-from sphereorient.evaluate.robustness.run import (
+from sphereorient.bench.figures import robustness_figure, worst_first, write_table
+from sphereorient.bench.results import save_results, summaries, summarised
+from sphereorient.bench.run import (
     measure,
     no_track,
     run_benchmark,
@@ -29,8 +28,9 @@ from sphereorient.evaluate.robustness.run import (
     track_scene,
     trackers_of,
 )
-from sphereorient.evaluate.score import aligned_errors_deg, orientations_at, read_fictrac, true_orientations
-from sphereorient.report.robustness import robustness_figure, worst_first, write_table
+from sphereorient.bench.score import aligned_errors_deg, orientations_at, read_fictrac, true_orientations
+from sphereorient.cli import main
+from sphereorient.errors import BenchError, OutputError, SettingsError, TrackError
 from sphereorient.trajectory import CameraTrack, Trajectory
 
 FRAMES = 24
@@ -278,14 +278,14 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
     config = tmp_path / "bench.yaml"
     config.write_text("degradations: [defocus]\nlevels: [2]\nseeds: [0]\ntogether: 0\nframes: 12\n")
     seen = []
-    monkeypatch.setattr("sphereorient.evaluate.robustness.write_scene", lambda folder, scene: seen.append(scene))
+    monkeypatch.setattr("sphereorient.bench.write_scene", lambda folder, scene: seen.append(scene))
     out = tmp_path / "scenes"
     out.mkdir()
     assert run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)[0] == 0
-    assert [(scene.name, scene.frames) for scene in seen] == [("clean-0-0-0", 12), ("defocus-2-0-0", 12)]
+    assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 12), ("defocus-2-0-0", 12)]
     seen.clear()
     run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config, "--levels", "4", "--frames", "15")
-    assert [(scene.name, scene.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
+    assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
     config.write_text("level: [2]\n")
     code, _, said = run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)
     assert (code, len(said.strip().splitlines())) == (2, 1)

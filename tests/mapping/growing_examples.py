@@ -1,0 +1,49 @@
+"""A ball that turns in its place, and a map of it that has grown with its frames."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from test_fixed_centre import truth
+
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.recording import open_recording
+from sphereorient.locate import LocateSettings, screened_frames
+from sphereorient.mapping.disks import cut_out, fixed_place
+from sphereorient.mapping.growing import FIRST_FRAMES, GrowingMap
+from sphereorient.mapping.settings import MapSettings
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
+
+SETTINGS = MapSettings(pixels=500)
+RATE_HZ = 600.0
+
+
+@pytest.fixture(name="ball", scope="module")
+def turning_ball(tmp_path_factory):
+    """A ball that turns in its place by 7 degrees a frame: its place, pictures and true attitudes."""
+    settings = SynthSettings(
+        frames=70, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
+        exposure_samples=1, omega_rms=60.0, seed=5,
+    )  # fmt: skip
+    path = write_synthetic_experiment(tmp_path_factory.mktemp("turns"), settings)
+    experiment = load_experiment(path).with_sphere(fixed=True, texture_path=None)
+    with open_recording(experiment, ["cam1"], textured=False) as recording:
+        place = fixed_place(recording, SETTINGS, LocateSettings())
+        shots = list(screened_frames(recording.streams[0], place.views[0].background))
+        for shot in shots:
+            _ = shot.picture
+    return SimpleNamespace(place=place, shots=shots, R=truth(path)[1], X=truth(path)[0])
+
+
+@pytest.fixture(name="grown", scope="module")
+def grown_map(ball):
+    """A map of 60 frames, after four iterations, from orientations in the body frame of the first frame."""
+    growing = GrowingMap(ball.place, SETTINGS)
+    Q = ball.R[0].mT
+    for k in range(60):
+        growing.add(cut_out(ball.place, [ball.shots[k].picture]), ball.R[k] @ Q)
+        if k in (FIRST_FRAMES, 40, 50, 59):
+            assert growing.ready()
+            growing.iterate(size=k >= 50)
+    return growing, growing.live_map()
