@@ -6,8 +6,6 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from functools import partial
@@ -160,10 +158,10 @@ class CheckpointCallback(Callback):
     """Keeps the history, the weights of the best validation, and last.ckpt after each epoch, in the folder `out`."""
 
     def __init__(self, out: Path, progress: Progress) -> None:
-        self._out, self._progress = out, progress
+        self.out, self._progress = out, progress
         self.rows: list[Row] = []
         self.best: dict[str, Tensor] = {}
-        self.best_nll = float("inf")
+        self.best_nll = math.inf
         self.best_step = 0
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -184,7 +182,7 @@ class CheckpointCallback(Callback):
                 **{f"validation_{name}": value for name, value in asdict(module.metrics).items() if name != "pictures"},
             }
         )
-        with put_aside(self._out / "metrics.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        with put_aside(self.out / "metrics.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, sorted({key for row in self.rows for key in row}))
             writer.writeheader()
             writer.writerows({**row, "step": int(row["step"])} for row in self.rows)
@@ -194,7 +192,7 @@ class CheckpointCallback(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write last.ckpt atomically."""
-        with put_aside(self._out / LAST, also=(RuntimeError,)) as aside:
+        with put_aside(self.out / LAST, also=(RuntimeError,)) as aside:
             trainer.save_checkpoint(aside)
 
     def state_dict(self) -> dict[str, Any]:
@@ -240,23 +238,8 @@ def train_proposer(
     progress("draw maps", 0, 1)
     data = TrainingData(settings)
     progress("draw maps", 1, 1)
-    with _quiet_lightning(), writing(force=resume):  # last.ckpt says whose folder it is
-        stop = EarlyStopping("validation_nll", patience=settings.training.patience, mode="min")
-        trainer = Trainer(
-            accelerator="gpu" if torch.cuda.is_available() else "cpu",
-            devices=1,
-            max_epochs=settings.training.epochs,
-            callbacks=[stop, kept, timer],
-            logger=False,
-            default_root_dir=str(out),
-            gradient_clip_val=1.0,
-            reload_dataloaders_every_n_epochs=1,
-            num_sanity_val_steps=0 if resume else -1,  # the untrained network is the first row of the history
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        _fit(trainer, ProposerModule(settings, network), data, str(out / LAST) if resume else None)
+    with writing(force=resume):  # last.ckpt says whose folder it is
+        _fit(ProposerModule(settings, network), data, kept, timer, resume)
     if not kept.best:
         do = "lower training.learning_rate"
         raise SettingsError(refusal("training", expected="finite losses", got="others in the first epoch", do=do))
@@ -328,12 +311,35 @@ def _without_length(settings: ProposerSettings) -> dict[str, Any]:
     return settings.model_dump(exclude={"training": set(LENGTH)})
 
 
-def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str | None) -> None:
-    """Train; raise KeyboardInterrupt on Ctrl-C, where Lightning would exit."""
+def _fit(
+    module: ProposerModule, data: TrainingData, kept: CheckpointCallback, timer: TrainingTimer, resume: bool
+) -> None:
+    """Train without Lightning's messages; raise KeyboardInterrupt on Ctrl-C, where Lightning would exit."""
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
+    training = module.settings.training
+    loggers = {name: logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")}
+    levels = {name: logger.level for name, logger in loggers.items()}
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=last)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
+            for logger in loggers.values():
+                logger.setLevel(logging.ERROR)
+            trainer = Trainer(
+                accelerator="gpu" if torch.cuda.is_available() else "cpu",
+                devices=1,
+                max_epochs=training.epochs,
+                callbacks=[EarlyStopping("validation_nll", patience=training.patience, mode="min"), kept, timer],
+                logger=False,
+                default_root_dir=str(kept.out),
+                gradient_clip_val=1.0,
+                reload_dataloaders_every_n_epochs=1,
+                num_sanity_val_steps=0 if resume else -1,  # the untrained network is the first row of the history
+                enable_checkpointing=False,
+                enable_progress_bar=False,
+                enable_model_summary=False,
+            )
+            trainer.fit(module, datamodule=data, ckpt_path=str(kept.out / LAST) if resume else None)
     except SystemExit:
         if trainer.interrupted:
             raise KeyboardInterrupt from None
@@ -341,18 +347,5 @@ def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str
     finally:
         if main:
             signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _quiet_lightning() -> Iterator[None]:
-    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        for name, logger in loggers.items():
+            logger.setLevel(levels[name])
