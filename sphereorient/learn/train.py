@@ -146,12 +146,12 @@ class ProposerModule(LightningModule):
 class TrainingTimer(Timer):
     """Ends training at its time limit."""
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
         """Check the time, and pass the elapsed share to the learning rate."""
         super().on_train_batch_end(trainer)
-        minutes = _own(pl_module).settings.training.minutes
+        minutes = pl_module.settings.training.minutes
         if minutes is not None:
-            _own(pl_module).share_of_time = self.time_elapsed() / (60 * minutes)
+            pl_module.share_of_time = self.time_elapsed() / (60 * minutes)
 
 
 class CheckpointCallback(Callback):
@@ -164,14 +164,14 @@ class CheckpointCallback(Callback):
         self.best_nll = math.inf
         self.best_step = 0
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
         """Report the progress."""
-        training = _own(pl_module).settings.training
+        training = pl_module.settings.training
         self._progress("train", trainer.global_step, training.epochs * training.steps)
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Add a row to the history, and keep the weights if they are the best."""
-        module = _own(pl_module)
+        module: ProposerModule = pl_module
         assert module.metrics is not None
         self.rows.append(
             {
@@ -190,7 +190,7 @@ class CheckpointCallback(Callback):
             self.best_nll, self.best_step = module.metrics.nll, trainer.global_step
             self.best = {name: tensor.detach().cpu().clone() for name, tensor in module.network.state_dict().items()}
 
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Write last.ckpt atomically."""
         with put_aside(self.out / LAST, also=(RuntimeError,)) as aside:
             trainer.save_checkpoint(aside)
@@ -203,11 +203,6 @@ class CheckpointCallback(Callback):
         """Restore the state."""
         for key, value in state_dict.items():
             setattr(self, key, value)
-
-
-def _own(module: LightningModule) -> ProposerModule:
-    assert isinstance(module, ProposerModule)
-    return module
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -223,14 +218,9 @@ def train_proposer(
     settings: ProposerSettings, out: Path, *, resume: bool = False, progress: Progress = silent
 ) -> Trained:
     """Train a proposer and write proposer.ckpt, last.ckpt and metrics.csv into the folder `out`, created if missing.
-
     `resume` continues from last.ckpt, to the same weights unless `minutes` is set; `progress` gets stage, done, total.
-
-    Raises:
-        CheckpointError: training.start or last.ckpt cannot be used.
-        TextureError: pictures.texture cannot be read.
-        OutputError: the folder cannot be written.
-        SettingsError: the training does not converge to finite numbers.
+    Raises CheckpointError: training.start or last.ckpt cannot be used; TextureError: pictures.texture cannot be read;
+    OutputError: the folder cannot be written; SettingsError: the training does not converge to finite numbers.
     """
     network, minutes = prepare(settings, out, resume), settings.training.minutes
     timer = TrainingTimer(None if minutes is None else timedelta(minutes=minutes), verbose=False)

@@ -40,11 +40,9 @@ class Task:
 
 def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory | Tracks:
     """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
-
     `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
-
-    Raises:
-        SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store stays).
+    Raises SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store
+    stays).
     """
     check_out(request)
     with opened(request, store, progress) as work, store.held(request, resume=resume):
@@ -60,7 +58,6 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
     """Yield the tasks of a run, stage by stage; send all results of a stage to get the next one.
-
     The tasks of one stage are independent. The `workers` share the frames; None: one task follows all.
     """
     (batches,) = yield [Task("learn")]

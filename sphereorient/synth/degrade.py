@@ -59,12 +59,8 @@ Put = Callable[[Tensor, Tensor, Disk], Tensor]
 
 def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
     """Return pictures (..., H, W), unrounded and unclipped floats, with degradations in a fixed order.
-
     `values` maps names to physical values, see `severity`.
-
-    Raises:
-        SettingsError: unknown name, no picture degradation, or impossible value.
-        ShapeError: not pictures.
+    Raises SettingsError: unknown name, no picture degradation, or impossible value; ShapeError: not pictures.
     """
     if pictures.ndim < 2 or not pictures.is_floating_point():
         got, do = f"{tuple(pictures.shape)} {pictures.dtype}", "pass grey levels as floats"
@@ -227,21 +223,8 @@ def read_noise(pictures: Tensor, sigma: float, disk: Disk, rng: torch.Generator)
     return pictures + sigma * _normal(pictures, rng)
 
 
-OPERATIONS: Mapping[str, Operation] = MappingProxyType(
-    {
-        "uneven_light": uneven_light,
-        "highlights": highlights,
-        "background_clutter": background_clutter,
-        "occlusion": occlusion,
-        "bubbles": bubbles,
-        "dirt": dirt,
-        "contrast_loss": contrast_loss,
-        "defocus": defocus,
-        "saturation": saturation,
-        "shot_noise": shot_noise,
-        "read_noise": read_noise,
-    }
-)
+_ALL = (uneven_light, highlights, background_clutter, occlusion, bubbles, dirt, contrast_loss, defocus, saturation)
+OPERATIONS: Mapping[str, Operation] = MappingProxyType({one.__name__: one for one in (*_ALL, shot_noise, read_noise)})
 
 # Those that draw a field of the whole picture: how it is drawn, and how it is put into a picture.
 FIELDS: Mapping[str, tuple[Draw, Put]] = MappingProxyType(

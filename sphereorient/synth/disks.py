@@ -51,12 +51,9 @@ def film_disks(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: DiskSettings
 ) -> Tensor:
     """Film a sphere with random light per picture; return crops (F, S, S) float32, grey levels.
-
     `texture` is the worn map (H, 2 H), `R_view_body` (F, 3, 3); `values` maps `DISK_DEGRADATIONS` to physical values,
     values of maps are ignored.
-
-    Raises:
-        SettingsError: unknown name or impossible value.
+    Raises SettingsError: unknown name or impossible value.
     """
     _check(values)
     scale = settings.scale

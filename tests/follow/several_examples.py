@@ -88,8 +88,4 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several
     }
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
-    return Several(
-        path,
-        {name: place[name].numpy() for name in balls},
-        {name: R[name].numpy() for name in balls},
-    )
+    return Several(path, {name: place[name].numpy() for name in balls}, {name: R[name].numpy() for name in balls})

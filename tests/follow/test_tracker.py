@@ -135,7 +135,7 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
             own_covariance=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(1, 2, 3, 3),
         )
         tracker = SimpleNamespace(usual_apart_rad=0.002)
-        return bool(BallTracker._contradictory(tracker, said, torch.tensor([[True, both]])))
+        return bool(BallTracker.contradictory(tracker, said, torch.tensor([[True, both]])))
 
     assert disagree(0.006, -0.006)
     assert not disagree(0.006, 0.006), "both would turn the pose alike"

@@ -15,15 +15,7 @@ from conftest import REPO, assert_close
 from torch import Tensor
 
 from sphereorient.errors import SettingsError, ShapeError
-from sphereorient.synth.degrade import (
-    OPERATIONS,
-    Disk,
-    centre_error,
-    degrade,
-    gain_to_clip,
-    lost_frames,
-    radius_error,
-)
+from sphereorient.synth.degrade import OPERATIONS, Disk, centre_error, degrade, gain_to_clip, lost_frames, radius_error
 from sphereorient.synth.severities import DEGRADATIONS, degradation, severity
 
 SIZE, RADIUS = 96, 30.0

@@ -18,13 +18,7 @@ from sphereorient.errors import SettingsError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.sphere.texture import map_directions
-from sphereorient.synth import (
-    DEGRADATIONS,
-    SynthSettings,
-    severity,
-    write_degraded,
-    write_synthetic_experiment,
-)
+from sphereorient.synth import DEGRADATIONS, SynthSettings, severity, write_degraded, write_synthetic_experiment
 from sphereorient.synth.degrade_scene import (
     degraded_settings,
     misdrawn,
@@ -38,14 +32,7 @@ from sphereorient.synth.degrade_scene import (
 )
 from sphereorient.synth.write import clean_movie, default_cameras, motion_of
 
-SETTINGS = SynthSettings(
-    frames=10,
-    image_size=(96, 90),
-    diameter_px=40.0,
-    volume_mm=6.0,
-    velocity_rms=0.3,
-    seed=6,
-)
+SETTINGS = SynthSettings(frames=10, image_size=(96, 90), diameter_px=40.0, volume_mm=6.0, velocity_rms=0.3, seed=6)
 
 
 def frames_of(path: Path) -> dict[str, np.ndarray]:
