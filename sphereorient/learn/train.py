@@ -143,31 +143,22 @@ class ProposerModule(LightningModule):
         checkpoint["sphereorient_settings"] = self.settings.model_dump(mode="json")
 
 
-class TrainingTimer(Timer):
-    """Ends training at its time limit."""
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        """Check the time, and pass the elapsed share to the learning rate."""
-        super().on_train_batch_end(trainer)
-        minutes = pl_module.settings.training.minutes
-        if minutes is not None:
-            pl_module.share_of_time = self.time_elapsed() / (60 * minutes)
-
-
 class CheckpointCallback(Callback):
     """Keeps the history, the weights of the best validation, and last.ckpt after each epoch, in the folder `out`."""
 
-    def __init__(self, out: Path, progress: Progress) -> None:
-        self.out, self._progress = out, progress
+    def __init__(self, out: Path, progress: Progress, timer: Timer) -> None:
+        self.out, self._progress, self._timer = out, progress, timer
         self.rows: list[Row] = []
         self.best: dict[str, Tensor] = {}
         self.best_nll = math.inf
         self.best_step = 0
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        """Report the progress."""
+        """Report the progress, and pass the share of the time to the learning rate."""
         training = pl_module.settings.training
         self._progress("train", trainer.global_step, training.epochs * training.steps)
+        if training.minutes is not None:
+            pl_module.share_of_time = self._timer.time_elapsed() / (60 * training.minutes)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Add a row to the history, and keep the weights if they are the best."""
@@ -223,8 +214,8 @@ def train_proposer(
     OutputError: the folder cannot be written; SettingsError: the training does not converge to finite numbers.
     """
     network, minutes = prepare(settings, out, resume), settings.training.minutes
-    timer = TrainingTimer(None if minutes is None else timedelta(minutes=minutes), verbose=False)
-    kept = CheckpointCallback(out, progress)
+    timer = Timer(None if minutes is None else timedelta(minutes=minutes), verbose=False)
+    kept = CheckpointCallback(out, progress, timer)
     progress("draw maps", 0, 1)
     data = TrainingData(settings)
     progress("draw maps", 1, 1)
@@ -292,18 +283,13 @@ def _check_last(last: Path, settings: ProposerSettings) -> None:
     except Exception as error:  # damaged pickles raise nearly anything
         got = "a damaged file, or one of another version"
         raise CheckpointError(refusal(name, expected="a whole last.ckpt", got=got, do=do)) from error
-    if _without_length(before) != _without_length(settings):
+    old, new = (one.model_dump(exclude={"training": set(LENGTH)}) for one in (before, settings))
+    if old != new:
         do = "pass settings.yaml beside it"
         raise CheckpointError(refusal(name, expected="the same settings", got="other settings", do=do))
 
 
-def _without_length(settings: ProposerSettings) -> dict[str, Any]:
-    return settings.model_dump(exclude={"training": set(LENGTH)})
-
-
-def _fit(
-    module: ProposerModule, data: TrainingData, kept: CheckpointCallback, timer: TrainingTimer, resume: bool
-) -> None:
+def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, timer: Timer, resume: bool) -> None:
     """Train without Lightning's messages; raise KeyboardInterrupt on Ctrl-C, where Lightning would exit."""
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
