@@ -40,7 +40,7 @@ class CineMovie(Movie):
 
     def __init__(self, path: Path) -> None:
         self._read_header(path)
-        layout, height, width = self._layout, *self._size
+        layout, (height, width) = self._layout, self._size
         self._top_down = bool(self._flip_vertical) != layout.packed
         content = np.memmap(path, np.uint8, "r")
         found = Counter(_prefix_and_size(content, int(offset)) for offset in self._offsets[:FIRST])

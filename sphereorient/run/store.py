@@ -288,19 +288,17 @@ def read_poses(path: Path) -> dict[str, list[Poses]] | None:
             if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file):
                 return None
             groups = {str(name): group for name, group in file[SPHERES].items()} if SPHERES in file else {"": file}
-            found = {name: _read_poses(group) for name, group in groups.items()}
+            return {name: _read_poses(group) for name, group in groups.items()}
     except MemoryError:
         raise
     except DAMAGE:
         return None
-    whole = {name: poses for name, poses in found.items() if poses is not None}
-    return whole if len(whole) == len(found) else None
 
 
-def _read_poses(group: h5py.Group) -> list[Poses] | None:
+def _read_poses(group: h5py.Group) -> list[Poses]:
     R = torch.from_numpy(group["R_lab_body"][()])
     if not bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all()):
-        return None
+        raise ValueError("no rotations")
     count, use = group["count"][()].tolist(), torch.from_numpy(group["use"][()])
     reason = [[Reason(why.decode()) for why in row] for row in group["reason"][()].tolist()]
     parts = {name: torch.split(torch.from_numpy(group[name][()]), count) for name in POSE_PARTS}

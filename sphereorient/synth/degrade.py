@@ -8,8 +8,8 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
-from sphereorient.synth.severities import DEGRADATIONS, degradation
+from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.synth.severities import DEGRADATIONS, check_values, degradation
 
 WHITE_LEVEL = 255
 VEIL = 95.0  # grey level of turbid liquid
@@ -65,12 +65,7 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
     if pictures.ndim < 2 or not pictures.is_floating_point():
         got, do = f"{tuple(pictures.shape)} {pictures.dtype}", "pass grey levels as floats"
         raise ShapeError(refusal("pictures", expected="(..., H, W) floats", got=got, do=do))
-    for name, value in values.items():
-        row = degradation(name)
-        if name not in OPERATIONS:
-            expected, do = f"one of {', '.join(OPERATIONS)}", "apply it with write_degraded, which films the scene"
-            raise SettingsError(refusal("degradation of pictures", expected=expected, got=name, do=do))
-        row.check(value)
+    check_values(values, OPERATIONS, "apply it with write_degraded, which films the scene")
     for name, operation in OPERATIONS.items():
         if name in values and values[name] != DEGRADATIONS[name].nothing:
             pictures = operation(pictures, values[name], disk, rng)

@@ -1,7 +1,7 @@
 """Degradations of pictures and reported inputs: names, units, five severities."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
@@ -124,6 +124,15 @@ def degradation(name: str) -> Degradation:
     if name not in DEGRADATIONS:
         raise SettingsError(refuse_unknown(name, DEGRADATIONS, "degradation"))
     return DEGRADATIONS[name]
+
+
+def check_values(values: Mapping[str, float], known: Iterable[str], do: str) -> None:
+    """Raise SettingsError for an unknown name, one that is not among `known`, with remedy `do`, or a wrong value."""
+    for name, value in values.items():
+        row = degradation(name)
+        if name not in known:
+            raise SettingsError(refusal("degradation", expected=f"one of {', '.join(known)}", got=name, do=do))
+        row.check(value)
 
 
 def severity(name: str, level: int) -> float:

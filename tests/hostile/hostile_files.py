@@ -246,18 +246,8 @@ PLACES = ["time", "valid", "position", "orientation_cov", "segment", "flags", "c
 PLACES += ["cameras/cam1/reason", "cameras/cam1/centre_px", "cameras/cam1/candidates", "cameras/cam1/candidates/offset"]
 PLACES += ["cameras/cam1/candidates/orientation", "margin"]
 DEEP = "[" * 100_000 + "]" * 100_000
-TEXTS: list[Any] = [
-    "",
-    "x" * 60_000,
-    "a\nb\x1b",
-    "{",
-    DEEP,
-    '{"a": 1e999}',
-    "[]",
-    "null",
-    b"\xff\xfe",
-    np.bytes_(b"\0"),
-]
+TEXTS: list[Any] = ["", "x" * 60_000, "a\nb\x1b", "{", DEEP, '{"a": 1e999}', "[]", "null", b"\xff\xfe"]
+TEXTS += [np.bytes_(b"\0")]
 TEXTS += [1, np.nan, np.inf, -1.0, [1.0, 2.0], ["a", "b"], h5py.Empty("f8"), np.zeros(3, [("a", "f8")]), 10**18]
 ATTRIBUTES = ["schema", "provenance", "method", "settings", "experiment", "frame_rate"]
 

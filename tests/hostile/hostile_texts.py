@@ -91,16 +91,9 @@ OTHERS: dict[str, dict[str, Any]] = {
     "pinhole": {"vfov_deg": 45.0, "centre": [31.0, 23.0]},
 }
 PORT = {"normal": [0.0, 0.0, -1.0], "offset": 100.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
-PLATE = {
-    "type": "dots",
-    "columns": 13,
-    "rows": 13,
-    "pitch": 8.0,
-    "dot_diameter": 3.2,
-    "fiducial_diameter": 5.0,
-    "fiducials": [[0, 0], [3, 0], [0, 2]],
-    "dots": "dark",
-}
+PLATE = {"type": "dots", "columns": 13, "rows": 13, "pitch": 8.0, "dot_diameter": 3.2, "fiducial_diameter": 5.0}
+PLATE |= {"fiducials": [[0, 0], [3, 0], [0, 2]], "dots": "dark"}
+BOARD = {"columns": 8, "rows": 7, "pitch": 8.0}
 
 
 def camera(model: str) -> dict[str, Any]:
@@ -150,25 +143,9 @@ def calibration_documents() -> list[dict[str, Any]]:
     pictures = [{"pose": 0, "cam1": "a.png", "cam2": "b.png"}, {"pose": 12, "cam1": "c.png"}]
     filmed = schema | {"plate": PLATE, "surveyed": surveyed, "pictures": pictures}
     targets: list[dict[str, Any]] = [
-        {"type": "chessboard", "columns": 8, "rows": 7, "pitch": 8.0},
-        {
-            "type": "charuco",
-            "columns": 8,
-            "rows": 7,
-            "pitch": 8.0,
-            "marker": 6.0,
-            "dictionary": "DICT_4X4_50",
-            "legacy_pattern": False,
-        },
-        {
-            "type": "circles",
-            "columns": 8,
-            "rows": 7,
-            "pitch": 8.0,
-            "dot_diameter": 3.0,
-            "asymmetric": True,
-            "dots": "dark",
-        },
+        {"type": "chessboard", **BOARD},
+        {"type": "charuco", **BOARD, "marker": 6.0, "dictionary": "DICT_4X4_50", "legacy_pattern": False},
+        {"type": "circles", **BOARD, "dot_diameter": 3.0, "asymmetric": True, "dots": "dark"},
     ]
     tables = schema | {"points": {"cam1": "points.csv"}, "model": "brown"}
     ports = {"ports": {"cam1": PORT}, "fit_ports": ["port_offset", "port_tilt_x"]}
@@ -218,23 +195,8 @@ def write_cameras(folder: Path) -> None:
 
 
 TABLE = "x,y,z,u,v\n" + "".join(f"{k}.5,{2 * k},-{k},{10 * k}.25,{k}\n" for k in range(12))
-CELLS = [
-    "",
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "1,5",
-    "abc",
-    "1_0",
-    "0x10",
-    "\0",
-    "é",
-    '"',
-    "x" * 3000,
-    "9" * 5000,
-    "\u2028",
-]
+CELLS = ["", "nan", "inf", "-inf", "1e400", "1,5", "abc", "1_0", "0x10", "\0", "é", '"', "\u2028"]
+CELLS += ["x" * 3000, "9" * 5000]
 
 
 def points_family() -> Family:

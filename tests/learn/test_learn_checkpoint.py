@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from learn_examples import state_of, tiny, untrained
+from learn_examples import Writer, state_of, tiny, untrained
 
 from sphereorient.errors import CheckpointError
 from sphereorient.learn import checkpoint as module
@@ -79,16 +79,6 @@ def test_the_network_of_a_checkpoint_says_what_it_said_before(tmp_path, rng):
         assert torch.equal(network(disks, blurs), untrained()(disks, blurs))
     assert not network.training
     assert not any(parameter.requires_grad for parameter in network.parameters())
-
-
-class Writer:
-    """A pickle of this writes a file when it is loaded with code."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.write_text, (self.path, "executed")
 
 
 @pytest.mark.parametrize("form", ["torch", "pickle", "legacy", "in the weights"])

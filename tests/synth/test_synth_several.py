@@ -17,19 +17,9 @@ from sphereorient.synth import SynthSettings, make_scene, write_synthetic_experi
 from sphereorient.synth.scene import expose
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of, motions_of
 
-SMALL = SynthSettings(
-    name="tiny",
-    balls=4,
-    paints=3,
-    frames=2,
-    image_size=(220, 200),
-    diameter_mm=12.0,
-    diameter_px=24.0,
-    volume_mm=40.0,
-    background=0.0,
-    exposure_samples=1,
-    seed=2,
-)
+SCENE = {"name": "tiny", "frames": 2, "image_size": (220, 200), "diameter_mm": 12.0, "diameter_px": 24.0}
+SCENE |= {"volume_mm": 40.0, "background": 0.0, "exposure_samples": 1, "seed": 2}
+SMALL = SynthSettings(balls=4, paints=3, **SCENE)
 
 
 @pytest.fixture(scope="module")
