@@ -21,14 +21,13 @@ def refused(path: Path, message: str) -> None:
 
 
 def test_a_missing_file_and_a_folder_without_pictures_are_refused(tmp_path):
-    refused(tmp_path / "none.mkv", "expected a movie file, got no such file")
+    refused(tmp_path / "none.mkv", "no such file")
     refused(tmp_path, "expected pictures .*, got none")
 
 
 def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path):
     (tmp_path / "movie.wmv").write_bytes(b"")
-    known = r"\.mkv \.avi \.mp4 \.mov \.npy \.cine \.tif \.tiff \.h5 \.hdf5 or a folder of pictures"
-    refused(tmp_path / "movie.wmv", f"expected a movie of type {known}, got '.wmv'")
+    refused(tmp_path / "movie.wmv", r"\.mkv \.avi \.mp4 .* a folder of pictures, got '.wmv'")
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".avi", ".mp4", ".mov", ".npy", ".cine", ".tif", ".h5"])

@@ -121,7 +121,7 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
     for applied, message in (({"defocs": 2}, "write 'defocus' instead"), ({"defocus": 6}, "got 6; choose one of them")):
         with pytest.raises(SettingsError, match=message):
             write_degraded(tmp_path / "new", SETTINGS, applied)
-    with pytest.raises(SettingsError, match=r"^degradation occlusion: expected 0 or more, and below 1, got 2;"):
+    with pytest.raises(SettingsError, match=r"degradation occlusion: .* below 1"):
         write_synthetic_experiment(tmp_path / "new", SETTINGS, values={"occlusion": 2.0})
     assert not (tmp_path / "new").exists()
 

@@ -89,14 +89,14 @@ def test_the_first_ball_moves_as_an_only_one():
 
 
 def test_balls_without_room_are_refused_in_one_line():
-    with pytest.raises(SettingsError, match=r"^balls: expected room for 8 of 18 mm in all 3 frames, got") as caught:
+    with pytest.raises(SettingsError, match="room for 8 of 18 mm") as caught:
         motions_of(SynthSettings(balls=8, frames=3, volume_mm=8.0))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["uneven_light", "highlights", "occlusion", "bubbles"])
 def test_what_lies_on_the_disk_of_one_ball_is_refused_of_several(name, tmp_path):
-    with pytest.raises(SettingsError, match=rf"^degradation {name}: expected one ball, got 4; leave it out"):
+    with pytest.raises(SettingsError, match=f"{name}: .* one ball, got 4"):
         write_synthetic_experiment(tmp_path / "new", SMALL, values={name: 2.0 if name == "uneven_light" else 0.5})
     assert not (tmp_path / "new").exists()
 
