@@ -28,7 +28,7 @@ def main() -> None:
     excerpt = REPO / "synthetic_data" / "excerpt"
     experiment = load_experiment(excerpt / "experiment.yaml")
     with progress_bar() as advance:
-        track = track_movies(experiment, progress=advance, command="scripts/demo.py")
+        track = track_movies(experiment, progress=advance)
     track.save(out / "track.h5")
     score = score_track(track, excerpt / "truth.h5")
     Console().print(error_table(score))

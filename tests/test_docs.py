@@ -50,22 +50,14 @@ def test_the_examples_of_a_page_run(page):
     assert failed == 0
 
 
-def test_the_cameras_of_the_page_load_and_no_key_of_any_model_is_missing(tmp_path):
+def test_the_cameras_of_the_page_load_and_no_key_or_parameter_of_any_model_is_missing(tmp_path):
     (tmp_path / "cameras.yaml").write_text(blocks("cameras.md", "yaml")[0])
     cameras = load_cameras(tmp_path / "cameras.yaml")
     assert {type(getattr(camera, "camera", camera)) for camera in cameras.values()} == set(MODELS.values())
     text = (REPO / "docs" / "cameras.md").read_text()
-    entries = [PortEntry, *ENTRIES.values()]
-    for key in {key for entry in entries for key in entry.model_fields}:
-        assert f"`{key}`" in text, key
-
-
-def test_every_parameter_of_every_camera_is_named_on_the_page(tmp_path):
-    (tmp_path / "cameras.yaml").write_text(blocks("cameras.md", "yaml")[0])
-    text = (REPO / "docs" / "cameras.md").read_text()
-    for camera in load_cameras(tmp_path / "cameras.yaml").values():
-        for name in parameter_names(camera):
-            assert f"`{name}`" in text, name
+    names = {key for entry in (PortEntry, *ENTRIES.values()) for key in entry.model_fields}
+    for name in names.union(*map(parameter_names, cameras.values())):
+        assert f"`{name}`" in text, name
 
 
 def test_the_calibration_file_of_the_page_loads_and_all_its_keys_are_there(tmp_path):
@@ -78,13 +70,21 @@ def test_the_calibration_file_of_the_page_loads_and_all_its_keys_are_there(tmp_p
         assert f"`{key}`" in text, key
 
 
-@pytest.mark.slow  # draws and finds 14 pictures
-def test_the_figure_of_the_calibration_is_drawn_by_its_script(tmp_path):
-    out = tmp_path / "calibration.png"
-    subprocess.run([sys.executable, REPO / "scripts" / "figure_calibration.py", "--out", out], check=True)
-    drawn, committed = (cv2.imread(str(path)) for path in (out, REPO / "docs" / "calibration.png"))
-    assert drawn.shape == committed.shape
-    assert abs(drawn.astype(float) - committed).mean() < 10
+@pytest.mark.slow  # the calibration draws and finds 14 pictures
+@pytest.mark.parametrize(
+    ("script", "out", "names"),
+    [
+        ("figure_calibration.py", "calibration.png", ("calibration.png",)),
+        ("figure_conventions.py", "", ("conventions.png", "animal.png")),
+    ],
+)
+def test_figures_are_drawn_by_their_scripts(tmp_path, script, out, names):
+    subprocess.run([sys.executable, REPO / "scripts" / script, "--out", tmp_path / out], check=True)
+    for name in names:
+        drawn, committed = (cv2.imread(str(folder / name)) for folder in (tmp_path, REPO / "docs"))
+        assert drawn.shape == committed.shape
+        # Fonts and line ends differ between versions of matplotlib, the panels do not.
+        assert abs(drawn.astype(float) - committed).mean() < 10
 
 
 def test_parameters_and_configs_are_those_of_the_code(monkeypatch, capsys):
@@ -92,16 +92,6 @@ def test_parameters_and_configs_are_those_of_the_code(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(REPO / "scripts" / "make_parameters.py"), run_name="__main__")
     assert (ended.value.code, capsys.readouterr().out) == (0, "")
-
-
-@pytest.mark.slow
-def test_the_figures_of_the_conventions_are_drawn_by_their_script(tmp_path):
-    subprocess.run([sys.executable, REPO / "scripts" / "figure_conventions.py", "--out", tmp_path], check=True)
-    for name in ("conventions.png", "animal.png"):
-        drawn, committed = (cv2.imread(str(folder / name)) for folder in (tmp_path, REPO / "docs"))
-        assert drawn.shape == committed.shape
-        # Fonts and line ends differ between versions of matplotlib, the panels do not.
-        assert abs(drawn.astype(float) - committed).mean() < 10
 
 
 @cache

@@ -35,7 +35,7 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
 from sphereorient.report.frame_warnings import distance_deg
-from sphereorient.run.stages import track_movies
+from sphereorient.run.stages import track_movies, with_proposer
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
 Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
@@ -47,7 +47,7 @@ Floats = NDArray[np.float64]
 TRACKERS: dict[str, Tracker] = {
     "precise": partial(track_movies, method="precise", settings=Settings()),
     "paper": partial(track_movies, method="paper", settings=Settings()),
-    "precise_network": partial(track_movies, method="precise", settings=Settings(), proposer="default"),
+    "precise_network": partial(track_movies, method="precise", settings=with_proposer(Settings(), "default")),
 }
 DEFAULT = ("precise", "paper")
 

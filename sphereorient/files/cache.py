@@ -99,14 +99,15 @@ def _write(path: Path, arrays: Arrays) -> None:
         aside.replace(path)
         _trim(path.parent)
     except OSError as error:
-        _warn_once(f"nothing is kept in {path.parent} ({error_words(error)}): each run computes it again (--no-cache)")
+        warn_once(f"nothing is kept in {path.parent} ({error_words(error)}): each run computes it again (--no-cache)")
     finally:
         with suppress(OSError):
             aside.unlink(missing_ok=True)
 
 
 @lru_cache(maxsize=8)
-def _warn_once(words: str) -> None:
+def warn_once(words: str) -> None:
+    """Warn of each thing once a process."""
     warnings.warn(words, stacklevel=3)
 
 

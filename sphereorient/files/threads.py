@@ -4,7 +4,6 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from itertools import islice
 from typing import TypeVar
 
@@ -16,12 +15,7 @@ _limit: list[int] = []  # of this process: that of a worker, which shares the ma
 
 def cores() -> int:
     """Return how many threads compute: one a core, or those that `limit_cores` set."""
-    return _limit[-1] if _limit else _of_machine()
-
-
-@cache
-def _of_machine() -> int:
-    return os.cpu_count() or 1
+    return _limit[-1] if _limit else os.cpu_count() or 1
 
 
 def limit_cores(count: int) -> None:

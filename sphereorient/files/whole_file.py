@@ -220,12 +220,9 @@ def relative_path(path: Path | str, folder: Path) -> str:
 def check_folder(path: Path, name: str) -> None:
     """Raise OutputError, with `name`, if the folder of a file to write cannot be made or may not be written in."""
     folder = next((one for one in path.absolute().parents if one.exists()), Path("/"))
-    if not folder.is_dir():
-        do = "choose another --out"
-        raise OutputError(refusal(name, expected="a folder to write in", got=f"{folder}, a file", do=do))
-    if not os.access(folder, os.W_OK):
-        do = "choose another --out"
-        raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        got = f"{folder}, which may not be written" if folder.is_dir() else f"{folder}, a file"
+        raise OutputError(refusal(name, expected="a folder to write in", got=got, do="choose another --out"))
 
 
 def check_ending(path: Path, option: str, endings: Collection[str]) -> None:

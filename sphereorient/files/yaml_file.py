@@ -101,11 +101,9 @@ def yaml_words(fault: Exception) -> str:
 
 def parse_yaml(text: str) -> Any:
     """Parse one bounded YAML document of plain values; aliases are allowed, tags and repeated keys are not.
-
-    Raises:
-        yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above.
-        ValueError: an impossible value, such as a date that does not exist.
-        OverflowError: a number to the base 60 that is too large.
+    Raises yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above;
+    ValueError: an impossible value, such as a date that does not exist; OverflowError: a number to the base 60 that is
+    too large.
     """
     return _BoundedLoader(text).get_single_data()
 

@@ -262,7 +262,7 @@ class BallTracker:
         both = self._fitted(there, fit.position_lab_mm, fit.R_lab_body, usable)
         unused = good & found.unused.any(1)
         limit = torch.where(there.contradicted, AGREES_AGAIN, 1.0)
-        contradicts = self._contradictory(both, usable, limit)
+        contradicts = self.contradictory(both, usable, limit)
         back = unused & self._supported(both, usable, there.visible) & ~contradicts
         fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
         several = good & ~back & ((usable & ~use).sum(1) > 1)
@@ -271,7 +271,7 @@ class BallTracker:
             rows = several & (usable & ~use)[:, k]
             wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
             both = self._fitted(there, fit.position_lab_mm, fit.R_lab_body, wider)
-            rows &= self._supported(both, wider, there.visible) & ~self._contradictory(both, wider, limit)
+            rows &= self._supported(both, wider, there.visible) & ~self.contradictory(both, wider, limit)
             fit, use = both.where(rows, fit), torch.where(rows[:, None], wider, use)
         return _Found(fit, use, good, usable), unused & contradicts
 
@@ -331,9 +331,9 @@ class BallTracker:
         if visible is not None:  # of little paint the pose may not be known at all
             arrived &= ((score > 0) & seen).any(1) & np.isfinite(fit.covariance.numpy()).all((1, 2))
         good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
-        return good if use.shape[1] == 1 else good & ~self._contradictory(fit, use)
+        return good if use.shape[1] == 1 else good & ~self.contradictory(fit, use)
 
-    def _contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
+    def contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
         """Return for which poses two cameras disagree, (B,) bool: their pictures are not of one instant."""
         wrong = torch.zeros(len(use), dtype=torch.bool)
         for k, m in combinations(range(use.shape[1]), 2):
@@ -370,7 +370,7 @@ class BallTracker:
         ]
         if not bool(seen.any()):
             return no_pose(len(shots), reason)
-        if bool(self._contradictory(poses, seen.expand(len(poses), -1))[0]):
+        if bool(self.contradictory(poses, seen.expand(len(poses), -1))[0]):
             return self._by_each(poses, frames, seen)
         if bool((seen == poses.use).all()):
             return poses

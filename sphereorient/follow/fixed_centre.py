@@ -81,11 +81,11 @@ def centre_of(
     return FixedCentre(
         position_lab_mm=place,
         covariance_mm2=covariance + _edge(fitter, place),
-        follows_rad_mm=_follows(fitter, pixels.thinned(FOLLOWS_EVERY), place, fit.R_lab_body, use),
+        follows_rad_mm=follows_place(fitter, pixels.thinned(FOLLOWS_EVERY), place, fit.R_lab_body, use),
     )
 
 
-def _follows(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tensor) -> Tensor:
+def follows_place(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tensor) -> Tensor:
     """Return the derivative (3, 3), rad/mm, of held orientations (n, 3, 3) by the centre, by finite differences."""
     aside = ASIDE * fitter.radius_mm * torch.eye(3, dtype=torch.float64)
     beyond_doubt = torch.eye(3, dtype=torch.float64).expand(len(R), 3, 3) / (FIRM**2 * ASIDE * fitter.radius_mm) ** 2

@@ -114,7 +114,7 @@ class SceneStart:
         where = [(k, n) for k, seen in enumerate(disks) for n in range(len(seen))]
         proposed = ball.proposals([(k, shots[k].picture, disks[k][n]) for k, n in where])
         each = dict(zip(where, proposed, strict=True))
-        return [_look([each[k, n] for k, n in enumerate(match.chosen) if n >= 0]) for match in matches]
+        return [look_of([each[k, n] for k, n in enumerate(match.chosen) if n >= 0]) for match in matches]
 
     def _costs(
         self,
@@ -159,7 +159,7 @@ def _gain(score: Tensor) -> Tensor:
     return 0.5 * PATCHES * ((1 - NO_PAINT) / (1 - score.clamp(-1.0, 0.99))).log()
 
 
-def _look(proposed: Sequence[tuple[Tensor, Tensor]]) -> _Look:
+def look_of(proposed: Sequence[tuple[Tensor, Tensor]]) -> _Look:
     """Return the look of the disks of a match, each with its proposals: rotations (M, 3, 3), scores (M,)."""
     R = torch.cat([each for each, _ in proposed])
     if not len(R):

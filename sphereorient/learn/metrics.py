@@ -148,12 +148,9 @@ def benchmark_checkpoint(
     checkpoint: Checkpoint, settings: PictureSettings, pictures: int, progress: Progress, seed: int = 0
 ) -> ProposerBenchmark:
     """Measure a checkpoint on unseen maps and pictures; a fine-tuned one on its own map, that of `settings`.
-
     `pictures` of each degradation and level, ten times as many mixed; `progress` gets stage, finished maps, all maps.
-
-    Raises:
-        CheckpointError: another picture size, or another map than that of the fine-tuning.
-        TextureError: the map cannot be read.
+    Raises CheckpointError: another picture size, or another map than that of the fine-tuning; TextureError: the map
+    cannot be read.
     """
     _check(checkpoint, settings)
     network = correlator_of(checkpoint)

@@ -180,7 +180,6 @@ class Modes:
 
 def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) -> Modes:
     """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3).
-
     The temperature divides the logits for probabilities and order only; orientations are means of the density as
     learnt.
     """
@@ -231,7 +230,6 @@ def probability_of(score: Tensor) -> Tensor:
 
 class LearnedProposer:
     """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
-
     At most `CANDIDATES` for each disk; `temperature` divides the logits, for calibrated probabilities.
     """
 
@@ -253,7 +251,6 @@ class LearnedProposer:
     @torch.inference_mode()
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations in the view frames of disks, with `score_of` their probability.
-
         A uniform disk has no proposals (`LOW_SCORE`); raise ShapeError for disks of another size.
         """
         check_disks(disks, self.size_px, self.size_px)

@@ -6,8 +6,6 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from functools import partial
@@ -145,35 +143,26 @@ class ProposerModule(LightningModule):
         checkpoint["sphereorient_settings"] = self.settings.model_dump(mode="json")
 
 
-class TrainingTimer(Timer):
-    """Ends training at its time limit."""
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Check the time, and pass the elapsed share to the learning rate."""
-        super().on_train_batch_end(trainer)
-        minutes = _own(pl_module).settings.training.minutes
-        if minutes is not None:
-            _own(pl_module).share_of_time = self.time_elapsed() / (60 * minutes)
-
-
 class CheckpointCallback(Callback):
     """Keeps the history, the weights of the best validation, and last.ckpt after each epoch, in the folder `out`."""
 
-    def __init__(self, out: Path, progress: Progress) -> None:
-        self._out, self._progress = out, progress
+    def __init__(self, out: Path, progress: Progress, timer: Timer) -> None:
+        self.out, self._progress, self._timer = out, progress, timer
         self.rows: list[Row] = []
         self.best: dict[str, Tensor] = {}
-        self.best_nll = float("inf")
+        self.best_nll = math.inf
         self.best_step = 0
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Report the progress."""
-        training = _own(pl_module).settings.training
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        """Report the progress, and pass the share of the time to the learning rate."""
+        training = pl_module.settings.training
         self._progress("train", trainer.global_step, training.epochs * training.steps)
+        if training.minutes is not None:
+            pl_module.share_of_time = self._timer.time_elapsed() / (60 * training.minutes)
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Add a row to the history, and keep the weights if they are the best."""
-        module = _own(pl_module)
+        module: ProposerModule = pl_module
         assert module.metrics is not None
         self.rows.append(
             {
@@ -184,7 +173,7 @@ class CheckpointCallback(Callback):
                 **{f"validation_{name}": value for name, value in asdict(module.metrics).items() if name != "pictures"},
             }
         )
-        with put_aside(self._out / "metrics.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        with put_aside(self.out / "metrics.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, sorted({key for row in self.rows for key in row}))
             writer.writeheader()
             writer.writerows({**row, "step": int(row["step"])} for row in self.rows)
@@ -192,9 +181,9 @@ class CheckpointCallback(Callback):
             self.best_nll, self.best_step = module.metrics.nll, trainer.global_step
             self.best = {name: tensor.detach().cpu().clone() for name, tensor in module.network.state_dict().items()}
 
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Write last.ckpt atomically."""
-        with put_aside(self._out / LAST, also=(RuntimeError,)) as aside:
+        with put_aside(self.out / LAST, also=(RuntimeError,)) as aside:
             trainer.save_checkpoint(aside)
 
     def state_dict(self) -> dict[str, Any]:
@@ -205,11 +194,6 @@ class CheckpointCallback(Callback):
         """Restore the state."""
         for key, value in state_dict.items():
             setattr(self, key, value)
-
-
-def _own(module: LightningModule) -> ProposerModule:
-    assert isinstance(module, ProposerModule)
-    return module
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,38 +209,18 @@ def train_proposer(
     settings: ProposerSettings, out: Path, *, resume: bool = False, progress: Progress = silent
 ) -> Trained:
     """Train a proposer and write proposer.ckpt, last.ckpt and metrics.csv into the folder `out`, created if missing.
-
     `resume` continues from last.ckpt, to the same weights unless `minutes` is set; `progress` gets stage, done, total.
-
-    Raises:
-        CheckpointError: training.start or last.ckpt cannot be used.
-        TextureError: pictures.texture cannot be read.
-        OutputError: the folder cannot be written.
-        SettingsError: the training does not converge to finite numbers.
+    Raises CheckpointError: training.start or last.ckpt cannot be used; TextureError: pictures.texture cannot be read;
+    OutputError: the folder cannot be written; SettingsError: the training does not converge to finite numbers.
     """
     network, minutes = prepare(settings, out, resume), settings.training.minutes
-    timer = TrainingTimer(None if minutes is None else timedelta(minutes=minutes), verbose=False)
-    kept = CheckpointCallback(out, progress)
+    timer = Timer(None if minutes is None else timedelta(minutes=minutes), verbose=False)
+    kept = CheckpointCallback(out, progress, timer)
     progress("draw maps", 0, 1)
     data = TrainingData(settings)
     progress("draw maps", 1, 1)
-    with _quiet_lightning(), writing(force=resume):  # last.ckpt says whose folder it is
-        stop = EarlyStopping("validation_nll", patience=settings.training.patience, mode="min")
-        trainer = Trainer(
-            accelerator="gpu" if torch.cuda.is_available() else "cpu",
-            devices=1,
-            max_epochs=settings.training.epochs,
-            callbacks=[stop, kept, timer],
-            logger=False,
-            default_root_dir=str(out),
-            gradient_clip_val=1.0,
-            reload_dataloaders_every_n_epochs=1,
-            num_sanity_val_steps=0 if resume else -1,  # the untrained network is the first row of the history
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        _fit(trainer, ProposerModule(settings, network), data, str(out / LAST) if resume else None)
+    with writing(force=resume):  # last.ckpt says whose folder it is
+        _fit(ProposerModule(settings, network), data, kept, timer, resume)
     if not kept.best:
         do = "lower training.learning_rate"
         raise SettingsError(refusal("training", expected="finite losses", got="others in the first epoch", do=do))
@@ -319,21 +283,39 @@ def _check_last(last: Path, settings: ProposerSettings) -> None:
     except Exception as error:  # damaged pickles raise nearly anything
         got = "a damaged file, or one of another version"
         raise CheckpointError(refusal(name, expected="a whole last.ckpt", got=got, do=do)) from error
-    if _without_length(before) != _without_length(settings):
+    old, new = (one.model_dump(exclude={"training": set(LENGTH)}) for one in (before, settings))
+    if old != new:
         do = "pass settings.yaml beside it"
         raise CheckpointError(refusal(name, expected="the same settings", got="other settings", do=do))
 
 
-def _without_length(settings: ProposerSettings) -> dict[str, Any]:
-    return settings.model_dump(exclude={"training": set(LENGTH)})
-
-
-def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str | None) -> None:
-    """Train; raise KeyboardInterrupt on Ctrl-C, where Lightning would exit."""
+def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, timer: Timer, resume: bool) -> None:
+    """Train without Lightning's messages; raise KeyboardInterrupt on Ctrl-C, where Lightning would exit."""
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
+    training = module.settings.training
+    loggers = {name: logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")}
+    levels = {name: logger.level for name, logger in loggers.items()}
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=last)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
+            for logger in loggers.values():
+                logger.setLevel(logging.ERROR)
+            trainer = Trainer(
+                accelerator="gpu" if torch.cuda.is_available() else "cpu",
+                devices=1,
+                max_epochs=training.epochs,
+                callbacks=[EarlyStopping("validation_nll", patience=training.patience, mode="min"), kept, timer],
+                logger=False,
+                default_root_dir=str(kept.out),
+                gradient_clip_val=1.0,
+                reload_dataloaders_every_n_epochs=1,
+                num_sanity_val_steps=0 if resume else -1,  # the untrained network is the first row of the history
+                enable_checkpointing=False,
+                enable_progress_bar=False,
+                enable_model_summary=False,
+            )
+            trainer.fit(module, datamodule=data, ckpt_path=str(kept.out / LAST) if resume else None)
     except SystemExit:
         if trainer.interrupted:
             raise KeyboardInterrupt from None
@@ -341,18 +323,5 @@ def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str
     finally:
         if main:
             signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _quiet_lightning() -> Iterator[None]:
-    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        for name, logger in loggers.items():
+            logger.setLevel(levels[name])

@@ -22,7 +22,7 @@ MAX_SIDE = 1 << 16  # px; larger than any sensor
 FIRST = 64  # images that determine the usual size
 JPEG, FILTER_ARRAY = 1, 2  # values of `compression`
 PREFIX = 8  # bytes before the pixels at least: size of the annotation, size of the image
-COPY_AGAIN = "copy it from the camera again"
+COPY_AGAIN, EXPORT_AGAIN = "copy it from the camera again", "export it again; its header is damaged"
 Rows = NDArray[np.uint8]  # (H, stride), as stored
 
 
@@ -35,61 +35,85 @@ class _Layout:
     packed: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class _Header:
-    layout: _Layout
-    width: int
-    height: int
-    stated: int  # images by the header
-    offsets: NDArray[np.int64]  # (stated or fewer,), of images in the file
-    first_number: int  # of the first image, counted from the trigger
-    times_s: NDArray[np.float64] | None  # (n,) by the block of time stamps, from the trigger
-    frame_rate_hz: int
-    flip_horizontal: bool
-    flip_vertical: bool
-    rotate_deg: int
-    real_bits: int
-
-
 class CineMovie(Movie):
     """A .cine file of uncompressed or packed images; MovieError for compressed ones, filter arrays or damage."""
 
     def __init__(self, path: Path) -> None:
-        header = self._header = _read_header(path)
-        layout = header.layout
-        self._top_down = header.flip_vertical != layout.packed
+        self._read_header(path)
+        layout, (height, width) = self._layout, self._size
+        self._top_down = bool(self._flip_vertical) != layout.packed
         content = np.memmap(path, np.uint8, "r")
-        found = Counter(_prefix_and_size(content, int(offset)) for offset in header.offsets[:FIRST])
+        found = Counter(_prefix_and_size(content, int(offset)) for offset in self._offsets[:FIRST])
         found.pop((0, 0), None)
         if not found:
             raise refused(path, "at least one whole image", "none", COPY_AGAIN)
         (prefix, self._image_size), _ = found.most_common(1)[0]
-        self._stride, rest = divmod(self._image_size, header.height)  # rows may be padded
-        least = -(-header.width * layout.bits // 8)
+        self._stride, rest = divmod(self._image_size, height)  # rows may be padded
+        least = -(-width * layout.bits // 8)
         if rest or self._stride < least:
-            expected = f"images of {header.height} rows of at least {least} bytes"
-            do = "export it again; its header is damaged"
-            raise refused(path, expected, f"{self._image_size} bytes", do)
-        there = np.flatnonzero((header.offsets > 0) & (header.offsets <= len(content) - prefix - self._image_size))
+            expected = f"images of {height} rows of at least {least} bytes"
+            raise refused(path, expected, f"{self._image_size} bytes", EXPORT_AGAIN)
+        there = np.flatnonzero((self._offsets > 0) & (self._offsets <= len(content) - prefix - self._image_size))
         count = int(there[-1]) + 1  # one at least is whole
-        used = f" ({header.real_bits} of them used)" if 0 < header.real_bits < layout.bits else ""
-        super().__init__(
-            path, f".cine, {layout.name}{used}", count, (header.height, header.width), np.dtype(layout.dtype)
-        )
-        self.times_s, remarks = _times(header, count)
-        self.remarks = (*self._truncated(header.stated), *remarks, *self._pixel_remarks())
+        used = f" ({self._real_bits} of them used)" if 0 < self._real_bits < layout.bits else ""
+        super().__init__(path, f".cine, {layout.name}{used}", count, self._size, np.dtype(layout.dtype))
+        self.times_s, remarks = self._times(count)
+        self.remarks = (*self._truncated(self._stated), *remarks, *self._pixel_remarks())
+
+    def _read_header(self, path: Path) -> None:
+        """Read the header (little-endian, packed without gaps); allocate nothing larger than the file."""
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            kind, header_size, compression, _, _, _, first, count, at_bitmap, at_setup, at_table, trigger = _unpack(
+                path, file, 0, FILE_HEADER
+            )
+            if kind != b"CI" or header_size < FILE_HEADER.size:
+                do = "name a movie of a Phantom camera"
+                raise refused(path, "a .cine file, which begins with CI", f"{kind!r}", do)
+            _, width, height, _, bits, packing, *_ = _unpack(path, file, at_bitmap, BITMAP_HEADER)
+            if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+                raise refused(path, "the size of a picture", f"{width} x {height}", EXPORT_AGAIN)
+            rate_16, mark, length = _unpack(path, file, at_setup, SETUP_START)
+            if mark != b"ST":  # older than any version whose fields are known
+                length = 0
+            file.seek(at_setup)
+            setup = SETUP.unpack(file.read(min(length, SETUP.size)).ljust(SETUP.size, b"\0"))
+            file.seek(at_table)
+            offsets = np.frombuffer(file.read(8 * min(count, max(0, size - at_table) // 8)), "<i8")
+            stamps_s = _read_times(file, at_setup + length, min(at_table, size), trigger) if length else None
+        self._layout, self._size = _layout(path, compression, packing, bits), (height, width)
+        self._stated = count  # images by the header
+        self._offsets = offsets.astype(np.int64)  # (stated or fewer,), of images in the file
+        self._first_number = first  # of the first image, counted from the trigger
+        self._stamps_s = stamps_s  # (n,), s, from the trigger; None: no block of time stamps
+        self._flip_horizontal, self._flip_vertical, rate, self._rotate_deg, self._real_bits = setup
+        self._frame_rate_hz = rate or rate_16  # the short field stops at 65535
+
+    def _times(self, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+        """Return the time (count,), s, of each frame from the trigger, by stamps or frame rate, and a remark."""
+        remark = "it has no time stamps"
+        if self._stamps_s is not None and len(self._stamps_s) >= count:
+            times_s = self._stamps_s[:count]
+            if (np.diff(times_s) > 0).all():
+                return times_s, ()
+            remark = "its time stamps do not increase"
+        rate = self._frame_rate_hz
+        if not rate:
+            return None, (f"{remark} and no frame rate",)
+        numbers = self._first_number + np.arange(count, dtype=np.float64)
+        return numbers / rate, (f"{remark}: times are by its frame rate, {rate} Hz",)
 
     def _pixel_remarks(self) -> Iterator[str]:
-        if self._header.layout.colour:
+        if self._layout.colour:
             yield COLOUR_REMARK
-        if self._header.layout.name == "packed 10 bit":
+        if self._layout.name == "packed 10 bit":
             yield "packed 10 bit: grey values are the recorder's codes, which are not linear in brightness"
-        if self._header.flip_vertical:
+        if self._flip_vertical:
             yield "its header asks for rows turned round (bFlipV), applied; if the picture stands on its head: flip"
-        if self._header.flip_horizontal:
+        if self._flip_horizontal:
             yield "its header asks for columns turned round (bFlipH), applied; if the picture is mirrored: flip"
-        if self._header.rotate_deg:
-            yield f"its header asks for a turn by {self._header.rotate_deg} degrees, which is not applied"
+        if self._rotate_deg:
+            yield f"its header asks for a turn by {self._rotate_deg} degrees, which is not applied"
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         whole = (self.path.stat().st_size,)
@@ -97,14 +121,14 @@ class CineMovie(Movie):
             yield self._picture(content, number)
 
     def _picture(self, content: NDArray[np.uint8], number: int) -> Grey:
-        offset = int(self._header.offsets[number])
+        offset = int(self._offsets[number])
         prefix, size = _prefix_and_size(content, offset)
         if size != self._image_size:
             raise self._damage(number, "an image that is cut off or of another size")
         pixels = content[offset + prefix : offset + prefix + size]
-        grey = _grey(pixels.reshape(self._header.height, self._stride), self._header.width, self._header.layout)
+        grey = _grey(pixels.reshape(self._size[0], self._stride), self._size[1], self._layout)
         upright = grey if self._top_down else grey[::-1]
-        if self._header.flip_horizontal:
+        if self._flip_horizontal:
             upright = upright[:, ::-1]
         return np.array(upright, self.dtype, order="C")  # a copy: the memory is the file's
 
@@ -118,45 +142,6 @@ def _prefix_and_size(content: NDArray[np.uint8], offset: int) -> tuple[int, int]
         return 0, 0
     size = int.from_bytes(content[offset + prefix - 4 : offset + prefix].tobytes(), "little")
     return (prefix, size) if size <= len(content) - offset - prefix else (0, 0)
-
-
-def _read_header(path: Path) -> _Header:
-    """Read the header (little-endian, packed without gaps); allocate nothing larger than the file."""
-    with path.open("rb") as file:
-        size = file.seek(0, 2)
-        kind, header_size, compression, _, _, _, first, count, at_bitmap, at_setup, at_table, trigger = _unpack(
-            path, file, 0, FILE_HEADER
-        )
-        if kind != b"CI" or header_size < FILE_HEADER.size:
-            raise refused(path, "a .cine file, which begins with CI", f"{kind!r}", "name a movie of a Phantom camera")
-        _, width, height, _, bits, packing, *_ = _unpack(path, file, at_bitmap, BITMAP_HEADER)
-        if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-            do = "export it again; its header is damaged"
-            raise refused(path, "the size of a picture", f"{width} x {height}", do)
-        rate_16, mark, length = _unpack(path, file, at_setup, SETUP_START)
-        if mark != b"ST":  # older than any version whose fields are known
-            length = 0
-        file.seek(at_setup)
-        setup = SETUP.unpack(file.read(min(length, SETUP.size)).ljust(SETUP.size, b"\0"))
-        file.seek(at_table)
-        offsets = np.frombuffer(file.read(8 * min(count, max(0, size - at_table) // 8)), "<i8").astype(np.int64)
-        times_s = _read_times(file, at_setup + length, min(at_table, size), trigger) if length else None
-
-    flip_horizontal, flip_vertical, rate, rotate_deg, real_bits = setup
-    return _Header(
-        layout=_layout(path, compression, packing, bits),
-        width=width,
-        height=height,
-        stated=count,
-        offsets=offsets,
-        first_number=first,
-        times_s=times_s,
-        frame_rate_hz=rate or rate_16,  # the short field stops at 65535
-        flip_horizontal=bool(flip_horizontal),
-        flip_vertical=bool(flip_vertical),
-        rotate_deg=rotate_deg,
-        real_bits=real_bits,
-    )
 
 
 def _unpack(path: Path, file: BinaryIO, at: int, layout: struct.Struct) -> tuple[Any, ...]:
@@ -182,21 +167,6 @@ def _read_times(file: BinaryIO, at: int, end: int, trigger: int) -> NDArray[np.f
             return since.view(np.int64) / 2.0**32
         at += size
     return None
-
-
-def _times(header: _Header, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return the time (count,), s, of each frame from the trigger, by stamps or frame rate, and a remark."""
-    remark = "it has no time stamps"
-    if header.times_s is not None and len(header.times_s) >= count:
-        times_s = header.times_s[:count]
-        if (np.diff(times_s) > 0).all():
-            return times_s, ()
-        remark = "its time stamps do not increase"
-    rate = header.frame_rate_hz
-    if not rate:
-        return None, (f"{remark} and no frame rate",)
-    numbers = header.first_number + np.arange(count, dtype=np.float64)
-    return numbers / rate, (f"{remark}: times are by its frame rate, {rate} Hz",)
 
 
 def _layout(path: Path, compression: int, packing: int, bits: int) -> _Layout:

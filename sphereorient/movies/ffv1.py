@@ -4,7 +4,6 @@ import threading
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -18,11 +17,8 @@ TRAILER = 8  # bytes after each slice: 3 its size, 1 a status, 4 the check sum
 # FFV1 computes its CRC from the most significant bit on, zlib from the least: they agree on bit-reversed bytes.
 REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 INVERTED = 0xFFFFFFFF  # zlib inverts check sums before and after
-VERSION = 3
-FRESH = 128  # state of the range coder that nothing has been coded with: a probability of one half
-STATES = 32  # of the numbers in a header
-EXPONENT, MANTISSA, SIGN, MOST = 1, 22, 11, 9  # first states of a number's parts, and the last exponent of its own
-TABLES = 2  # coder type from which the header holds a table of transitions
+MOST = 9  # bits of a number's exponent that have a state of their own
+SHOWN_SHARE = 0.75  # of the pixels that are not 0: slices of other grids share less than this with those of FFmpeg's
 STUB = 14  # bytes of a slice that says it lies outside of the picture
 
 
@@ -72,45 +68,46 @@ class SliceDecoder:
         self.places: tuple[Rectangle, ...] = ()
 
     def matches(self, packet: bytes, picture: Grey) -> bool:
-        """Learn from one packet and its picture (H, W) where slices lie; return whether each one alone gives its part.
-        Where it does not, this stream or this decoder must decode whole frames.
+        """Learn from one packet and its picture (H, W) where slices lie, which FFmpeg cuts row by row; return whether
+        each one alone gives its part and nothing else. Where it does not, or where the picture is too dark to tell,
+        whole frames must be decoded.
         """
         slices = split_slices(packet)
-        header = _header(self._record)
-        if slices is None or header is None or len(slices) < 2:
+        if slices is None or np.mean(picture > 0) < SHOWN_SHARE:
+            return False
+        count = len(slices)
+        grids = ((rows, columns) for rows in range(2, count) for columns in range(rows, 2 * rows))
+        grid = next((one for one in grids if one[0] * one[1] == count), None)
+        if grid is None:
             return False
         self.dtype = picture.dtype
-        columns, rows = (
-            [k * size // count for k in range(count + 1)]
-            for size, count in zip(self.shape[::-1], (header.columns, header.rows), strict=True)
-        )
-        places = [
-            _slice_at(content, first=number == 0, transitions=header.transitions)
-            for number, content in enumerate(slices)
-        ]
-        cells = [(across, down) for down in range(header.rows) for across in range(header.columns)]
-        if sorted(places) != sorted((*cell, 0, 0) for cell in cells):
-            return False
+        down, across = ([k * size // n for k in range(n + 1)] for size, n in zip(self.shape, grid, strict=True))
         self.places = tuple(
-            Rectangle(columns[across], rows[down], columns[across + 1], rows[down + 1]) for across, down, *_ in places
+            Rectangle(left, top, right, bottom) for top, bottom in pairwise(down) for left, right in pairwise(across)
         )
         for number, place in enumerate(self.places):
-            part = np.zeros(self.shape, self.dtype)
-            self.decode(slices, [number], part)
-            if not np.array_equal(part[_pixels(place)], picture[_pixels(place)]):
+            self._own = threading.local()  # a fresh decoder leaves 0 beside its slice
+            alone, expected = self.decoded(slices, {number}), np.zeros_like(picture)
+            expected[_pixels(place)] = picture[_pixels(place)]
+            if alone is None or not np.array_equal(alone, expected):
                 return False
         return True
 
     def decode(self, slices: Sequence[bytes], numbers: Sequence[int], into: Grey) -> None:
         """Decode slices of a packet, by number, into their places of a picture (H, W)."""
-        wanted = set(numbers)
-        some = [content if k in wanted else _stub(k == 0) for k, content in enumerate(slices)]
+        whole = self.decoded(slices, set(numbers))
+        if whole is not None:  # else 0, which shows no sphere
+            for number in numbers:
+                into[_pixels(self.places[number])] = whole[_pixels(self.places[number])]
+
+    def decoded(self, slices: Sequence[bytes], wanted: set[int]) -> Grey | None:
+        """Return a picture (H, W) of which only these slices are decoded; None where that gives no such picture."""
+        some = [content if k in wanted else stub_slice(k == 0) for k, content in enumerate(slices)]
         frames = self._context.decode(av.Packet(b"".join(some)))
         if len(frames) != 1 or (frames[0].height, frames[0].width) != self.shape:
-            return  # 0 shows no sphere
-        whole = self._values(frames[0])
-        for number in wanted:
-            into[_pixels(self.places[number])] = whole[_pixels(self.places[number])]
+            return None
+        found: Grey = self._values(frames[0])
+        return found
 
     @property
     def _context(self) -> av.VideoCodecContext:
@@ -171,45 +168,8 @@ class SlicedPicture(OnDemand):
         return self._pixels
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What the configuration record says that slices need."""
-
-    transitions: tuple[int, ...]  # state after a one, by state
-    columns: int  # of slices
-    rows: int
-
-
-def _header(record: bytes) -> _Header | None:
-    """Read a configuration record; None for other versions and for more than grey. Source: RFC 9043, 4.2."""
-    if len(record) < TRAILER:
-        return None
-    usual = _usual_transitions()
-    coder, state = _RangeDecoder(record, usual), [FRESH] * STATES
-    version, _, kind = (coder.number(state) for _ in range(3))
-    transitions = usual
-    if kind >= TABLES:
-        transitions = (0, *((usual[k] + coder.signed(state)) & 0xFF for k in range(1, 256)))
-    colours, _ = coder.number(state), coder.number(state)
-    chroma = coder.bit(state, 0)
-    coder.number(state), coder.number(state)  # how much coarser colours are
-    alpha = coder.bit(state, 0)
-    columns, rows = coder.number(state) + 1, coder.number(state) + 1
-    if version != VERSION or colours or chroma or alpha:
-        return None
-    return _Header(transitions=transitions, columns=columns, rows=rows)
-
-
-def _slice_at(content: bytes, first: bool, transitions: Sequence[int]) -> tuple[int, int, int, int]:
-    """Return column, row, and how many more columns and rows a slice has, by its header. Source: RFC 9043, 4.6."""
-    coder, state = _RangeDecoder(content, transitions), [FRESH] * STATES
-    if first:
-        coder.bit([FRESH], 0)  # a key frame
-    return coder.number(state), coder.number(state), coder.number(state), coder.number(state)
-
-
 @lru_cache(maxsize=2)
-def _stub(first: bool) -> bytes:
+def stub_slice(first: bool) -> bytes:
     """Return a slice that says it lies outside of every picture, so that the decoder leaves it out at once.
     All of its bits have a probability of one half: whether it is a key frame, if `first`, and a column beyond 1023.
     """
@@ -224,67 +184,3 @@ def _stub(first: bool) -> bytes:
             low, width, count = low << 8, width << 8, count + 1
     content = low.to_bytes(count, "big").ljust(STUB, b"\xff") + STUB.to_bytes(3, "big") + b"\0"
     return content + _crc(content).to_bytes(4, "little").translate(REVERSED_BITS)
-
-
-class _RangeDecoder:
-    """Decodes bits of adaptive probability. Source: RFC 9043, 3.8.1."""
-
-    def __init__(self, content: bytes, transitions: Sequence[int]) -> None:
-        self._rest = iter(content[2:])
-        self._low, self._width = int.from_bytes(content[:2], "big"), 0xFF00
-        self._after_one = transitions
-
-    def bit(self, state: list[int], k: int) -> bool:
-        """Decode a bit by the state k, and change that."""
-        part = (self._width * state[k]) >> 8
-        self._width -= part
-        one = self._low >= self._width
-        if one:
-            self._low, self._width = self._low - self._width, part
-            state[k] = self._after_one[state[k]]
-        else:
-            state[k] = 256 - self._after_one[256 - state[k]]
-        if self._width < 0x100:
-            self._low, self._width = (self._low << 8) + next(self._rest, 0), self._width << 8
-        return one
-
-    def number(self, state: list[int]) -> int:
-        """Decode a number that is not negative."""
-        return self._magnitude(state)[0]
-
-    def signed(self, state: list[int]) -> int:
-        """Decode a number."""
-        value, exponent = self._magnitude(state)
-        return -value if value and self.bit(state, SIGN + min(exponent, MOST + 1)) else value
-
-    def _magnitude(self, state: list[int]) -> tuple[int, int]:
-        if self.bit(state, 0):
-            return 0, 0
-        exponent = 0
-        while exponent < STATES and self.bit(state, EXPONENT + min(exponent, MOST)):
-            exponent += 1
-        value = 1
-        for k in reversed(range(exponent)):
-            value = 2 * value + self.bit(state, MANTISSA + min(k, MOST))
-        return value, exponent
-
-
-@lru_cache(maxsize=1)
-def _usual_transitions() -> tuple[int, ...]:
-    """Return the state after a one by state, where no table is given. Source: RFC 9043, 3.8.1.5, by its formula."""
-    one, rate, most = 1 << 32, int(0.05 * (1 << 32)), 248
-    after = [0] * 256
-    chance = one // 2
-    chain: list[int] = []
-    for _ in range(128):
-        chain.append(max((256 * chance + one // 2) >> 32, chain[-1] + 1 if chain else 0))
-        chance += ((one - chance) * rate + one // 2) >> 32
-    for state, following in pairwise(chain):
-        if following <= most:
-            after[state] = following
-    for state in range(256 - most, most + 1):
-        if not after[state]:
-            chance = (state * one + 128) >> 8
-            chance += ((one - chance) * rate + one // 2) >> 32
-            after[state] = min(max((256 * chance + one // 2) >> 32, state + 1), most)
-    return tuple(after)

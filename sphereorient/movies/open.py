@@ -22,9 +22,7 @@ def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
     Videos: .mkv, .avi, .mp4, .mov (any codec of FFmpeg), .cine. Stacks of uint8 or uint16: .tif, .tiff, .npy (N, H, W),
     .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: a folder, or a pattern with * or %05d.
-
-    Raises:
-        MovieError: missing, of another suffix, unreadable, or empty.
+    Raises MovieError: missing, of another suffix, unreadable, or empty.
     """
     path = Path(path)
     if _is_sequence(path):

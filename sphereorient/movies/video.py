@@ -1,12 +1,13 @@
 """Videos that FFmpeg decodes: exact seeks, exact grey values, nothing decoded from damaged data."""
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import av
 import numpy as np
@@ -16,6 +17,7 @@ from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
 from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, OnDemand, luma, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
+Found = TypeVar("Found")
 LOSSLESS = "lossless"
 PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so may have a grey first plane
 NOTHING = "none from the decoder"
@@ -111,25 +113,12 @@ class VideoMovie(Movie):
 
     def _packets(self, numbers: range) -> Iterator[tuple[int, bytes | None]]:
         """Yield increasing frame numbers with their packets, None where the file holds none."""
-        waiting = iter(numbers)
-        wanted = next(waiting, None)
-        if wanted is None:
+        if not numbers:
             return
         with _opened(self.path) as container:
-            self._seek(container, wanted)
-            for packet in _demuxed(container):
-                number = self._index.number(packet.pts, packet.pos)
-                while wanted is not None and number is not None and wanted < number:
-                    yield wanted, None
-                    wanted = next(waiting, None)
-                if wanted is not None and wanted == number:
-                    yield wanted, bytes(packet)
-                    wanted = next(waiting, None)
-                if wanted is None:
-                    return
-        while wanted is not None:
-            yield wanted, None
-            wanted = next(waiting, None)
+            self._seek(container, numbers[0])
+            packets = ((self._index.number(each.pts, each.pos), bytes(each)) for each in _demuxed(container))
+            yield from _aligned(numbers, packets)
 
     def _decode(self, numbers: Sequence[int]) -> Iterator[Grey | MovieError]:
         with _opened(self.path) as container:
@@ -160,25 +149,20 @@ class VideoMovie(Movie):
         self, container: av.container.InputContainer, numbers: list[int], key: int
     ) -> Iterator[Grey | MovieError]:
         """Yield picture or error of increasing frame numbers; ignore damage before `key`, which the seek may cause."""
-        waiting = iter(numbers)
-        wanted = next(waiting, None)
         spoilt: dict[int, str] = {}
-        for number, frame in self._decoded(container):
-            if isinstance(frame, str):
-                if number >= key:
-                    spoilt |= {lost: frame for lost in self._index.spoilt_by(number) if lost not in spoilt}
-                continue
-            while wanted is not None and wanted < number:
-                yield self._damage(wanted, spoilt.get(wanted, NOTHING))
-                wanted = next(waiting, None)
-            if wanted == number:
-                yield self._damage(number, spoilt[number]) if number in spoilt else self._picture(frame, number)
-                wanted = next(waiting, None)
-            if wanted is None:
-                return
-        while wanted is not None:
-            yield self._damage(wanted, spoilt.get(wanted, NOTHING))
-            wanted = next(waiting, None)
+
+        def undamaged() -> Iterator[tuple[int, av.VideoFrame]]:
+            for number, frame in self._decoded(container):
+                if not isinstance(frame, str):
+                    yield number, frame
+                elif number >= key:
+                    spoilt.update({lost: frame for lost in self._index.spoilt_by(number) if lost not in spoilt})
+
+        for number, frame in _aligned(numbers, undamaged()):
+            if frame is None or number in spoilt:
+                yield self._damage(number, spoilt.get(number, NOTHING))
+            else:
+                yield self._picture(frame, number)
 
     def _decoded(self, container: av.container.InputContainer) -> Iterator[tuple[int, av.VideoFrame | str]]:
         """Decode from the container's position on; yield frame numbers with the frame or the error in words."""
@@ -206,6 +190,19 @@ class VideoMovie(Movie):
         expected = f"pictures of one kind, {self.frame_shape} {self._pixels}"
         got, do = f"{(frame.height, frame.width)} {frame.format.name}", "split the movie where it changes"
         return refused(f"{self.path}, frame {number}", expected, got, do)
+
+
+def _aligned(numbers: Sequence[int], found: Iterable[tuple[int | None, Found]]) -> Iterator[tuple[int, Found | None]]:
+    """Yield increasing frame numbers with what was found of them, None without; other findings are left out."""
+    waiting = deque(numbers)
+    for number, thing in found:
+        while waiting and number is not None and waiting[0] < number:
+            yield waiting.popleft(), None
+        if waiting and waiting[0] == number:
+            yield waiting.popleft(), thing
+        if not waiting:
+            return
+    yield from ((number, None) for number in waiting)
 
 
 def _opened(path: Path) -> av.container.InputContainer:

@@ -31,10 +31,8 @@ def write_movie(
     """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5); return their number.
     A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, go into the HDF5 file, or
     beside the .mkv into `MOVIE.times.csv`, for `times:` of experiment.yaml; players alone use `frame_rate_hz` of .mkv.
-
-    Raises:
-        MovieError: another suffix, no frame, or frames of different size or type.
-        OutputError: the file cannot be written; an old file is kept.
+    Raises MovieError: another suffix, no frame, or frames of different size or type; OutputError: the file cannot be
+    written; an old file is kept.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:

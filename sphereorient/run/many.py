@@ -35,20 +35,20 @@ class ProcessExecutor:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._workers = [_worker() for _ in range(size)]
+        self.workers = [_worker() for _ in range(size)]
 
     def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Start a task on an idle worker."""
-        return self._workers[worker].submit(task, *arguments)
+        return self.workers[worker].submit(task, *arguments)
 
     def renew(self, worker: int) -> None:
         """Replace a worker that died."""
-        self._workers[worker].shutdown(wait=False, cancel_futures=True)
-        self._workers[worker] = _worker()
+        self.workers[worker].shutdown(wait=False, cancel_futures=True)
+        self.workers[worker] = _worker()
 
     def close(self) -> None:
         """Terminate the workers; finished work is in the stores."""
-        for worker in self._workers:
+        for worker in self.workers:
             processes = list((getattr(worker, "_processes", None) or {}).values())
             worker.shutdown(wait=False, cancel_futures=True)
             for process in processes:
@@ -77,12 +77,11 @@ def end_with_parent() -> None:
 
 class DaskExecutor:
     """The workers of a Dask cluster (`distributed.Client`); they must see the same files under the same names.
-
     `cluster`: closed together with the connection; None: it continues for others.
     """
 
     def __init__(self, client: Any, cluster: Any = None) -> None:
-        self._client, self._cluster = client, cluster
+        self._client, self.cluster = client, cluster
         self._executor = client.get_executor(pure=False, retries=0)
 
     @property
@@ -103,8 +102,8 @@ class DaskExecutor:
         """Disconnect."""
         self._executor.shutdown(wait=False)
         self._client.close()
-        if self._cluster is not None:
-            self._cluster.close()
+        if self.cluster is not None:
+            self.cluster.close()
 
 
 Executor = ProcessExecutor | DaskExecutor
@@ -112,9 +111,7 @@ Executor = ProcessExecutor | DaskExecutor
 
 def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
     """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
-
-    Raises:
-        SettingsError: Dask is not installed, or the scheduler does not answer.
+    Raises SettingsError: Dask is not installed, or the scheduler does not answer.
     """
     try:
         import distributed
@@ -211,12 +208,9 @@ def run_many(
     requests: Sequence[Request], executor: Executor, *, resume: bool = False, progress: Progress = silent
 ) -> list[Outcome]:
     """Track experiments on the workers of an executor; return the outcomes in the order of the requests.
-
     Each track equals that of a single process to the last bit; failures and dead workers do not stop the others. The
     executor is closed. `resume` continues from stores; `progress` gets a track's name, frames done and all frames.
-
-    Raises:
-        SettingsError: two requests have the same track.
+    Raises SettingsError: two requests have the same track.
     """
     outs = [request.track.resolve() for request in requests]
     if twice := [str(out) for k, out in enumerate(outs) if out in outs[:k]]:

@@ -1,6 +1,6 @@
 """One way through a run, for every command, the Python API and the workers: learn, follow, join."""
 
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -40,11 +40,9 @@ class Task:
 
 def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory | Tracks:
     """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
-
     `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
-
-    Raises:
-        SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store stays).
+    Raises SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store
+    stays).
     """
     check_out(request)
     with opened(request, store, progress) as work, store.held(request, resume=resume):
@@ -60,7 +58,6 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
     """Yield the tasks of a run, stage by stage; send all results of a stage to get the next one.
-
     The tasks of one stage are independent. The `workers` share the frames; None: one task follows all.
     """
     (batches,) = yield [Task("learn")]
@@ -162,12 +159,10 @@ def track_movies(
     settings: Settings | None = None,
     cameras: Sequence[str] | None = None,
     device: str = "cpu",
-    learnt: Learnt | Mapping[str, Learnt] | None = None,
-    proposer: str | Path | None = None,
     progress: Progress = silent,
-    command: str = "sphereorient.track_movies",
 ) -> Trajectory | Tracks:
     """Measure position (mm) and orientation of the sphere in every frame; see docs/data-format.md for the result.
+    `run` with a `Request` does the same from what another run learnt, and writes files.
 
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
@@ -175,10 +170,7 @@ def track_movies(
         settings: None: the defaults.
         cameras: names of the cameras to use; None: all.
         device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
-        learnt: background, light and motion from another run; None: estimate them (method precise).
-        proposer: checkpoint of a network (docs/proposer.md), "default": the bundled one; None: as in the settings.
         progress: called with stage, frames done and frames in all.
-        command: recorded as the origin in the track's provenance.
 
     Raises:
         SphereOrientError: missing, unreadable or inconsistent inputs.
@@ -187,17 +179,15 @@ def track_movies(
         source = experiment if isinstance(experiment, Experiment) else Path(experiment)
     except TypeError as error:
         got, do = type(experiment).__name__, "name the movies in it; `sphereorient init MOVIE...` writes one"
-        raise ExperimentError(
-            refusal("experiment", expected="the path of an experiment.yaml", got=got, do=do)
-        ) from error
+        expected = "the path of an experiment.yaml"
+        raise ExperimentError(refusal("experiment", expected=expected, got=got, do=do)) from error
     request = Request(
         experiment=source,
         method=method,
-        settings=with_proposer(settings or Settings(), proposer),
+        settings=settings or Settings(),
         cameras=None if cameras is None else tuple(cameras),
         device=device,
-        learnt=learnt,
-        command=command,
+        command="sphereorient.track_movies",
     )
     return run(request, MemoryStore(), progress=progress)
 

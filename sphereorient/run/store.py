@@ -158,10 +158,8 @@ class FolderStore:
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
         """Create the folder, or resume from it, and lock it against other runs.
-
-        Raises:
-            TrackError: the folder to resume from belongs to a run with other inputs or settings.
-            OutputError: it cannot be written, it is not of a run, or another run is writing it.
+        Raises TrackError: the folder to resume from belongs to a run with other inputs or settings; OutputError: it
+        cannot be written, it is not of a run, or another run is writing it.
         """
         with self._locked():
             now, before = fingerprint(request), self._fingerprint()
@@ -290,19 +288,17 @@ def read_poses(path: Path) -> dict[str, list[Poses]] | None:
             if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file):
                 return None
             groups = {str(name): group for name, group in file[SPHERES].items()} if SPHERES in file else {"": file}
-            found = {name: _read_poses(group) for name, group in groups.items()}
+            return {name: _read_poses(group) for name, group in groups.items()}
     except MemoryError:
         raise
     except DAMAGE:
         return None
-    whole = {name: poses for name, poses in found.items() if poses is not None}
-    return whole if len(whole) == len(found) else None
 
 
-def _read_poses(group: h5py.Group) -> list[Poses] | None:
+def _read_poses(group: h5py.Group) -> list[Poses]:
     R = torch.from_numpy(group["R_lab_body"][()])
     if not bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all()):
-        return None
+        raise ValueError("no rotations")
     count, use = group["count"][()].tolist(), torch.from_numpy(group["use"][()])
     reason = [[Reason(why.decode()) for why in row] for row in group["reason"][()].tolist()]
     parts = {name: torch.split(torch.from_numpy(group[name][()]), count) for name in POSE_PARTS}

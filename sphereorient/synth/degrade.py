@@ -8,8 +8,8 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
-from sphereorient.synth.severities import DEGRADATIONS, degradation
+from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.synth.severities import DEGRADATIONS, check_values, degradation
 
 WHITE_LEVEL = 255
 VEIL = 95.0  # grey level of turbid liquid
@@ -59,22 +59,13 @@ Put = Callable[[Tensor, Tensor, Disk], Tensor]
 
 def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
     """Return pictures (..., H, W), unrounded and unclipped floats, with degradations in a fixed order.
-
     `values` maps names to physical values, see `severity`.
-
-    Raises:
-        SettingsError: unknown name, no picture degradation, or impossible value.
-        ShapeError: not pictures.
+    Raises SettingsError: unknown name, no picture degradation, or impossible value; ShapeError: not pictures.
     """
     if pictures.ndim < 2 or not pictures.is_floating_point():
         got, do = f"{tuple(pictures.shape)} {pictures.dtype}", "pass grey levels as floats"
         raise ShapeError(refusal("pictures", expected="(..., H, W) floats", got=got, do=do))
-    for name, value in values.items():
-        row = degradation(name)
-        if name not in OPERATIONS:
-            expected, do = f"one of {', '.join(OPERATIONS)}", "apply it with write_degraded, which films the scene"
-            raise SettingsError(refusal("degradation of pictures", expected=expected, got=name, do=do))
-        row.check(value)
+    check_values(values, OPERATIONS, "apply it with write_degraded, which films the scene")
     for name, operation in OPERATIONS.items():
         if name in values and values[name] != DEGRADATIONS[name].nothing:
             pictures = operation(pictures, values[name], disk, rng)
@@ -227,21 +218,8 @@ def read_noise(pictures: Tensor, sigma: float, disk: Disk, rng: torch.Generator)
     return pictures + sigma * _normal(pictures, rng)
 
 
-OPERATIONS: Mapping[str, Operation] = MappingProxyType(
-    {
-        "uneven_light": uneven_light,
-        "highlights": highlights,
-        "background_clutter": background_clutter,
-        "occlusion": occlusion,
-        "bubbles": bubbles,
-        "dirt": dirt,
-        "contrast_loss": contrast_loss,
-        "defocus": defocus,
-        "saturation": saturation,
-        "shot_noise": shot_noise,
-        "read_noise": read_noise,
-    }
-)
+_ALL = (uneven_light, highlights, background_clutter, occlusion, bubbles, dirt, contrast_loss, defocus, saturation)
+OPERATIONS: Mapping[str, Operation] = MappingProxyType({one.__name__: one for one in (*_ALL, shot_noise, read_noise)})
 
 # Those that draw a field of the whole picture: how it is drawn, and how it is put into a picture.
 FIELDS: Mapping[str, tuple[Draw, Put]] = MappingProxyType(

@@ -134,7 +134,6 @@ class Filming:
 
     def picture(self, exposure: Exposure, disk: Disk, name: str, frame: int) -> NDArray[np.float32]:
         """Return degraded grey levels (H, W) of a camera's frame, before the camera's own noise.
-
         `disk` is the place of the sphere. What the sphere cannot change is taken from the empty picture.
         """
         beyond = max((BEYOND.get(what, 0.0) for what in self.optics), default=0.0) * float(disk.radius_px)
@@ -202,7 +201,6 @@ def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -
 
 def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float], seed: int = 0) -> Mapping[str, Camera]:
     """Return cameras whose principal points are off along the diagonal, in opposite directions by turns.
-
     One is also rotated about the lab origin, whose pixel stays, and shifted along its own x: the second with an even
     seed, the first with an odd one.
     """

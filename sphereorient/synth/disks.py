@@ -10,13 +10,12 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Rays
-from sphereorient.errors import SettingsError, refusal
 from sphereorient.sphere import reduced_texture, see_sphere
 from sphereorient.sphere.renderer import lambert
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth.degrade import OPERATIONS, Disk, blurred, centre_error, degrade, radius_error
 from sphereorient.synth.scene import LIT
-from sphereorient.synth.severities import DEGRADATIONS
+from sphereorient.synth.severities import DEGRADATIONS, check_values
 from sphereorient.synth.textures import random_directions
 
 MARGIN = 0.2  # picture beyond the limb, radii
@@ -51,14 +50,11 @@ def film_disks(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: DiskSettings
 ) -> Tensor:
     """Film a sphere with random light per picture; return crops (F, S, S) float32, grey levels.
-
     `texture` is the worn map (H, 2 H), `R_view_body` (F, 3, 3); `values` maps `DISK_DEGRADATIONS` to physical values,
     values of maps are ignored.
-
-    Raises:
-        SettingsError: unknown name or impossible value.
+    Raises SettingsError: unknown name or impossible value.
     """
-    _check(values)
+    check_values(values, DISK_DEGRADATIONS, "film a movie: write_degraded")
     scale = settings.scale
     diameter = values.get("ball_size", settings.diameter_px)
     if diameter < settings.diameter_px:
@@ -75,14 +71,6 @@ def film_disks(
     noise = (READ_NOISE**2 + SHOT_NOISE**2 * grey.clamp_min(0)).sqrt()
     grey = (grey + noise * torch.randn(grey.shape, generator=rng)).round().clamp(0, 255)
     return _cropped(grey, _outline(disk, values, scale, rng, settings), settings.size_px)
-
-
-def _check(values: Mapping[str, float]) -> None:
-    for name, value in values.items():
-        if name not in DISK_DEGRADATIONS:
-            expected, do = f"one of {', '.join(DISK_DEGRADATIONS)}", "film a movie: write_degraded"
-            raise SettingsError(refusal("degradation of single balls", expected=expected, got=name[:40], do=do))
-        DEGRADATIONS[name].check(value)
 
 
 def _lit(

@@ -68,7 +68,6 @@ def random_motion(
     velocity_rms: float, velocity_time: float, omega_rms: float, omega_time: float, volume_mm: float, seed: int
 ) -> RandomMotion:
     """Draw a smooth motion from rms values per component, m/s and rad/s (lab), and correlation times, s.
-
     The velocity is reduced where the rms distance from the origin would exceed half of `volume_mm`.
     """
     rng = torch.Generator().manual_seed(seed)
@@ -110,7 +109,6 @@ def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8
 
 def magnus_rotation(early: Tensor, late: Tensor, step_s: Tensor | float) -> Tensor:
     """Return step rotations (..., 3, 3) from omega (..., 3), rad/s, at each step's two Gauss nodes.
-
     Source: fourth-order Magnus expansion (Iserles and Norsett 1999).
     """
     h = step_s

@@ -132,12 +132,9 @@ def exposures(
     scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> Iterator[Exposure]:
     """Yield N exposures of K balls without noise.
-
     `position_lab_mm` (K, N, E, 3) and `R_lab_body` (K, N, E, 3, 3) are the poses at the E instants of each exposure.
     Nearer balls cover those behind them; balls cast no shadows.
-
-    Raises:
-        CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
+    Raises CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     size, blur_px = camera.image_size[::-1], scenes[0].settings.blur_px
     radii_mm = position_lab_mm.new_tensor([scene.settings.diameter_mm / 2 for scene in scenes])[:, None, None]
@@ -206,7 +203,6 @@ def _seen(
     scene: RenderedScene, origin: Tensor, direction: Tensor, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> Tensor:
     """Return shaded paint times coverage, and coverage, (2, M) float32, of M pixels with rays (3, M S), float64.
-
     It is what `see_sphere` sees, where a ray hits; with x, y and z apart it takes a fifth of the time.
     """
     settings, radius_mm = scene.settings, scene.settings.diameter_mm / 2

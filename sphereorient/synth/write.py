@@ -84,10 +84,7 @@ def write_degraded(
     clean: Clean | None = None,
 ) -> Path:
     """Render as `write_synthetic_experiment` does; `applied` maps degradations to levels 1 .. 5.
-
-    Raises:
-        SettingsError: unknown name or level, or impossible scene.
-        OutputError: folder not writable.
+    Raises SettingsError: unknown name or level, or impossible scene; OutputError: folder not writable.
     """
     values = {name: severity(name, k) for name, k in applied.items()}
     return write_synthetic_experiment(folder, base, progress, values, clean)
@@ -101,15 +98,12 @@ def write_synthetic_experiment(
     clean: Clean | None = None,
 ) -> Path:
     """Render an experiment with exact truth in `folder` and return the path of experiment.yaml.
-
     The folder also receives movies, backgrounds, texture.png (of several balls texture_0.png, ... of each paint),
     cameras.yaml and truth.h5; old files are replaced. `progress` receives the number of frames rendered since the last
     call. `values` maps degradations to physical values: reported cameras, texture map and diameter may be wrong;
     truth.h5 describes the filmed cameras and sphere. `clean` is called in place of `clean_movie`.
-
-    Raises:
-        SettingsError: unknown degradation, one of a single ball for several, or impossible value or scene.
-        OutputError: folder not writable.
+    Raises SettingsError: unknown degradation, one of a single ball for several, or impossible value or scene;
+    OutputError: folder not writable.
     """
     for name, value in values.items():
         degradation(name).check(value)
@@ -133,15 +127,15 @@ def write_synthetic_experiment(
     save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
     write_truth(folder / "truth.h5", movie.truth, cameras)
     path = folder / "experiment.yaml"
-    write_text(path, yaml.safe_dump(_experiment(filming), sort_keys=False))
+    too_large = values.get("radius_error", 0.0) / (settings.diameter_px / 2)  # share, at the rim of the picture
+    told = settings.model_copy(update={"diameter_mm": settings.diameter_mm * (1 + too_large)})
+    write_text(path, yaml.safe_dump(experiment_document(told, cameras), sort_keys=False))
     return path
 
 
 def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
     """Return what the cameras of `default_cameras` see, before degradations of pictures.
-
-    Raises:
-        SettingsError: no room for a ball.
+    Raises SettingsError: no room for a ball.
     """
     motions = motions_of(settings)
     # Rounded to grey levels, as in the file.
@@ -156,11 +150,8 @@ def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
     at = [motion.at(instants_s(settings).reshape(-1)) for motion in motions.values()]
     X = torch.stack([poses.position_lab_mm.reshape(settings.frames, -1, 3) for poses in at])
     R = torch.stack([poses.R_lab_body.reshape(settings.frames, -1, 3, 3) for poses in at])
-    wearing, cameras, times_s = (
-        [scenes[k] for k in settings.worn.values()],
-        default_cameras(settings),
-        frame_times_s(settings),
-    )
+    wearing = [scenes[k] for k in settings.worn.values()]
+    cameras, times_s = default_cameras(settings), frame_times_s(settings)
     return CleanMovie(
         textures=textures,
         truth={name: motion.at(times_s) for name, motion in motions.items()},
@@ -184,9 +175,7 @@ def instants_s(settings: SynthSettings) -> Tensor:
 
 def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
     """Draw the motion of each ball, by its name; one that meets an earlier ball at a filmed instant is drawn again.
-
-    Raises:
-        SettingsError: no room for a ball.
+    Raises SettingsError: no room for a ball.
     """
     times_s, motions, paths = instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
     for k, name in enumerate(settings.worn):
@@ -207,15 +196,9 @@ def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
 
 def motion_of(settings: SynthSettings) -> RandomMotion:
     """Draw the motion of the first ball of a synthetic experiment."""
-    motion = random_motion(
-        settings.velocity_rms,
-        settings.velocity_time,
-        settings.omega_rms,
-        settings.omega_time,
-        settings.volume_mm,
-        settings.seed,
-    )
-    return without_seam(motion, settings.frames / settings.frame_rate) if settings.periodic else motion
+    s = settings
+    motion = random_motion(s.velocity_rms, s.velocity_time, s.omega_rms, s.omega_time, s.volume_mm, s.seed)
+    return without_seam(motion, s.frames / s.frame_rate) if s.periodic else motion
 
 
 def _texture_file(settings: SynthSettings, paint: int) -> str:
@@ -261,15 +244,6 @@ def _true_values(truth: Motion6D, cameras: Mapping[str, Camera]) -> dict[str, Te
         "alpha_body": (body @ truth.alpha_lab_rad_s2[..., None])[..., 0],
     }
     return data | {f"{name}/centre_px": camera.project(truth.position_lab_mm) for name, camera in cameras.items()}
-
-
-def _experiment(filming: Filming) -> dict[str, Any]:
-    settings = filming.settings
-    too_large = filming.values.get("radius_error", 0.0) / (settings.diameter_px / 2)  # share, at the rim of the picture
-    document = experiment_document(settings, filming.cameras)
-    for sphere in document.get("spheres", {"": document.get("sphere")}).values():
-        sphere["diameter"] *= 1 + too_large
-    return document
 
 
 def experiment_document(settings: SynthSettings, cameras: Iterable[str], suffix: str = ".mkv") -> dict[str, Any]:

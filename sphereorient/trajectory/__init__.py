@@ -2,5 +2,4 @@
 
 from sphereorient.trajectory.datasets import runs_of
 from sphereorient.trajectory.reasons import Flag, Reason
-from sphereorient.trajectory.tracks import Tracks, one_track
-from sphereorient.trajectory.trajectory import CameraTrack, Trajectory, quaternions_wxyz
+from sphereorient.trajectory.trajectory import CameraTrack, Tracks, Trajectory, one_track, quaternions_wxyz

@@ -1,6 +1,5 @@
 """A track that is still being measured: a file of rows that only grows, so that it can be read at any time, also after
 a kill. It lies beside the track until that is written whole.
-
 The first line is JSON with the attributes of the track; then a row of fixed length for each frame (`row_type`). What
 lies behind the last whole row is ignored.
 """
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.trajectory.datasets import blank_datasets, stored_fields
-from sphereorient.trajectory.reasons import Reason
+from sphereorient.trajectory.reasons import reasons_of
 
 SCHEMA = "sphereorient-journal/1"
 MARK = f'{{"schema": "{SCHEMA}"'.encode()
@@ -73,10 +72,7 @@ def is_journal(path: Path) -> bool:
 
 def read_journal(file: BinaryIO, track: type[Any], camera: type[Any], blank: Blank = blank_datasets) -> dict[str, Any]:
     """Return the fields of the track of a journal, as far as it was written; `blank` gives what is not in it.
-
-    Raises:
-        LookupError, TypeError, ValueError: its first line is damaged.
-        OSError: it cannot be read.
+    Raises LookupError, TypeError, ValueError: its first line is damaged; OSError: it cannot be read.
     """
     about = json.loads(file.readline(LONGEST_HEAD))
     kind = row_type(track, camera, about["cameras"])
@@ -84,13 +80,11 @@ def read_journal(file: BinaryIO, track: type[Any], camera: type[Any], blank: Bla
     fields["frame_rate"] = math.nan if about["frame_rate"] is None else float(about["frame_rate"])
     content = file.read()
     table = np.frombuffer(content, kind, len(content) // kind.itemsize)
-    known = {str(reason): reason for reason in Reason}
     found: dict[str, Any] = {}
     for name in about["cameras"]:
         own = table["cameras"][name]
-        texts = [text.decode() for text in own["reason"].tolist()]
         parts = blank(camera, len(table)) | {column: np.ascontiguousarray(own[column]) for column in OF_CAMERA}
-        found[name] = camera(reason=tuple(known.get(text, text) for text in texts), **parts)
+        found[name] = camera(reason=reasons_of(own["reason"]), **parts)
     parts = blank(track, len(table)) | {name: np.ascontiguousarray(table[name]) for name in OF_FRAME}
     return fields | parts | {"cameras": found}
 

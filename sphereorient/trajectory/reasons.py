@@ -1,4 +1,5 @@
 from enum import IntFlag, StrEnum
+from typing import Any
 
 
 class Flag(IntFlag):
@@ -35,3 +36,9 @@ class Reason(StrEnum):
     HIDDEN = "hidden"  # another sphere covers it
     UNDECODABLE = "undecodable"
     MISSING = "missing"
+
+
+def reasons_of(texts: Any) -> tuple[str, ...]:
+    """Return stored texts (N,), bytes, as reasons; texts of newer files stay texts."""
+    known = {str(reason): reason for reason in Reason}
+    return tuple(known.get(text, text) for text in (each.decode() for each in texts.tolist()))

@@ -17,7 +17,7 @@ from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
 from sphereorient.trajectory import datasets, journal
 from sphereorient.trajectory.datasets import in_length, stored, stored_fields
-from sphereorient.trajectory.reasons import Flag, Reason
+from sphereorient.trajectory.reasons import Flag, Reason, reasons_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "sphereorient-track/1"
 SCHEMA_MINOR = 1  # `score` of the precise method: evidence for the painted ball
-SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME each, see tracks.py
+SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME each
 SPHERES = "spheres"
 TEXTS = ("method", "settings", "experiment")
 HELD = 0.1  # of the position's stated error
@@ -206,7 +206,6 @@ class Trajectory:
     @classmethod
     def empty(cls, time: Floats, *, cameras: Sequence[str] = (), **fields: Any) -> Self:
         """Return a trajectory at times (N,), s, for the named cameras, with nothing measured.
-
         `fields`: frame_rate (Hz; NaN for uneven times), method, settings (YAML), experiment, provenance (JSON types).
         """
         known: dict[str, Any] = {"frame_rate": np.nan, "provenance": {}, **dict.fromkeys(TEXTS, ""), **fields}
@@ -214,43 +213,13 @@ class Trajectory:
         return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **parts, **known)
 
     def save(self, path: str | Path) -> None:
-        """Write HDF5 of schema sphereorient-track/1, replacing an old file at the end; equal arrays give equal bytes.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        with whole_hdf5(Path(path)) as file:
-            self.write(file)
-
-    def write(self, group: h5py.Group) -> None:
-        """Write into an empty group: a file, or the group of one sphere of several."""
-        group.attrs["schema"], group.attrs["schema_minor"] = SCHEMA, SCHEMA_MINOR
-        group.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
-        for name in (*TEXTS, "frame_rate", "length_unit"):
-            group.attrs[name] = getattr(self, name)
-        if self.sphere:
-            group.attrs["sphere"] = self.sphere
-        datasets.write_datasets(self, group)
-        group["flags"].attrs["bits"] = json.dumps(self.bits)
-        cameras = group.create_group("cameras")
-        for name in sorted(self.cameras):
-            write_camera(self.cameras[name], cameras.create_group(name))
+        """Write HDF5 of schema sphereorient-track/1, as `Tracks.save` of one ball."""
+        Tracks.of(self).save(path)
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a trajectory written by `save`; unknown datasets and attributes are ignored. Where `live` did not come
-        to its end, or goes on, read the rows that it has written so far.
-
-        Raises:
-            TrackError: no HDF5 file, another schema, several spheres, or a dataset missing or of wrong shape.
-        """
-        with opened_track(path) as file:
-            return cls.read(file)
-
-    @classmethod
-    def read(cls, file: h5py.Group | BinaryIO) -> Self:
-        """Read what `write` wrote, or a journal."""
-        return cls(**(_read(file) if isinstance(file, h5py.Group) else journal.read_journal(file, cls, CameraTrack)))
+    def load(cls, path: str | Path) -> "Trajectory":
+        """Read the track of one ball, as `Tracks.load`; raise TrackError also for those of several."""
+        return one_track(Tracks.load(path), str(path))
 
     def __getitem__(self, frames: slice | int) -> Self:
         """Return the frames of a slice with positive step; raise TypeError or ShapeError for anything else."""
@@ -269,11 +238,8 @@ class Trajectory:
 
     def to_pandas(self) -> "pd.DataFrame":
         """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...).
-
         It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
-
-        Raises:
-            OutputError: pandas is not installed.
+        Raises OutputError: pandas is not installed.
         """
         try:
             import pandas as pd
@@ -337,6 +303,88 @@ class Trajectory:
         return {"frames": len(self), "valid": int(np.sum(self.valid)), "lost": lost}
 
 
+class Tracks(Mapping[str, Trajectory]):
+    """Trajectories of the spheres of one recording, by name: `tracks["a"]`. The name of a sphere under the key `sphere`
+    of experiment.yaml is empty. All have the same times.
+    """
+
+    def __init__(self, tracks: Mapping[str, Trajectory]) -> None:
+        times = [track.time for track in tracks.values()]
+        if not all(np.array_equal(time, times[0]) for time in times):
+            got, do = ", ".join(str(len(time)) for time in times) + " frames, of other times", "give each all frames"
+            raise ShapeError(refusal("Tracks", expected="the same times of every ball", got=got, do=do))
+        self._tracks = {name: replace(track, sphere=name) for name, track in tracks.items()}
+
+    def __getitem__(self, name: str) -> Trajectory:
+        return self._tracks[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tracks)
+
+    def __len__(self) -> int:
+        return len(self._tracks)
+
+    def __repr__(self) -> str:
+        return "\n".join(map(repr, self.values())) or "no tracks"
+
+    def _repr_html_(self) -> str:
+        return "".join(track._repr_html_() for track in self.values())
+
+    @classmethod
+    def of(cls, tracks: Trajectory | Mapping[str, Trajectory]) -> Self:
+        """Return tracks by name, or those of one trajectory."""
+        return cls({tracks.sphere: tracks} if isinstance(tracks, Trajectory) else tracks)
+
+    def save(self, path: str | Path) -> None:
+        """Write HDF5, replacing an old file at the end; equal arrays give equal bytes. One ball is schema
+        sphereorient-track/1, several are sphereorient-track/2: a group /spheres/NAME each, like such a file.
+        Raises OutputError: the file cannot be written.
+        """
+        with whole_hdf5(Path(path)) as file:
+            if len(self) == 1:
+                write_track(next(iter(self.values())), file)
+                return
+            file.attrs["schema"] = SCHEMA_OF_SEVERAL
+            spheres = file.create_group(SPHERES, track_order=True)
+            for name, track in self.items():
+                write_track(track, spheres.create_group(name))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a file written by `save`. Where `live` did not come to its end, or goes on, read the rows that it has
+        written so far.
+        Raises TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.
+        """
+        with opened_track(path) as file:
+            if not isinstance(file, h5py.File):
+                return cls.of(Trajectory(**journal.read_journal(file, Trajectory, CameraTrack)))
+            if file.attrs.get("schema") != SCHEMA_OF_SEVERAL:
+                return cls.of(read_track(file))
+            spheres = datasets.inside(file, SPHERES)
+            if not isinstance(spheres, h5py.Group) or not len(spheres):
+                raise TrackError(refusal(f"{path}: {SPHERES}", expected="groups with names", got="none", do=AGAIN))
+            return cls({name: read_track(datasets.named_group(spheres, name)) for name in spheres})
+
+    def picked(self, name: str | None) -> Self:
+        """Return the sphere of this name alone; None: all. Raise TrackError for an unknown name."""
+        if name is None:
+            return self
+        if name not in self:
+            known = ", ".join(each or "one ball without name" for each in self)
+            do = "leave --sphere out" if "" in self else "name one of these"
+            raise TrackError(refusal("--sphere", expected=known, got=repr(name)[:60], do=do))
+        return type(self)({name: self[name]})
+
+
+def one_track(found: "Trajectory | Tracks", name: str = "tracks") -> Trajectory:
+    """Return the track of an only ball; raise TrackError, with `name`, for those of several."""
+    tracks = Tracks.of(found)
+    if len(tracks) == 1:
+        return next(iter(tracks.values()))
+    got, do = ", ".join(tracks)[:200], "read all with Tracks.load(path), and pick one by its name"
+    raise TrackError(refusal(name, expected="the track of one ball", got=got, do=do))
+
+
 def quaternions_wxyz(R: NDArray[Any]) -> Floats:
     """Return quaternions (N, 4), w first, w >= 0, of rotations (N, 3, 3); NaN stays NaN."""
     from scipy.spatial.transform import Rotation
@@ -381,12 +429,9 @@ def opened_track(path: str | Path) -> Iterator[h5py.File | BinaryIO]:
         raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error
 
 
-def _read(group: h5py.Group) -> dict[str, Any]:
+def read_track(group: h5py.Group) -> Trajectory:
+    """Read what `write_track` wrote; unknown datasets and attributes are ignored."""
     schema, name = group.attrs.get("schema"), f"{group.file.filename}{group.name.rstrip('/')}"
-    spheres = datasets.inside(group, SPHERES) if schema == SCHEMA_OF_SEVERAL else None
-    if spheres is not None:
-        got, do = ", ".join(spheres)[:200], "read all with Tracks.load(path)"
-        raise TrackError(refusal(name, expected="the track of one ball", got=got, do=do))
     if schema != SCHEMA:
         got, do = repr(str(schema))[1:60].strip("'"), "pass a track, or update sphereorient where the track is newer"
         raise TrackError(refusal(f"{name}: schema", expected=SCHEMA, got=got, do=do))
@@ -394,14 +439,31 @@ def _read(group: h5py.Group) -> dict[str, Any]:
         if attribute not in group.attrs:
             raise TrackError(refusal(f"{name}: attribute {attribute}", expected="a value", got="none", do=AGAIN))
     cameras = datasets.inside(group, "cameras")
-    return datasets.read_datasets(group, Trajectory) | {
-        "cameras": {name: read_camera(cameras, name) for name in cameras or ()},
-        "frame_rate": float(group.attrs["frame_rate"]),
-        "provenance": json.loads(group.attrs["provenance"]),
-        "length_unit": str(group.attrs.get("length_unit", "mm")),
-        "sphere": str(group.attrs.get("sphere", "")),
-        **{name: str(group.attrs[name]) for name in TEXTS},
-    }
+    parts: dict[str, Any] = datasets.read_datasets(group, Trajectory)
+    parts |= {name: str(group.attrs[name]) for name in TEXTS}
+    return Trajectory(
+        cameras={name: read_camera(cameras, name) for name in cameras or ()},
+        frame_rate=float(group.attrs["frame_rate"]),
+        provenance=json.loads(group.attrs["provenance"]),
+        length_unit=str(group.attrs.get("length_unit", "mm")),
+        sphere=str(group.attrs.get("sphere", "")),
+        **parts,
+    )
+
+
+def write_track(track: Trajectory, group: h5py.Group) -> None:
+    """Write a track into an empty group: a file, or the group of one ball of several."""
+    group.attrs["schema"], group.attrs["schema_minor"] = SCHEMA, SCHEMA_MINOR
+    group.attrs["provenance"] = json.dumps(track.provenance, sort_keys=True)
+    for name in (*TEXTS, "frame_rate", "length_unit"):
+        group.attrs[name] = getattr(track, name)
+    if track.sphere:
+        group.attrs["sphere"] = track.sphere
+    datasets.write_datasets(track, group)
+    group["flags"].attrs["bits"] = json.dumps(track.bits)
+    cameras = group.create_group("cameras")
+    for name in sorted(track.cameras):
+        write_camera(track.cameras[name], cameras.create_group(name))
 
 
 def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
@@ -415,7 +477,5 @@ def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
 def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
     """Read one camera from the group of all."""
     group = datasets.named_group(cameras, name)
-    known = {str(reason): reason for reason in Reason}
-    texts = [text.decode() for text in datasets.read_dataset(group, "reason", "S").tolist()]
-    reason = tuple(known.get(text, text) for text in texts)
+    reason = reasons_of(datasets.read_dataset(group, "reason", "S"))
     return CameraTrack(reason=reason, **datasets.read_datasets(group, CameraTrack))

@@ -27,15 +27,8 @@ Floats = NDArray[np.float64]
 Pictures = NDArray[np.uint8]
 
 # Half the size of a usual movie, so that a hundred frames are tracked in seconds.
-SMALL: dict[str, Any] = {
-    "frames": 120,
-    "image_size": (240, 240),
-    "diameter_px": 50.0,
-    "distance_mm": 520.0,
-    "volume_mm": 30.0,
-    "exposure": 0.0001,
-    "exposure_samples": 1,
-}
+SMALL: dict[str, Any] = {"frames": 120, "image_size": (240, 240), "diameter_px": 50.0, "distance_mm": 520.0}
+SMALL |= {"volume_mm": 30.0, "exposure": 0.0001, "exposure_samples": 1}
 
 
 def mean_turn(deg: float, frame_rate: float = 600.0) -> float:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -41,6 +42,7 @@ from sphereorient.trajectory import Flag, Reason, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"
 Rendered = Callable[..., Movies]
+NONE = np.zeros(0, np.int64)
 
 
 @pytest.fixture(scope="session")
@@ -83,6 +85,25 @@ def check_right(track: Trajectory, movies: Movies, rows: np.ndarray, within_deg:
     assert track.valid[rows].all(), np.flatnonzero(~track.valid)
     off = turned_off(track, movies)[rows]
     assert off.max() < within_deg, (rows[off.argmax()], off.max())
+
+
+def followed(
+    name: str,
+    movies: Movies,
+    folder: Path,
+    *changed: str,
+    lost: np.ndarray = NONE,
+    cameras: tuple[str, ...] | None = None,
+) -> Trajectory:
+    """Track, and check that all frames but the lost ones have an orientation, the right one."""
+    track, rows = tracked(movies, folder, *changed, cameras=cameras), rest(movies, lost)
+    report(name, track, movies, rows)
+    check_right(track, movies, rows)
+    return track
+
+
+def rms(z: np.ndarray) -> float:
+    return float(np.sqrt((z**2).mean()))
 
 
 def check_nothing(track: Trajectory, rows: np.ndarray) -> None:
@@ -149,9 +170,7 @@ def test_no_frame_is_lost_however_fast_the_ball_turns(rendered, tmp_path, mean_d
     movies = rendered(**changed)
     turn = angle_deg(movies.R_lab_body[1:], movies.R_lab_body[:-1])
     assert turn.mean() >= mean_deg
-    track = tracked(movies, tmp_path)
-    report(f"mean turn {turn.mean():.1f}, largest {turn.max():.0f} deg", track, movies)
-    check_right(track, movies, np.arange(len(movies)))
+    track = followed(f"mean turn {turn.mean():.1f}, largest {turn.max():.0f} deg", movies, tmp_path)
     assert not track.flags.any()
     assert set(track.segment) == {0}
 
@@ -165,9 +184,7 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
     first = int(np.argmin(np.abs(turn[20:90] - 44.0))) + 21
     assert abs(turn[first - 1] - 44.0) < 2.0
     gap = np.arange(first, first + 12)
-    track = tracked(brisk.without_ball(gap), tmp_path)
-    report("gap of 12 frames, 44 degrees", track, brisk, rest(brisk, gap))
-    check_right(track, brisk, rest(brisk, gap))
+    track = followed("gap of 12 frames, 44 degrees", brisk.without_ball(gap), tmp_path, lost=gap)
     check_nothing(track, gap)
     assert np.flatnonzero(track.flags & Flag.RECOVERED).tolist() == [first + 12]
     assert np.flatnonzero(track.flags & Flag.EXTRAPOLATED).tolist() == gap.tolist()
@@ -177,16 +194,13 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
     sigma = np.sqrt(np.trace(track.orientation_smooth_cov, axis1=1, axis2=2))
     assert sigma[gap[5]] > 1.1 * np.median(sigma[rest(brisk, gap)])  # errors that last are in both
     turn = torch.from_numpy(brisk.R_lab_body @ track.orientation_smooth.swapaxes(1, 2))
-    z = in_sigmas(so3.log(turn).numpy(), track.orientation_smooth_cov)[gap]
-    assert 0.3 < np.sqrt((z**2).mean()) < 2.0
+    assert 0.3 < rms(in_sigmas(so3.log(turn).numpy(), track.orientation_smooth_cov)[gap]) < 2.0
 
 
 @pytest.mark.slow
 def test_when_both_cameras_are_blind_for_20_frames_nothing_is_invented(brisk, tmp_path):
     blind = np.arange(50, 70)
-    track = tracked(brisk.without_ball(blind), tmp_path)
-    report("both cameras blind for 20 frames", track, brisk, rest(brisk, blind))
-    check_right(track, brisk, rest(brisk, blind))
+    track = followed("both cameras blind for 20 frames", brisk.without_ball(blind), tmp_path, lost=blind)
     check_nothing(track, blind)
     assert np.isnan(track.orientation_smooth[blind]).all()
     assert np.isnan(track.omega_lab[blind]).all()
@@ -199,9 +213,7 @@ def test_when_both_cameras_are_blind_for_20_frames_nothing_is_invented(brisk, tm
 def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path, name, along):
     """`along`: the lab axis along which the camera that is left looks."""
     blind = np.arange(50, 70)
-    track = tracked(brisk.without_ball(blind, (name,)), tmp_path)
-    report(f"{name} blind for 20 frames", track, brisk)
-    check_right(track, brisk, np.arange(len(brisk)))
+    track = followed(f"{name} blind for 20 frames", brisk.without_ball(blind, (name,)), tmp_path)
     assert np.flatnonzero(track.flags & Flag.ONE_CAMERA).tolist() == blind.tolist()
     assert np.flatnonzero(track.flags & Flag.DOUBTFUL_FIT).tolist() == blind.tolist()  # the ball should be seen there
     reasons = track.cameras[name].reason
@@ -213,18 +225,15 @@ def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path,
     assert np.median(sigma[blind][:, along]) > 8 * np.median(sigma[blind][:, across])
     assert np.median(sigma[blind][:, along]) > 8 * np.median(sigma[rest(brisk, blind)][:, along])
     z = in_sigmas(track.position - brisk.position_mm, track.position_cov)[blind]
-    assert 0.3 < np.sqrt((z**2).mean()) < 1.7
+    assert 0.3 < rms(z) < 1.7
     assert np.abs(z).max() < 4.5
-    z = in_sigmas(rotation_error(track, brisk), track.orientation_cov)[blind]
-    assert np.sqrt((z**2).mean()) < 1.9
+    assert rms(in_sigmas(rotation_error(track, brisk), track.orientation_cov)[blind]) < 1.9
 
 
 @pytest.mark.slow
 def test_30_percent_of_the_frames_dropped_cost_no_other_frame(brisk, tmp_path):
     dropped = np.random.default_rng(0).choice(len(brisk), 36, replace=False)
-    track = tracked(brisk.without_ball(dropped), tmp_path)
-    report("30 % of the frames dropped", track, brisk, rest(brisk, dropped))
-    check_right(track, brisk, rest(brisk, dropped))
+    track = followed("30 % of the frames dropped", brisk.without_ball(dropped), tmp_path, lost=dropped)
     check_nothing(track, dropped)
     assert set(track.segment[4:]) == {0}
 
@@ -236,9 +245,7 @@ def test_30_percent_dropped_in_each_camera_by_itself(brisk, tmp_path):
     one, other = (rng.choice(len(brisk), 36, replace=False) for _ in CAMERAS)
     neither = np.intersect1d(one, other)
     movies = brisk.without_ball(one, ("cam1",)).without_ball(other, ("cam2",))
-    track = tracked(movies, tmp_path)
-    report("30 % dropped, each camera by itself", track, brisk, rest(brisk, neither))
-    check_right(track, brisk, rest(brisk, neither))
+    track = followed("30 % dropped, each camera by itself", movies, tmp_path, lost=neither)
     check_nothing(track, neither)
     alone = np.flatnonzero(track.flags & Flag.ONE_CAMERA)
     expected = np.setxor1d(one, other)
@@ -255,9 +262,7 @@ def test_a_jump_between_two_frames_is_found_out_at_once(held, tmp_path):
     after = 31 + int(np.argmin(np.abs(turn[31:60] - 40.0)))
     assert turn[after] > 30.0
     movies = held.frames(np.r_[0:31, after : len(held)])
-    track = tracked(movies, tmp_path)
-    report(f"a jump of {turn[after]:.0f} degrees", track, movies)
-    check_right(track, movies, np.arange(len(movies)))
+    track = followed(f"a jump of {turn[after]:.0f} degrees", movies, tmp_path)
     assert np.flatnonzero(track.flags & Flag.SPIKE).tolist() == [31]
     assert track.segment[31] == track.segment[30] + 1
 
@@ -266,9 +271,7 @@ def test_a_jump_between_two_frames_is_found_out_at_once(held, tmp_path):
 def test_frames_of_another_attitude_do_not_draw_the_track_away(held, tmp_path):
     movies = held.frames(np.r_[0:30, 90:93, 33:80, 105, 81:90])
     spliced = np.array([30, 31, 32, 80])
-    track = tracked(movies, tmp_path)
-    report("4 frames of another attitude spliced in", track, movies, rest(movies, spliced))
-    check_right(track, movies, rest(movies, spliced))
+    track = followed("4 frames of another attitude spliced in", movies, tmp_path, lost=spliced)
     # What the pictures show there may pass for a measurement or for a fault, but not for a smooth motion.
     off = turned_off(track, movies)[spliced]
     assert (np.isnan(off) | (off < 0.4)).all()
@@ -288,10 +291,7 @@ def with_more_noise(movie: np.ndarray) -> np.ndarray:
     ids=["turns back", "stands still for 20 frames", "three times as fast"],
 )
 def test_sudden_changes_of_the_motion_cost_no_frame(held, tmp_path, order):
-    movies = held.frames(order).spoilt(with_more_noise)
-    track = tracked(movies, tmp_path)
-    report("a sudden change of the motion", track, movies)
-    check_right(track, movies, np.arange(len(movies)))
+    followed("a sudden change of the motion", held.frames(order).spoilt(with_more_noise), tmp_path)
 
 
 # Other paint, other light.
@@ -310,9 +310,7 @@ def test_sudden_changes_of_the_motion_cost_no_frame(held, tmp_path, order):
 )
 def test_no_frame_is_lost_with_other_paint_and_light(rendered, tmp_path, request, changed):
     movies = rendered(omega_rms=mean_turn(4.5), **changed)
-    track = tracked(movies, tmp_path)
-    report(request.node.callspec.id, track, movies)
-    check_right(track, movies, np.arange(len(movies)))
+    track = followed(request.node.callspec.id, movies, tmp_path)
     assert np.median(turned_off(track, movies)) < 0.12
 
 
@@ -348,8 +346,7 @@ def test_the_blur_of_soft_pictures_is_learnt_as_well_as_told_and_a_told_one_is_u
     print(f"learnt {learnt:.4f}, told {right:.4f}, told wrongly {wrong:.4f} degrees")
     assert learnt < 1.15 * right
     assert wrong > 1.5 * right
-    z = in_sigmas(rotation_error(found[0], movies), found[0].orientation_cov)
-    assert 0.6 < np.sqrt((z**2).mean()) < 1.4
+    assert 0.6 < rms(in_sigmas(rotation_error(found[0], movies), found[0].orientation_cov)) < 1.4
 
 
 @pytest.mark.slow
@@ -365,23 +362,17 @@ def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_one_camera_alone_loses_no_frame_and_knows_what_it_does_not_see(brisk, tmp_path, name):
-    track = tracked(brisk, tmp_path, cameras=(name,))
-    report(f"{name} alone", track, brisk)
-    check_right(track, brisk, np.arange(len(brisk)))
+    track = followed(f"{name} alone", brisk, tmp_path, cameras=(name,))
     assert list(track.cameras) == [name]
-    z = in_sigmas(track.position - brisk.position_mm, track.position_cov)
-    assert 0.5 < np.sqrt((z**2).mean()) < 1.8
-    z = in_sigmas(rotation_error(track, brisk), track.orientation_cov)
-    assert 0.6 < np.sqrt((z**2).mean()) < 1.7
+    assert 0.5 < rms(in_sigmas(track.position - brisk.position_mm, track.position_cov)) < 1.8
+    assert 0.6 < rms(in_sigmas(rotation_error(track, brisk), track.orientation_cov)) < 1.7
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_one_camera_finds_every_frame_without_history(brisk, tmp_path, name):
     """Where half of the rim is dark, an outline's distance is centimetres off: the fit must come all the way back."""
-    track = tracked(brisk, tmp_path, "refine.chunk_frames=2", cameras=(name,))
-    report(f"{name} alone, every frame searched", track, brisk)
-    check_right(track, brisk, np.arange(len(brisk)))
+    followed(f"{name} alone, every frame searched", brisk, tmp_path, "refine.chunk_frames=2", cameras=(name,))
 
 
 # Short movies and parts of movies.

@@ -59,9 +59,9 @@ def check_excerpt(track: Trajectory, median_deg: float, proposer: Path) -> None:
 
 @pytest.mark.slow
 def test_the_paper_tracks_the_excerpt_with_the_network(tmp_path: Path) -> None:
-    alone = load_settings(None, ["propose.when=always"])
+    alone = load_settings(None, ["propose.when=always", "propose.checkpoint=default"])
     experiment = shortened(tmp_path / "copy", 0, 12)
-    track = track_movies(experiment, method="paper", settings=alone, proposer="default")
+    track = track_movies(experiment, method="paper", settings=alone)
     check_excerpt(track, 4.0, DEFAULT_CHECKPOINT)
     assert "checkpoint: default" in track.settings
 
@@ -80,8 +80,8 @@ def test_the_command_line_takes_a_checkpoint(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("when", ["in_doubt", "always"])
 def test_the_precise_figures_hold_with_the_network(when: str) -> None:
-    settings = load_settings(None, [f"propose.when={when}"])
-    track = track_movies(SHARED / "experiment.yaml", settings=settings, proposer="default")
+    settings = load_settings(None, [f"propose.when={when}", "propose.checkpoint=default"])
+    track = track_movies(SHARED / "experiment.yaml", settings=settings)
     score = score_track(track, SHARED / "truth.h5")
     p50, p95, _, worst = score.percentiles_deg()
     assert score.valid.all()
@@ -163,6 +163,6 @@ def test_a_checkpoint_that_is_none_is_one_line(tmp_path: Path, content: bytes | 
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(CheckpointError) as caught:
-        track_movies(EXCERPT / "experiment.yaml", proposer=path)
+        track_movies(EXCERPT / "experiment.yaml", settings=load_settings(None, [f"propose.checkpoint={path}"]))
     assert "\n" not in str(caught.value)
     assert "other.ckpt" in str(caught.value)

@@ -221,89 +221,71 @@ def test_a_mirrored_movie_scores_worse_than_the_right_one(copy, tracked):
         assert best < np.nanmin(right.cameras[name].score) - 0.05
 
 
-def _missing(folder: Path) -> None:
-    (folder / "cam1.mkv").unlink()
-
-
-def _unreadable(folder: Path) -> None:
-    (folder / "cam1.mkv").write_bytes(bytes(range(256)) * 20)
-
-
-def _empty(folder: Path) -> None:
-    np.save(folder / "none.npy", np.zeros((0, 650, 650), np.uint8))
-    _replace(folder / "experiment.yaml", "cam1: cam1.mkv", "cam1: none.npy")
-
-
-def _texture(folder: Path) -> None:
-    texture = cv2.imread(str(folder / "texture.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(folder / "texture.png"), texture[:-10])
-
-
-def _other_size(folder: Path) -> None:
-    _replace(folder / "cameras.yaml", "- 650", "- 640")
-
-
-def _no_frames_left(folder: Path) -> None:
-    (folder / "experiment.yaml").write_text((folder / "experiment.yaml").read_text() + "start: {cam1: 40}\n")
-
-
-def _not_a_number(folder: Path) -> None:
-    _replace(folder / "cameras.yaml", "f: 45.0", "f: .nan")
-
-
-def _no_rotation(folder: Path) -> None:
-    _replace(folder / "cameras.yaml", "0.998022948172868", "0.9")
-
-
-def _unknown_key(folder: Path) -> None:
-    _replace(folder / "experiment.yaml", "frame_rate", "framerate")
-
-
-def _masks(folder: Path) -> None:
-    (folder / "experiment.yaml").write_text((folder / "experiment.yaml").read_text() + "masks: {cam1: m.png}\n")
-
-
-def _fixed(folder: Path) -> None:
-    text = (folder / "experiment.yaml").read_text().splitlines()
-    text = [line for line in text if not line.startswith("backgrounds")]
-    (folder / "experiment.yaml").write_text("\n".join(text).replace("{diameter: 18.0", "{fixed: true, diameter: 18.0"))
-
-
-def _no_ball(folder: Path) -> None:
-    frames = np.random.default_rng(0).integers(10, 14, (12, 650, 650)).astype(np.uint8)
-    for name in ("cam1", "cam2"):
-        np.save(folder / f"{name}.npy", frames)
-        _replace(folder / "experiment.yaml", f"{name}.mkv", f"{name}.npy")
-    lines = (folder / "experiment.yaml").read_text().splitlines()
-    (folder / "experiment.yaml").write_text("\n".join(line for line in lines if not line.startswith("backgrounds")))
-
-
 def _replace(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
 
 
+def replacing(name: str, old: str, new: str) -> Callable[[Path], None]:
+    return lambda folder: _replace(folder / name, old, new)
+
+
+def adding(line: str) -> Callable[[Path], None]:
+    return replacing("experiment.yaml", "backgrounds:", f"{line}\nbackgrounds:")
+
+
+def without_backgrounds(folder: Path) -> None:
+    lines = (folder / "experiment.yaml").read_text().splitlines()
+    (folder / "experiment.yaml").write_text("\n".join(line for line in lines if not line.startswith("backgrounds")))
+
+
+def empty(folder: Path) -> None:
+    np.save(folder / "none.npy", np.zeros((0, 650, 650), np.uint8))
+    _replace(folder / "experiment.yaml", "cam1: cam1.mkv", "cam1: none.npy")
+
+
+def cut_texture(folder: Path) -> None:
+    texture = cv2.imread(str(folder / "texture.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(folder / "texture.png"), texture[:-10])
+
+
+def fixed(folder: Path) -> None:
+    without_backgrounds(folder)
+    _replace(folder / "experiment.yaml", "{diameter: 18.0", "{fixed: true, diameter: 18.0")
+
+
+def no_ball(folder: Path) -> None:
+    frames = np.random.default_rng(0).integers(10, 14, (12, 650, 650)).astype(np.uint8)
+    for name in ("cam1", "cam2"):
+        np.save(folder / f"{name}.npy", frames)
+        _replace(folder / "experiment.yaml", f"{name}.mkv", f"{name}.npy")
+    without_backgrounds(folder)
+
+
+SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "missing": (lambda folder: (folder / "cam1.mkv").unlink(), ["cam1.mkv", "no such file"]),
+    "unreadable": (
+        lambda folder: (folder / "cam1.mkv").write_bytes(bytes(range(256)) * 20),
+        ["cam1.mkv", "readable movie"],
+    ),
+    "empty": (empty, ["none.npy"]),
+    "texture": (cut_texture, ["texture.png", "twice as wide as high", "2048 x 1014"]),
+    "other size": (replacing("cameras.yaml", "- 650", "- 640"), ["640 x 640", "650 x 650"]),
+    "no frames left": (adding("start: {cam1: 40}"), ["0 (cam1)", "40 (cam2)", "correct start:"]),
+    "not a number": (replacing("cameras.yaml", "f: 45.0", "f: .nan"), ["cameras.yaml", "cam1", "nan"]),
+    "no rotation": (replacing("cameras.yaml", "0.998022948172868", "0.9"), ["cameras.yaml", "cam1", "rotation"]),
+    "unknown key": (replacing("experiment.yaml", "frame_rate", "framerate"), ["framerate", "frame_rate"]),
+    "masks": (adding("masks: {cam1: m.png}"), ["m.png", "no such file", "hides the ball"]),
+    "fixed": (fixed, ["a ball that turns in its place"]),
+    "no ball": (no_ball, ["sphere in some frame", "not_found"]),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (_missing, ["cam1.mkv", "no such file"]),
-        (_unreadable, ["cam1.mkv", "readable movie"]),
-        (_empty, ["none.npy"]),
-        (_texture, ["texture.png", "twice as wide as high", "2048 x 1014"]),
-        (_other_size, ["640 x 640", "650 x 650"]),
-        (_no_frames_left, ["0 (cam1)", "40 (cam2)", "correct start:"]),
-        (_not_a_number, ["cameras.yaml", "cam1", "nan"]),
-        (_no_rotation, ["cameras.yaml", "cam1", "rotation"]),
-        (_unknown_key, ["framerate", "frame_rate"]),
-        (_masks, ["m.png", "no such file", "hides the ball"]),
-        (_fixed, ["a ball that turns in its place"]),
-        (_no_ball, ["sphere in some frame", "not_found"]),
-    ],
-    ids=lambda value: value.__name__.strip("_") if callable(value) else "",
-)
-def test_bad_input_is_one_clear_line_and_leaves_no_file(copy, refused, spoil, words):
+@pytest.mark.parametrize("case", SPOILT)
+def test_bad_input_is_one_clear_line_and_leaves_no_file(copy, refused, case):
+    spoil, words = SPOILT[case]
     spoil(copy)
     line = refused("track", copy / "experiment.yaml", "--out", copy / "track.h5", "--quiet")
     for word in words:

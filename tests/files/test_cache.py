@@ -23,7 +23,7 @@ ARRAYS = {"a": np.arange(5000.0), "b": np.array([1, 2], np.int8)}
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv(WITHOUT)
     monkeypatch.setattr(cache.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "kept")
-    cache._warn_once.cache_clear()
+    cache.warn_once.cache_clear()
     return tmp_path / "kept"
 
 

@@ -70,5 +70,5 @@ def test_of_sizes_given_twice_that_of_the_decoder_counts(kind, tmp_path):
     assert decoded_grey(twice).size == 10_000
     assert claimed_pixels(twice) >= 10_000
     (tmp_path / "map.tif").write_bytes(sized_twice(kind, (30_000, 15_000), (64, 32)))
-    with pytest.raises(TextureError, match=r"expected a picture of at most 33\.6 million pixels"):
+    with pytest.raises(TextureError, match=r"33\.6 million pixels"):
         load_texture(tmp_path / "map.tif")

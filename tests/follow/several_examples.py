@@ -31,17 +31,8 @@ class Several:
 
 def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several:
     """Balls that cross in the pictures: a passes before b in the first camera, c follows behind."""
-    settings = SynthSettings(
-        frames=FRAMES,
-        cameras=cameras,
-        image_size=(260, 260),
-        diameter_px=52.0,
-        diameter_mm=DIAMETER_MM,
-        distance_mm=520.0,
-        black=70.0,
-        exposure=0.0,
-        exposure_samples=1,
-    )
+    scene = {"image_size": (260, 260), "diameter_px": 52.0, "diameter_mm": DIAMETER_MM, "distance_mm": 520.0}
+    settings = SynthSettings(frames=FRAMES, cameras=cameras, black=70.0, exposure=0.0, exposure_samples=1, **scene)
     t = torch.arange(FRAMES, dtype=torch.float64)[:, None] / FRAMES - 0.5
     place = {
         "a": torch.tensor([[2.0, -12.0, 3.0]]).double() + 30.0 * t * torch.tensor([1.0, 0.1, 0.0]).double(),
@@ -60,19 +51,11 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several
     scenes = [make_scene(paint[PAINTS[name]], settings) for name in balls]
     for n, (name, camera) in enumerate(seen.items()):
         rng = seeded(n)
-        movie = [
-            digitise(
-                expose(
-                    scenes,
-                    camera,
-                    torch.stack([place[ball][k : k + 1] for ball in balls]),
-                    torch.stack([R[ball][k : k + 1] for ball in balls]),
-                ).before(settings.background),
-                settings,
-                rng,
-            )
-            for k in range(FRAMES)
-        ]
+        movie = []
+        for k in range(FRAMES):
+            X_now, R_now = (torch.stack([poses[ball][k : k + 1] for ball in balls]) for poses in (place, R))
+            picture = expose(scenes, camera, X_now, R_now).before(settings.background)
+            movie.append(digitise(picture, settings, rng))
         np.save(folder / f"{name}.npy", np.stack(movie))
         height, width = movie[0].shape
         write_picture(folder / f"empty_{name}.png", np.full((height, width), round(settings.background), np.uint8))
@@ -88,8 +71,4 @@ def write_several(folder: Path, balls: str = "abc", cameras: int = 3) -> Several
     }
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
-    return Several(
-        path,
-        {name: place[name].numpy() for name in balls},
-        {name: R[name].numpy() for name in balls},
-    )
+    return Several(path, {name: place[name].numpy() for name in balls}, {name: R[name].numpy() for name in balls})

@@ -18,7 +18,7 @@ from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow.ball import BallTracker
-from sphereorient.follow.fixed_centre import FixedCentre, _follows, find_fixed_centre, mean_place
+from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, follows_place, mean_place
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import Tracker
@@ -87,7 +87,7 @@ def test_attitudes_err_with_the_place_as_follows_says():
         def fit(self, pixels, X, R, use, level, iterations, precision):
             return held(X, R, precision)
 
-    follows = _follows(Held(), pixels, X[0], R, use)
+    follows = follows_place(Held(), pixels, X[0], R, use)
     firm = 1e14 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
     for aside in f64([[0.05, 0.0, 0.0], [0.0, 0.0, 0.05]]):
         # Held at the true place + aside, the place errs by -aside: true less measured, as delta is of the attitude.

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import h5py
 import numpy as np
 import pytest
-import torch
 import yaml
+from run_examples import off_deg, rms_sigmas
 
-from sphereorient import so3
 from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
-
-
-def off_deg(track, experiment) -> np.ndarray:
-    with h5py.File(experiment.parent / "truth.h5") as truth:
-        R = torch.from_numpy(truth["orientation"][()])
-    return np.degrees(so3.geodesic_distance(torch.from_numpy(track.orientation), R).numpy())
 
 
 @pytest.mark.slow
@@ -35,8 +27,7 @@ def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
     assert not learnt.sharper
     off = off_deg(track, experiment)
     assert np.median(off) < 0.04
-    sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
-    assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.5
+    assert rms_sigmas(track, off) < 1.5
 
     again = run(Request(experiment=experiment, learnt=known), MemoryStore())
     assert again.orientation.tobytes() == track.orientation.tobytes()
@@ -62,5 +53,4 @@ def test_an_exposure_that_is_not_that_of_the_pictures_smears_nothing(tmp_path):
     assert any("sharper than the ball's motion" in remark for remark in track.provenance["remarks"])
     off = off_deg(track, experiment)
     assert np.median(off) < 0.03
-    sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
-    assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.5
+    assert rms_sigmas(track, off) < 1.5

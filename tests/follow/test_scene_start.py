@@ -16,7 +16,7 @@ from locate_examples import SETTINGS, even_background, looking_along_y, looking_
 from sphereorient import so3
 from sphereorient.cameras import sphere_disk_px
 from sphereorient.follow.poses import Poses
-from sphereorient.follow.scene_start import Ahead, SceneStart, _look
+from sphereorient.follow.scene_start import Ahead, SceneStart, look_of
 from sphereorient.locate import CameraScene, Frame, Match, places_of
 from sphereorient.locate.matching import assigned
 from sphereorient.pose import CameraView
@@ -177,11 +177,11 @@ def test_a_match_of_disks_that_show_different_rotations_gains_less_than_one_of_t
     one = (R[None], torch.tensor([0.9]))
     alike = (rotation(0.03, 0.0, 0.02)[None] @ R, torch.tensor([0.9]))
     different = (other[None], torch.tensor([0.9]))
-    assert _look([one, alike]).gain == pytest.approx(2 * _look([one]).gain)
-    assert _look([one, different]).gain < _look([one]).gain
-    assert _look([one, (R[None], torch.tensor([0.4]))]).gain < _look([one]).gain  # a paint that does not fit
+    assert look_of([one, alike]).gain == pytest.approx(2 * look_of([one]).gain)
+    assert look_of([one, different]).gain < look_of([one]).gain
+    assert look_of([one, (R[None], torch.tensor([0.4]))]).gain < look_of([one]).gain  # a paint that does not fit
 
 
 def test_a_disk_without_a_proposal_is_no_support():
     nothing = (torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0))
-    assert _look([nothing]).gain == -np.inf
+    assert look_of([nothing]).gain == -np.inf

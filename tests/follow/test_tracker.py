@@ -17,6 +17,7 @@ from sphereorient.follow.chunk import Chunk, mirrored, regained
 from sphereorient.follow.follower import cameras_disagree
 from sphereorient.follow.initialise import by_decreasing_size
 from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.pose.fit import blank_parts
 from sphereorient.trajectory import Reason
 
 TIMES = [0.0, 1.0, 2.5, 3.2]
@@ -34,21 +35,11 @@ def place(time: float, change: float) -> Tensor:
 
 def seen(time: float, change: float) -> Poses:
     """The exact pose at a time of a motion whose rates change evenly."""
-    return Poses(
-        position_lab_mm=place(time, change)[None],
-        R_lab_body=so3.exp(angle(time, change) * AXIS)[None],
-        covariance=1e-10 * torch.eye(6, dtype=torch.float64)[None],
-        own_turn=torch.zeros(1, 2, 3, dtype=torch.float64),
-        own_covariance=torch.zeros(1, 2, 3, 3, dtype=torch.float64),
-        own_move=torch.zeros(1, 2, 3, dtype=torch.float64),
-        own_sigma_mm=torch.ones(1, 2, dtype=torch.float64),
-        excess=torch.ones(1, 2, dtype=torch.float64),
-        score=torch.ones(1, 2, dtype=torch.float64),
-        nll=torch.zeros(1, dtype=torch.float64),
-        step=torch.zeros(1, 6, dtype=torch.float64),
-        use=torch.tensor([True, True]),
-        reason=(Reason.OK, Reason.OK),
-    )
+    parts = blank_parts(2, 1)
+    parts |= {name: torch.ones_like(parts[name]) for name in ("own_sigma_mm", "excess", "score")}
+    parts["position_lab_mm"], parts["R_lab_body"] = place(time, change)[None], so3.exp(angle(time, change) * AXIS)[None]
+    parts["covariance"] = 1e-10 * torch.eye(6, dtype=torch.float64)[None]
+    return Poses(**parts, use=torch.tensor([True, True]), reason=(Reason.OK, Reason.OK))
 
 
 def lane(frames: list[int], change: float, times: list[float] = TIMES) -> Chunk:
@@ -135,7 +126,7 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
             own_covariance=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(1, 2, 3, 3),
         )
         tracker = SimpleNamespace(usual_apart_rad=0.002)
-        return bool(BallTracker._contradictory(tracker, said, torch.tensor([[True, both]])))
+        return bool(BallTracker.contradictory(tracker, said, torch.tensor([[True, both]])))
 
     assert disagree(0.006, -0.006)
     assert not disagree(0.006, 0.006), "both would turn the pose alike"

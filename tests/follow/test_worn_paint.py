@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import sys
 
-import h5py
 import numpy as np
 import pytest
 import torch
+from run_examples import off_deg, rms_sigmas
 
-from sphereorient import so3
 from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.cli import main
 from sphereorient.methods.method import Learnt
@@ -27,12 +25,6 @@ def worn(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("worn"), scene)
 
 
-def off_deg(track, experiment) -> np.ndarray:
-    with h5py.File(experiment.parent / "truth.h5") as truth:
-        R = torch.from_numpy(truth["orientation"][()])
-    return np.degrees(so3.geodesic_distance(torch.from_numpy(track.orientation), R).numpy())
-
-
 @pytest.mark.slow
 def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
     known = tmp_path / "learnt.h5"
@@ -43,8 +35,7 @@ def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
     asis = Trajectory.load(tmp_path / "asis.h5")
     off, before = off_deg(track, worn), off_deg(asis, worn)
     assert np.median(off) < 0.03 < 2 * 0.03 < np.median(before)
-    sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
-    assert math.sqrt(np.mean((off / sigma) ** 2)) < 1.5
+    assert rms_sigmas(track, off) < 1.5
     told = [line for line in track.provenance["remarks"] if "differs from the texture map" in line]
     assert len(told) == 1
     assert not any("differs" in line for line in asis.provenance["remarks"])

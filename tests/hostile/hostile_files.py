@@ -21,8 +21,10 @@ from hostile_texts import CELLS, Family, Generated
 from hypothesis import strategies as st
 
 sys.path.append(str(REPO / "tests" / "movies"))
-from cine_writer import Cine, write_cine
-from movie_examples import encode
+from movie_examples import pictures as noise
+from movie_examples import smooth
+from movie_formats import EIGHT_BIT, LOSSLESS, Frames, Writer, cine, video
+from movie_formats import tiff as tiff_writer
 
 from sphereorient.experiment.stream import load_background
 from sphereorient.experiment.timeline import load_times
@@ -244,18 +246,8 @@ PLACES = ["time", "valid", "position", "orientation_cov", "segment", "flags", "c
 PLACES += ["cameras/cam1/reason", "cameras/cam1/centre_px", "cameras/cam1/candidates", "cameras/cam1/candidates/offset"]
 PLACES += ["cameras/cam1/candidates/orientation", "margin"]
 DEEP = "[" * 100_000 + "]" * 100_000
-TEXTS: list[Any] = [
-    "",
-    "x" * 60_000,
-    "a\nb\x1b",
-    "{",
-    DEEP,
-    '{"a": 1e999}',
-    "[]",
-    "null",
-    b"\xff\xfe",
-    np.bytes_(b"\0"),
-]
+TEXTS: list[Any] = ["", "x" * 60_000, "a\nb\x1b", "{", DEEP, '{"a": 1e999}', "[]", "null", b"\xff\xfe"]
+TEXTS += [np.bytes_(b"\0")]
 TEXTS += [1, np.nan, np.inf, -1.0, [1.0, 2.0], ["a", "b"], h5py.Empty("f8"), np.zeros(3, [("a", "f8")]), 10**18]
 ATTRIBUTES = ["schema", "provenance", "method", "settings", "experiment", "frame_rate"]
 
@@ -353,6 +345,12 @@ def times_family() -> Family:
 MOVIE = np.stack([pattern((10, 14)) + k for k in range(8)]).astype(np.uint8)
 
 
+def timed_hdf5(folder: Path, frames: Frames) -> Path:
+    with h5py.File(folder / "movie.h5", "w", libver="latest") as file:
+        file["pictures"], file["time"] = frames, np.arange(len(frames)) / 600
+    return folder / "movie.h5"
+
+
 def watch(path: Path) -> None:
     """Open a movie, and read from its beginning and its end: what is not decodable must be told frame by frame."""
     with open_movie(path) as movie:
@@ -367,40 +365,44 @@ def watch(path: Path) -> None:
         movie.sample([0, count - 1])
 
 
+PREDICTED = {"g": "5", "bf": "2", "qp": "2", "b_strategy": "0"}
+FORMATS: dict[str, dict[str, Writer]] = {
+    "npy": {"npy": LOSSLESS["npy"]},
+    "cine": {name: LOSSLESS[name] for name in ("cine", "cine, annotations", "cine, colour")}
+    | {"stamps": cine(stamps_s=np.arange(12) / 1000), "setup": cine(flip_v=1, setup_length=1000)}
+    | {"packed": lambda folder, frames: cine(packed_bits=10, real_bits=10)(folder, frames.astype(np.uint16) << 2)},
+    "tif": {name: LOSSLESS[f"tiff{name}"] for name in ("", ", zlib", ", lzw", ", imagej", ", one page", ", strips")}
+    | {"big": tiff_writer(compression="zlib", bigtiff=True), "other order": LOSSLESS["tiff, other byte order"]},
+    "h5": {name: LOSSLESS[f"hdf5{name}"] for name in ("", ", chunks", ", chunks of many")} | {"times": timed_hdf5},
+    "mkv": {"ffv1": LOSSLESS["ffv1 mkv"]},
+    "avi": {
+        "ffv1": LOSSLESS["ffv1 avi"],
+        "raw": EIGHT_BIT["raw avi"],
+        "h264": video("movie.avi", "libx264", "yuv420p", **PREDICTED),
+        "mpeg4": video("movie.avi", "mpeg4", "yuv420p"),
+    },
+    "mp4": {
+        "h264": video("movie.mp4", "libx264", "yuv420p", **PREDICTED),
+        "mpeg4": video("movie.mp4", "mpeg4", "yuv420p"),
+    },
+}
+
+
+@functools.cache
 def movie_bytes(kind: str) -> list[bytes]:
-    """Valid movies of one kind."""
-    with tempfile.TemporaryDirectory() as folder:
-        return [path.read_bytes() for path in _movies(Path(folder), kind)]
-
-
-def _movies(folder: Path, kind: str) -> list[Path]:
-    deep = MOVIE.astype(np.uint16) * 200
-    if kind == "npy":
-        np.save(folder / "a.npy", MOVIE)
-        np.save(folder / "b.npy", deep)
-        return [folder / "a.npy", folder / "b.npy"]
-    if kind == "cine":
-        stamps = np.arange(8) / 1000
-        packed = Cine(deep >> 6, packed_bits=10, real_bits=10)
-        cines = [Cine(MOVIE, stamps_s=stamps), Cine(deep, flip_v=1, setup_length=1000), packed]
-        return [write_cine(folder / f"{k}.cine", cine) for k, cine in enumerate(cines)]
-    if kind == "tif":
-        import tifffile
-
-        tifffile.imwrite(folder / "a.tif", MOVIE, photometric="minisblack")
-        tifffile.imwrite(folder / "b.tif", deep, photometric="minisblack", compression="zlib", bigtiff=True)
-        with tifffile.TiffWriter(folder / "c.tif", byteorder=">") as file:
-            for picture in MOVIE:
-                file.write(picture, contiguous=False, rowsperstrip=3, metadata=None)
-        return [folder / "a.tif", folder / "b.tif", folder / "c.tif"]
-    if kind == "h5":
-        for name, options in (("a", {}), ("b", {"chunks": (2, 10, 14), "compression": "gzip"})):
-            with h5py.File(folder / f"{name}.h5", "w", libver="latest" if name == "a" else None) as file:
-                file.create_dataset("pictures", data=MOVIE, **options)
-                file.create_dataset("time", data=np.arange(8) / 600)
-        return [folder / "a.h5", folder / "b.h5"]
-    codec, pixels = {"mkv": ("ffv1", "gray"), "avi": ("rawvideo", "gray"), "mp4": ("mpeg4", "yuv420p")}[kind]
-    return [encode(folder / f"a.{kind}", MOVIE, codec, pixels)]
+    """Valid movies of one kind, the first with one byte a pixel; of those without predicted frames also with two."""
+    with tempfile.TemporaryDirectory() as name:
+        found = []
+        for number, (form, write) in enumerate(FORMATS[kind].items()):
+            coded = form in ("h264", "mpeg4")
+            shown = [smooth((12, 38, 52))] if coded else [noise(shape=(12, 37, 51))]
+            if form in ("npy", "setup", "", "ffv1"):
+                shown.append(noise(np.uint16, (12, 37, 51)))
+            for k, frames in enumerate(shown):
+                folder = Path(name) / f"{number} {k}"
+                folder.mkdir()
+                found.append(write(folder, frames).read_bytes())
+    return found
 
 
 def npy(header: str, content: bytes = bytes(200), version: bytes = b"\x01\x00") -> bytes:
@@ -409,12 +411,8 @@ def npy(header: str, content: bytes = bytes(200), version: bytes = b"\x01\x00") 
 
 
 NPY_SHAPES = ["()", "(8,)", "(8, 10)", "(8, 10, 14, 3)", "(0, 10, 14)", "(8, 0, 14)", "(10**9, 10, 14)", "(-1, 10, 14)"]
-NPY_SHAPES += [
-    "(1000000000, 1000, 1000)",
-    "(9223372036854775807, 2, 2)",
-    "(8, 1000000000, 1000000000)",
-    "(1, 2**62, 4)",
-]
+NPY_SHAPES += ["(1000000000, 1000, 1000)", "(9223372036854775807, 2, 2)", "(8, 1000000000, 1000000000)"]
+NPY_SHAPES += ["(1, 2**62, 4)"]
 NPY_SHAPES += ["('a', 1, 1)", "(1.5, 1, 1)", "None", "(True, 10, 14)", "(" * 90 + ")" * 90, "(1," * 3000, "9" * 5000]
 NPY_TYPES = ["|O", "O", "<f8", "|S10", "<U4", "<M8[s]", "|V8", "c16", "<i2", "[('a', '<u1')]", "x", "", "<u1000000000"]
 NPY_TYPES += [">u2", "|b1", "<u4", "|u9", "__import__('os').system('true')"]
@@ -494,12 +492,13 @@ def movie_family(kind: str) -> Family:
         }.get(kind, list)()
         # FFmpeg searches zeros for a next frame, 70 MB/s: as long as reading them takes, so less of them for it.
         places = [case for case in no_files(valid) if kind not in VIDEO or case.place != "sparse"]
-        return [*places, Case("empty"), Case("text", b"movie" * 100), Case("zeros", bytes(3000)), *written]
+        cuts = [Case("cut", one[: len(one) * part // 24]) for one in movie_bytes(kind) for part in range(25)]
+        return [*places, Case("empty"), Case("text", b"movie" * 100), Case("zeros", bytes(3000)), *written, *cuts]
 
     def more(folder: Path) -> Generated:
         return st.one_of(*[spoilt_bytes(movie_bytes(kind))] * 4, garbage())
 
-    return Family(f"movie {kind}", f"movie.{kind}", watch, cases, more)
+    return Family(f"movie {kind}", f"movie.{kind}", watch, cases, more, many=2 * len(movie_bytes(kind)))
 
 
 VIDEO = ("mkv", "avi", "mp4")
@@ -521,7 +520,7 @@ def cine_cases(valid: bytes) -> list[Case]:
     return cases
 
 
-def sequence_family() -> Family:
+def sequence_family(suffix: str) -> Family:
     """The folder is the movie, and its only picture is spoilt."""
 
     def load(path: Path) -> None:
@@ -531,9 +530,10 @@ def sequence_family() -> Family:
         return [*no_files(pictures()["8 bit .png"]), *picture_cases()]
 
     def more(folder: Path) -> Generated:
-        return st.one_of(spoilt_bytes([pictures()["8 bit .png"], pictures()["16 bit .png"]]), garbage())
+        valid = [content for name, content in pictures().items() if (".tif" in name) == (suffix == ".tif")]
+        return st.one_of(*[spoilt_bytes(valid)] * 4, garbage())
 
-    return Family("movie sequence", "f001.png", load, first, more)
+    return Family(f"movie sequence {suffix}", f"f001{suffix}", load, first, more, many=8)
 
 
 @functools.cache
@@ -544,7 +544,8 @@ def file_families() -> dict[str, Family]:
         picture_family("background", "empty.png", lambda path: load_background(path, (16, 32))),
         track_family(),
         times_family(),
-        *(movie_family(kind) for kind in ("npy", "cine", "tif", "h5", "mkv", "avi", "mp4")),
-        sequence_family(),
+        *map(movie_family, FORMATS),
+        sequence_family(".png"),
+        sequence_family(".tif"),
     ]
     return {family.name: family for family in families}

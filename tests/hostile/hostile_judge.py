@@ -34,81 +34,39 @@ class Case:
 
     name: str
     content: bytes = b""
-    place: str = "file"  # file, missing, folder, fifo, device, socket, loop, long name, sparse, padded
+    place: str = "file"  # or one of PLACES
 
     def put(self, path: Path) -> Path:
         """Make the input at a path, and return the path to open."""
         if path.is_dir() and not path.is_symlink():
             path.rmdir()
         path.unlink(missing_ok=True)
-        return PLACES[self.place](path, self.content)
+        if self.place in BEHIND:
+            path.write_bytes(self.content)
+            os.truncate(path, max(len(self.content), BEHIND[self.place](len(self.content))))
+        elif self.place == "long name":
+            return path.with_name("x" * 300 + path.suffix)
+        elif self.place == "folder":
+            path.mkdir()
+        elif self.place == "fifo":
+            os.mkfifo(path)
+        elif self.place == "socket":
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(str(path))
+        elif self.place in LINKS:
+            path.symlink_to(LINKS[self.place] or path.name)
+        return path
 
 
-def _file(path: Path, content: bytes) -> Path:
-    path.write_bytes(content)
-    return path
-
-
-def _missing(path: Path, content: bytes) -> Path:
-    return path
-
-
-def _folder(path: Path, content: bytes) -> Path:
-    path.mkdir()
-    return path
-
-
-def _fifo(path: Path, content: bytes) -> Path:
-    os.mkfifo(path)
-    return path
-
-
-def _device(path: Path, content: bytes) -> Path:
-    path.symlink_to("/dev/zero")
-    return path
-
-
-def _socket(path: Path, content: bytes) -> Path:
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-    return path
-
-
-def _loop(path: Path, content: bytes) -> Path:
-    path.symlink_to(path.name)
-    return path
-
-
-def _long_name(path: Path, content: bytes) -> Path:
-    return path.with_name("x" * 300 + path.suffix)
-
-
-def _sparse(path: Path, content: bytes) -> Path:
-    """A file with zeros behind what it begins with; none of them is on the disk."""
-    path.write_bytes(content)
-    os.truncate(path, SPARSE_BYTES)
-    return path
-
-
-def _padded(path: Path, content: bytes) -> Path:
-    """A recording whose file was made large beforehand: what video libraries search for a next frame."""
-    path.write_bytes(content)
-    os.truncate(path, len(content) + SPARSE_BYTES // 20)
-    return path
-
-
-PLACES: dict[str, Callable[[Path, bytes], Path]] = {
-    "file": _file,
-    "missing": _missing,
-    "folder": _folder,
-    "fifo": _fifo,
-    "device": _device,
-    "socket": _socket,
-    "loop": _loop,
-    "long name": _long_name,
-    "sparse": _sparse,
-    "padded": _padded,
+LINKS = {"device": "/dev/zero", "loop": ""}
+# Bytes of a file with zeros behind what it begins with, none of them on the disk. Padded: a recording whose file was
+# made large beforehand, which video libraries search for a next frame.
+BEHIND: dict[str, Callable[[int], int]] = {
+    "file": lambda size: size,
+    "sparse": lambda size: SPARSE_BYTES,
+    "padded": lambda size: size + SPARSE_BYTES // 20,
 }
+PLACES = ("missing", "folder", "fifo", "device", "socket", "loop", "long name", "sparse", "padded")
 
 
 @dataclass

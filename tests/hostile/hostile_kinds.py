@@ -17,7 +17,7 @@ BOM = "﻿"
 def no_files(content: bytes = b"") -> list[Case]:
     """Everything that may stand where a file is expected."""
     filled = ("sparse", "padded")
-    return [Case(place, content if place in filled else b"", place) for place in PLACES if place != "file"]
+    return [Case(place, content if place in filled else b"", place) for place in PLACES]
 
 
 def no_text(valid: bytes) -> list[Case]:
@@ -81,122 +81,33 @@ def garbage() -> SearchStrategy[Case]:
 
 
 # What may stand for a value in YAML, as it is written there.
-VALUES = [
-    "null",
-    "true",
-    "~",
-    "''",
-    "0",
-    "-1",
-    "-0.0",
-    "1.5",
-    ".nan",
-    ".inf",
-    "-.inf",
-    "1e400",
-    "1.0e+400",
-    "1.0e+308",
-    "-1.0e+308",
-    "1.0e-320",
-    "9" * 30,
-    "9" * 400,
-    "9" * 3000,
-    "9" * 6000,
-    "0x" + "f" * 5000,
-    "0b" + "1" * 5000,
-    ":".join(["1"] * 500),
-    ":".join(["1"] * 500) + ".5",
-    "2001-99-99",
-    "2001-01-01",
-    "2001-12-14t21:59:43.10-05:00",
-    "[]",
-    "{}",
-    "[1]",
-    "[[1, 2], [3]]",
-    "[1, 2, 3, 4, 5]",
-    "['a', 'b', 'c']",
-    "[.nan, .nan, .nan]",
-    "[.nan, .inf]",
-    "[.inf, .inf]",
-    "[1.0e+308, 1.0e+308, 1.0e+308]",
-    "[0, 0, 0]",
-    "[0, 0]",
-    "[-1, -1]",
-    "[true, true]",
-    "[1000000000, 1000000000]",
+PLAIN = r"""
+null ; true ; ~ ; '' ; 0 ; -1 ; -0.0 ; 1.5 ; .nan ; .inf ; -.inf ; 1e400 ; 1.0e+400 ; 1.0e+308 ; -1.0e+308 ;
+1.0e-320 ; 2001-99-99 ; 2001-01-01 ; 2001-12-14t21:59:43.10-05:00 ; [] ; {} ; [1] ; *nothing ;
+!!python/name:os.system ; ../../../../etc/passwd ; /etc/passwd ; /dev/zero ; /proc/self/mem ; @at ; `tick ; %percent ;
+'open ; [open ; {open ;
+[[1, 2], [3]] ; [1, 2, 3, 4, 5] ; ['a', 'b', 'c'] ; [.nan, .nan, .nan] ; [.nan, .inf] ; [.inf, .inf] ;
+[1.0e+308, 1.0e+308, 1.0e+308] ; [0, 0, 0] ; [0, 0] ; [-1, -1] ; [true, true] ; [1000000000, 1000000000] ;
+[[.nan, 0, 0], [0, 1, 0], [0, 0, 1]] ; [[1, 0, 0], [0, 1, 0], [0, 0, -1]] ; [[1, 0, 0], [0, 1, 0], [0, 0, 1.1]] ;
+[[0, 0, 0], [0, 0, 0], [0, 0, 0]] ; [[1.0e+308, 0, 0], [0, 1.0e+308, 0], [0, 0, 1.0e+308]] ; {a: 1} ;
+{a: {b: {c: d}}} ; {1: 2} ; {null: null} ; {? [a, b] : c} ; {? {a: b} : c} ; {'': ''} ; {"a\nb": 1} ;
+{"\e[31m": {}} ; &a [*a] ; &a {b: *a} ; &a {? *a : 1} ; [&a x, *a, *a] ; [&a {f: 1}, {<<: *a}] ; {<<: 1} ;
+{<<: [1]} ; {<<: &b {<<: *b}} ; {a: 1, a: 2} ; !!python/object/apply:os.system ['true'] ;
+!!python/object/new:type ['x'] ; !!python/tuple [1, 2] ; !!binary AAECAw== ; !!binary '?' ; !!set {a, b} ;
+!!omap [a: 1, b: 2] ; !!pairs [a: 1] ; !!float abc ; !!int abc ; !!int '' ; !!bool 7 ; !!timestamp x ; !!null 3 ;
+!!str 3 ; !mine {a: 1} ; !<tag:yaml.org,2002:opencv-matrix> {rows: 1} ; "a\0b" ; "a\nb" ; "a\u2028b" ; "\ud800" ;
+"\U00110000" ; "open
+"""
+VALUES = [value.strip() for value in PLAIN.split(";")] + ['"\\e]0;title\\a"', "''\n---\nb: 1", "| \n  text", "\t"]
+VALUES += ["0x" + "f" * 5000, "0b" + "1" * 5000, ":".join(["1"] * 500), ":".join(["1"] * 500) + ".5"]
+VALUES += [
     "[" + "9" * 400 + ", 3]",
-    "[[.nan, 0, 0], [0, 1, 0], [0, 0, 1]]",
-    "[[1, 0, 0], [0, 1, 0], [0, 0, -1]]",
-    "[[1, 0, 0], [0, 1, 0], [0, 0, 1.1]]",
-    "[[0, 0, 0], [0, 0, 0], [0, 0, 0]]",
-    "[[1.0e+308, 0, 0], [0, 1.0e+308, 0], [0, 0, 1.0e+308]]",
-    "{a: 1}",
-    "{a: {b: {c: d}}}",
-    "{1: 2}",
-    "{null: null}",
-    "{? [a, b] : c}",
-    "{? {a: b} : c}",
-    "{'': ''}",
-    '{"a\\nb": 1}',
-    '{"\\e[31m": {}}',
     "{" + "k" * 3000 + ": 1}",
     "{" + ", ".join(f"k{i}: {i}" for i in range(2000)) + "}",
-    "[" * 30 + "]" * 30,
-    "[" * 5000 + "]" * 5000,
-    "{a: " * 3000 + "1" + "}" * 3000,
-    "[" * 100_000,
-    "- " * 2000 + "1",
-    "*nothing",
-    "&a [*a]",
-    "&a {b: *a}",
-    "&a {? *a : 1}",
-    "[&a x, *a, *a]",
-    "[&a {f: 1}, {<<: *a}]",
-    "{<<: 1}",
-    "{<<: [1]}",
-    "{<<: &b {<<: *b}}",
-    "{a: 1, a: 2}",
-    "!!python/object/apply:os.system ['true']",
-    "!!python/object/new:type ['x']",
-    "!!python/name:os.system",
-    "!!python/tuple [1, 2]",
-    "!!binary AAECAw==",
-    "!!binary '?'",
-    "!!set {a, b}",
-    "!!omap [a: 1, b: 2]",
-    "!!pairs [a: 1]",
-    "!!float abc",
-    "!!int abc",
-    "!!int ''",
-    "!!bool 7",
-    "!!timestamp x",
-    "!!null 3",
-    "!!str 3",
-    "!mine {a: 1}",
-    "!<tag:yaml.org,2002:opencv-matrix> {rows: 1}",
-    '"a\\0b"',
-    '"a\\nb"',
-    '"a\\u2028b"',
-    '"\\e]0;title\\a"',
-    '"\\ud800"',
-    '"\\U00110000"',
-    "x" * 300,
-    "x" * 5000,
-    "../../../../etc/passwd",
-    "/etc/passwd",
-    "/dev/zero",
-    "/proc/self/mem",
-    "''\n---\nb: 1",
-    "@at",
-    "`tick",
-    "%percent",
-    "'open",
-    '"open',
-    "[open",
-    "{open",
-    "| \n  text",
-    "\t",
 ]
+VALUES += ["{a: " * 3000 + "1" + "}" * 3000, "[" * 100_000, "- " * 2000 + "1"]
+VALUES += ["9" * n for n in (30, 400, 3000, 6000)] + ["[" * n + "]" * n for n in (30, 5000)]
+VALUES += ["x" * n for n in (300, 5000)]
 
 BOMBS = {
     "billion laughs": "a: &a [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n"

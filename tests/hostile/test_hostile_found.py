@@ -45,7 +45,7 @@ def one_camera(folder: Path, **keys: object) -> dict[str, Camera]:
 )
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path, load):
     os.mkfifo(tmp_path / "pipe.yml")
-    with pytest.raises((CameraError, SettingsError, TextureError), match=r"pipe\.yml: expected .* got a pipe"):
+    with pytest.raises((CameraError, SettingsError, TextureError), match=r"pipe\.yml: .* a pipe"):
         load(tmp_path / "pipe.yml")
 
 
@@ -145,12 +145,12 @@ def test_distortions_whose_powers_overflow_are_refused(tmp_path, key):
         "schema": "sphereorient-cameras/1",
         "cameras": {"cam1": camera("brown") | {key: [1e308, 1e308, 1e308][: 3 if key == "k" else 2]}},
     }
-    with pytest.raises(CameraError, match=f"cam1, {key}: expected finite numbers"):
+    with pytest.raises(CameraError, match=f"cam1, {key}"):
         load_cameras(written(tmp_path / "cameras.yaml", yaml.safe_dump(document)))
 
 
 def test_a_picture_of_a_trillion_pixels_is_no_cameras(tmp_path):
-    with pytest.raises(CameraError, match="cam1, image_size: expected at most 65536 px a side"):
+    with pytest.raises(CameraError, match="cam1, image_size"):
         one_camera(tmp_path, image_size=[1_000_000, 1_000_000])
 
 
@@ -201,7 +201,7 @@ def test_a_port_that_is_none_is_refused_with_the_name_of_the_file(tmp_path):
 def test_a_table_as_large_as_a_movie_is_refused_unread(tmp_path):
     path = written(tmp_path / points_family().file, "x,y,z,u,v\n")
     os.truncate(path, 10**10)
-    with pytest.raises(CameraError, match=r"expected a table, got 1e\+04 MB"):
+    with pytest.raises(CameraError, match=r"1e\+04 MB"):
         read_points(path)
 
 
@@ -219,7 +219,7 @@ def test_nesting_on_which_opencvs_parser_crashes_is_refused_before_it_sees_it(tm
 @pytest.mark.parametrize("claim", ["100000", "2147483647", "-1", "0", "1.5", "x"])
 def test_a_matrix_that_claims_much_is_not_made_room_for(tmp_path, claim):
     text = OPENCV["yml"].replace("rows: 3", f"rows: {claim}").replace("cols: 3", f"cols: {claim}")
-    with pytest.raises(CameraError, match="camera_matrix: expected an OpenCV matrix, got none"):
+    with pytest.raises(CameraError, match="camera_matrix"):
         load_opencv(written(tmp_path / "cam.yml", text))
 
 
@@ -266,14 +266,14 @@ def test_an_ori_with_a_mark_in_front_is_read_and_one_with_controls_is_refused_in
     ids=["png", "bomb", "tiff", "tiff big"],
 )
 def test_a_picture_that_claims_too_much_is_refused_before_room_is_made(tmp_path, content):
-    with pytest.raises(TextureError, match=r"expected a picture of at most 33\.6 million pixels, got"):
+    with pytest.raises(TextureError, match=r"33\.6 million pixels"):
         load_texture(written(tmp_path / "texture.png", content))
-    with pytest.raises(ExperimentError, match="expected 32 x 16 px as the movie, got"):
+    with pytest.raises(ExperimentError, match="32 x 16 px"):
         load_background(written(tmp_path / "empty.png", content), (16, 32))
 
 
 def test_formats_whose_size_is_not_told_before_decoding_are_refused(tmp_path):
-    with pytest.raises(TextureError, match="expected a PNG, TIFF or JPEG picture"):
+    with pytest.raises(TextureError, match="PNG, TIFF or JPEG"):
         load_texture(written(tmp_path / "texture.png", encoded(".webp", np.dstack([pattern()] * 3))))
 
 

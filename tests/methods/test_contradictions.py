@@ -25,10 +25,7 @@ FRAMES, MM, SIGMA_RAD = 12, 18.0, math.radians(0.02)
 
 
 def track_of(
-    turn_deg: dict[str, float],
-    shift_px: dict[str, float],
-    why: Reason = Reason.OK,
-    of: dict[str, Camera] = CAMERAS,
+    turn_deg: dict[str, float], shift_px: dict[str, float], why: Reason = Reason.OK, of: dict[str, Camera] = CAMERAS
 ) -> Trajectory:
     """Return a track whose cameras alone are off by rotations about x, by pixels along v; `why`: of cam2."""
     motion = motion_of(SynthSettings()).at(frame_times_s(SynthSettings(frames=FRAMES)))

@@ -165,6 +165,7 @@ EIGHT_BIT: dict[str, Writer] = {
     "bmp": sequence("bmp"),
     "ffv1 bgra": video("movie.avi", "ffv1", "bgra"),
     "raw avi": video("movie.avi", "rawvideo"),
+    "upper case suffix": video("MOVIE.AVI", "rawvideo"),
     "raw bgr avi": video("movie.avi", "rawvideo", "bgr24"),
 }
 LOSSY: dict[str, Writer] = {

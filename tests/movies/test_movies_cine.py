@@ -114,7 +114,7 @@ def test_an_image_size_that_is_no_whole_number_of_rows_is_refused(tmp_path):
     content = bytearray(path.read_bytes())
     content[44 + 8 : 44 + 12] = (36).to_bytes(4, "little")  # biHeight
     path.write_bytes(content)
-    with pytest.raises(MovieError, match="expected images of 36 rows of at least 51 bytes"):
+    with pytest.raises(MovieError, match="36 rows of at least 51 bytes"):
         open_movie(path)
 
 
@@ -146,5 +146,5 @@ def test_the_frames_of_a_cut_off_movie_are_there(tmp_path):
         assert np.array_equal(movie.sample(range(whole)), pictures()[:whole])
         assert len(movie.times_s) == whole
     path.write_bytes(content[: at_images + pitch - 1])
-    with pytest.raises(MovieError, match="expected at least one whole image"):
+    with pytest.raises(MovieError, match="one whole image"):
         open_movie(path)

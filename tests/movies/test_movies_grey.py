@@ -68,5 +68,5 @@ def test_usual_formats_are_accepted(pixels):
 
 @pytest.mark.parametrize("pixels", ["yuyv422", "ya8", "monow", "grayf32le"])
 def test_formats_whose_first_plane_is_not_plain_grey_are_refused(pixels):
-    with pytest.raises(MovieError, match=f"movie: expected grey, planar YUV or RGB pixels, got {pixels}; convert it"):
+    with pytest.raises(MovieError, match=f"got {pixels}"):
         check_format("movie", av.VideoFormat(pixels, 16, 16))

@@ -8,50 +8,16 @@ import av
 import numpy as np
 import pytest
 from conftest import SHARED
-from movie_examples import FRAMES, HEIGHT, WIDTH, encode, pictures, smooth
+from movie_examples import FRAMES, encode, pictures, smooth
 
 from sphereorient.movies import open_movie, write_ffv1
 
-FORMATS: dict[str, tuple[str, str, str, dict[str, str], dict[str, str]]] = {
-    "ffv1 mkv": ("movie.mkv", "ffv1", "gray", {}, {}),
-    "ffv1 avi": ("movie.avi", "ffv1", "gray", {}, {}),
-    "ffv1 bgra avi": ("movie.avi", "ffv1", "bgra", {}, {}),
-    "raw avi": ("movie.avi", "rawvideo", "gray", {}, {}),
-    "raw bgr avi": ("movie.avi", "rawvideo", "bgr24", {}, {}),
-    "upper case suffix": ("MOVIE.AVI", "rawvideo", "gray", {}, {}),
-}
 LOSSLESS_H264 = {"qp": "0", "g": "8", "sc_threshold": "0"}
 
 
 def all_of(path: Path) -> np.ndarray:
     with open_movie(path) as movie:
         return np.stack(list(movie.frames()))
-
-
-@pytest.mark.parametrize(("name", "codec", "pixels", "options", "container"), FORMATS.values(), ids=FORMATS)
-def test_grey_values_are_exact_in_every_format_with_odd_widths(tmp_path, name, codec, pixels, options, container):
-    frames = pictures()
-    path = encode(tmp_path / name, frames, codec, pixels, options, container)
-    with open_movie(path) as movie:
-        assert movie.path == path
-        assert movie.frame_shape == (HEIGHT, WIDTH)
-        assert movie.dtype == np.uint8
-        assert len(movie) == FRAMES
-        read = list(movie.frames())
-        assert all(frame.dtype == np.uint8 and frame.flags.c_contiguous and frame.flags.writeable for frame in read)
-        assert np.array_equal(np.stack(read), frames)
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_numpy_files_are_read_as_they_are(tmp_path, dtype):
-    frames = pictures(dtype)
-    np.save(tmp_path / "movie.npy", frames)
-    with open_movie(tmp_path / "movie.npy") as movie:
-        assert movie.frame_shape == (HEIGHT, WIDTH)
-        assert movie.dtype == dtype
-        assert len(movie) == FRAMES
-        assert np.array_equal(np.stack(list(movie.frames(3, 9))), frames[3:9])
-        assert np.array_equal(movie.sample([5, 1, 5]), frames[[5, 1, 5]])
 
 
 def test_numpy_files_of_the_other_byte_order_give_the_same_values(tmp_path):

@@ -136,12 +136,6 @@ def test_what_is_decoded_after_a_damaged_frame_is_spoilt_up_to_the_next_key_fram
     assert set(index.spoilt_by(ord(damaged) - ord("a"))) == numbers
 
 
-def test_a_range_outside_the_movie_is_refused_at_once(tmp_path):
-    np.save(tmp_path / "movie.npy", pictures())
-    with pytest.raises(MovieError, match=r"expected frames within 0 .. 30"):
-        open_movie(tmp_path / "movie.npy").readable(0, 31)
-
-
 @pytest.mark.parametrize(
     ("stamps", "step", "numbers"),
     [

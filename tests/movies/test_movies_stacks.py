@@ -58,7 +58,7 @@ def test_a_broken_picture_is_one_unreadable_frame(tmp_path):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["a_1.png", "b_1.png"], "names alike but for a number, got a_1.png beside b_1.png"),
+        (["a_1.png", "b_1.png"], "a_1.png beside b_1.png"),
         (["run1_1.png", "run1_2.png", "run2_1.png"], "names alike but for one number"),
         (["1.png", "01.png"], "one picture of each number|names alike but for one number"),
         (["1.png", "2.tif"], "names alike but for a number"),
@@ -74,7 +74,7 @@ def test_pictures_that_cannot_be_one_movie_are_refused(tmp_path, names, message)
 
 def test_one_picture_and_an_empty_pattern_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a_1.png"), pictures()[0])
-    refused(tmp_path / "a_1.png", "got one picture; name all of them")
+    refused(tmp_path / "a_1.png", "got one picture")
     refused(tmp_path / "b_*.png", "expected pictures")
     refused(tmp_path / "none" / "b_*.png", "no such folder")
 
@@ -175,7 +175,7 @@ def test_hdf5_with_several_movies_asks_for_a_name(tmp_path):
     path = tmp_path / "movie.h5"
     with h5py.File(path, "w") as file:
         file["a/x"], file["b/x"], file["c"] = pictures(), pictures(), np.zeros(3)
-    refused(path, "got a/x, b/x; name one: file.h5::group/dataset")
+    refused(path, "got a/x, b/x")
     refused(tmp_path / "movie.h5::a/y", "name one of: a/x, b/x")
     refused(tmp_path / "movie.h5::c", r"got \(3,\) of float64")
     refused(tmp_path / "movie.h5::a", "got a group")
@@ -196,7 +196,7 @@ def test_nothing_outside_the_hdf5_file_is_read(tmp_path):
         layout[:] = h5py.VirtualSource("other.h5", "movie", (FRAMES, 37, 51))
         file.create_virtual_dataset("virtual", layout)
     for name in ("link", "soft"):
-        refused(tmp_path / f"movie.h5::{name}", f"a data set in the file itself, got a link, '{name}'")
+        refused(tmp_path / f"movie.h5::{name}", f"a link, '{name}'")
     for name in ("raw", "virtual"):
         refused(tmp_path / f"movie.h5::{name}", "one that lies in other files")
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from conftest import SHARED
-from movie_formats import Writer, cine, hdf5, npy, pattern, sequence, tiff, video
+from movie_formats import LOSSLESS, Writer, cine, npy, video
 
 from sphereorient import so3
 from sphereorient.errors import ExperimentError
@@ -31,17 +31,9 @@ def ffv1(folder: Path, frames: np.ndarray) -> Path:
     return folder / "movie.mkv"
 
 
-LOSSLESS: dict[str, Writer] = {
-    "FFV1 in MKV": ffv1,
-    "FFV1 in AVI": video("movie.avi", "ffv1"),
-    "cine": cine(),
-    "cine, rows top-down": cine(flip_v=1),
-    "cine, cropped": cine(first_number=-30, total=20_000, annotation=24),
-    "TIFF stack": tiff(),
-    "TIFF sequence": sequence("tif"),
-    "PNG pattern": pattern,
-    "HDF5": hdf5(),
-}
+NAMES = ("ffv1 avi", "cine", "cine, rows top-down", "tiff", "tif pictures", "pattern", "hdf5")
+WRITERS = {name: LOSSLESS[name] for name in NAMES} | {"ffv1 mkv": ffv1}
+WRITERS["cine, cropped"] = cine(first_number=-30, total=20_000, annotation=24)
 
 
 @pytest.fixture(scope="module", params=STEPS, ids=lambda size: f"{8 * size} bit")
@@ -70,9 +62,9 @@ def reference(movies: dict[str, np.ndarray], tmp_path_factory: pytest.TempPathFa
     return tracked(tmp_path_factory.mktemp("npy"), movies, npy)
 
 
-@pytest.mark.parametrize("name", LOSSLESS)
+@pytest.mark.parametrize("name", WRITERS)
 def test_every_lossless_format_gives_the_same_track(movies, reference, tmp_path, name):
-    track = tracked(tmp_path, movies, LOSSLESS[name])
+    track = tracked(tmp_path, movies, WRITERS[name])
     assert track.valid.all()
     for part in ("position", "position_cov", "orientation", "orientation_cov", "omega_lab", "flags"):
         assert getattr(track, part).tobytes() == getattr(reference, part).tobytes(), part
@@ -93,5 +85,5 @@ def test_a_movie_compressed_with_loss_gives_nearly_the_same_track(movies, refere
 
 def test_a_mirrored_movie_is_found_out(movies, tmp_path):
     """Every rotation would come out inside out; no pose explains the pictures."""
-    with pytest.raises(ExperimentError, match=r"expected frames that the map explains, .* a mirrored movie \(flip:\)"):
+    with pytest.raises(ExperimentError, match=r"a mirrored movie \(flip:\)"):
         tracked(tmp_path, {name: movie[:, ::-1] for name, movie in movies.items()}, npy)

@@ -59,6 +59,7 @@ def test_what_cannot_be_written_leaves_the_old_movie_alone(tmp_path, suffix):
         ([None, None], "frames to write, got .*none"),
         ([pictures()[0], pictures()[0][:3]], "frame 1: expected"),
         ([np.zeros((3, 4))], "frame 0: expected frames"),
+        ([np.zeros((4, 5), np.uint8), np.zeros((4, 6), np.uint8)], "frame 1: expected"),
     ):
         with pytest.raises(MovieError, match=message), writing(force=True):
             write_movie(path, frames)

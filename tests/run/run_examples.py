@@ -8,7 +8,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import torch
 from conftest import REPO
+
+from sphereorient import so3
+from sphereorient.trajectory import Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
 # Windows of eight frames, five in the excerpt; every fourth frame is searched for, in a small bank, the blur given.
@@ -38,3 +42,16 @@ def run(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
     """Run the command line."""
     words = [*COMMAND, *map(str, arguments)]
     return subprocess.run(words, capture_output=True, text=True, timeout=300, check=False, **more)
+
+
+def off_deg(track: Trajectory, experiment: Path) -> np.ndarray:
+    """Errors of a track's orientations, (N,), degrees."""
+    with h5py.File(experiment.parent / "truth.h5") as truth:
+        R = torch.from_numpy(truth["orientation"][()])
+    return np.degrees(so3.geodesic_distance(torch.from_numpy(track.orientation), R).numpy())
+
+
+def rms_sigmas(track: Trajectory, off: np.ndarray) -> float:
+    """The same in stated standard deviations, rms."""
+    sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
+    return float(np.sqrt(np.mean((off / sigma) ** 2)))

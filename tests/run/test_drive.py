@@ -91,7 +91,7 @@ def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, set
         while time.monotonic() < deadline:
             there = {path.name for path in request.parts.glob("poses-*")} if request.parts.exists() else set()
             if there:
-                (pid,) = executor._workers[0]._processes
+                (pid,) = executor.workers[0]._processes
                 os.kill(pid, signal.SIGKILL)
                 killed.append((pid, there))
                 return
@@ -115,7 +115,7 @@ def test_an_experiment_that_kills_every_worker_is_given_up(tmp_path, settings):
 
     def kill() -> None:
         while not stop.wait(0.05):
-            for pid in list(executor._workers[0]._processes or {}):
+            for pid in list(executor.workers[0]._processes or {}):
                 os.kill(pid, signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
@@ -145,7 +145,7 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(tmp_path
         deadline = time.monotonic() + 100
         while time.monotonic() < deadline and not killed:
             if requests[0].parts.exists() and list(requests[0].parts.glob("poses-*")):
-                nanny = next(iter(executor._cluster.workers.values()))
+                nanny = next(iter(executor.cluster.workers.values()))
                 os.kill(nanny.pid, signal.SIGKILL)
                 killed.append(nanny.pid)
             time.sleep(0.005)

@@ -49,7 +49,7 @@ def test_a_folder_of_the_users_is_refused_and_stays(tmp_path):
     for resume in (False, True):
         store = FolderStore(request.parts)
         with (
-            pytest.raises(OutputError, match="got a folder of something else; move it away") as refused,
+            pytest.raises(OutputError, match="a folder of something else") as refused,
             store.held(request, resume=resume),
         ):
             pass
@@ -108,7 +108,7 @@ def test_a_damaged_part_is_measured_again(store, name, values, sealed):
     """Before: TypeError or IndexError on every try; -I and 2 I were taken over as rotations."""
     damage(store.poses(BATCH), name, values, sealed=sealed)
     assert read_poses(store.poses(BATCH)) is None
-    with pytest.raises(TrackError, match=r"got a damaged file; run again with --resume"):
+    with pytest.raises(TrackError, match="a damaged file"):
         store.read(BATCH)
     assert store.missing([BATCH]) == [BATCH]
 
@@ -130,7 +130,7 @@ def test_another_process_cannot_write_the_same_track(tmp_path):
         assert held.wait(60)
         request = request_to(tmp_path / "track.h5")
         with (
-            pytest.raises(OutputError, match=rf"is being written by another run \(process {other.pid}\)"),
+            pytest.raises(OutputError, match=rf"another run \(process {other.pid}\)"),
             FolderStore(request.parts).held(request, resume=False),
         ):
             pass

@@ -99,7 +99,7 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
     parts = halfway(whole, request)
     (part,) = sorted(parts.folder.glob("poses-*"))[:1]
     part.write_bytes(part.read_bytes()[:1000])
-    with pytest.raises(TrackError, match=r"got a damaged file; run again with --resume"):
+    with pytest.raises(TrackError, match="a damaged file"):
         tracked(request, resume=True)
     assert not request.out.exists()
     tracked(request, resume=True)
@@ -109,9 +109,7 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
 def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, request_of):
     request = request_of(tmp_path, cameras=("cam1",))
     parts = halfway(whole, request)
-    with pytest.raises(
-        TrackError, match=r"parts of a run with another cam2\.mkv, cameras, empty_cam2\.png; run without --resume"
-    ):
+    with pytest.raises(TrackError, match=r"another cam2\.mkv, cameras, empty_cam2\.png;"):
         tracked(request, resume=True)
     told = json.loads((parts.folder / "run.json").read_text())
     told["cam1.mkv"] = "12 34"
@@ -123,7 +121,7 @@ def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, req
 def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)
-    with parts.held(request, resume=True), pytest.raises(OutputError, match="is being written by another run"):
+    with parts.held(request, resume=True), pytest.raises(OutputError, match="another run"):
         tracked(request, resume=True)
     assert list(parts.folder.glob("poses-*"))
 

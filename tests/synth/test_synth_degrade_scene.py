@@ -18,13 +18,7 @@ from sphereorient.errors import SettingsError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.sphere.texture import map_directions
-from sphereorient.synth import (
-    DEGRADATIONS,
-    SynthSettings,
-    severity,
-    write_degraded,
-    write_synthetic_experiment,
-)
+from sphereorient.synth import DEGRADATIONS, SynthSettings, severity, write_degraded, write_synthetic_experiment
 from sphereorient.synth.degrade_scene import (
     degraded_settings,
     misdrawn,
@@ -38,14 +32,7 @@ from sphereorient.synth.degrade_scene import (
 )
 from sphereorient.synth.write import clean_movie, default_cameras, motion_of
 
-SETTINGS = SynthSettings(
-    frames=10,
-    image_size=(96, 90),
-    diameter_px=40.0,
-    volume_mm=6.0,
-    velocity_rms=0.3,
-    seed=6,
-)
+SETTINGS = SynthSettings(frames=10, image_size=(96, 90), diameter_px=40.0, volume_mm=6.0, velocity_rms=0.3, seed=6)
 
 
 def frames_of(path: Path) -> dict[str, np.ndarray]:
@@ -134,7 +121,7 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
     for applied, message in (({"defocs": 2}, "write 'defocus' instead"), ({"defocus": 6}, "got 6; choose one of them")):
         with pytest.raises(SettingsError, match=message):
             write_degraded(tmp_path / "new", SETTINGS, applied)
-    with pytest.raises(SettingsError, match=r"^degradation occlusion: expected 0 or more, and below 1, got 2;"):
+    with pytest.raises(SettingsError, match=r"degradation occlusion: .* below 1"):
         write_synthetic_experiment(tmp_path / "new", SETTINGS, values={"occlusion": 2.0})
     assert not (tmp_path / "new").exists()
 

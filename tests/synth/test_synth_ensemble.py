@@ -6,14 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from ensembles import (
-    EnsembleSpec,
-    Law,
-    draw_ensemble,
-    filtered_track,
-    nominal,
-    smoothed_track,
-)
+from ensembles import EnsembleSpec, Law, draw_ensemble, filtered_track, nominal, smoothed_track
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 

@@ -17,19 +17,9 @@ from sphereorient.synth import SynthSettings, make_scene, write_synthetic_experi
 from sphereorient.synth.scene import expose
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of, motions_of
 
-SMALL = SynthSettings(
-    name="tiny",
-    balls=4,
-    paints=3,
-    frames=2,
-    image_size=(220, 200),
-    diameter_mm=12.0,
-    diameter_px=24.0,
-    volume_mm=40.0,
-    background=0.0,
-    exposure_samples=1,
-    seed=2,
-)
+SCENE = {"name": "tiny", "frames": 2, "image_size": (220, 200), "diameter_mm": 12.0, "diameter_px": 24.0}
+SCENE |= {"volume_mm": 40.0, "background": 0.0, "exposure_samples": 1, "seed": 2}
+SMALL = SynthSettings(balls=4, paints=3, **SCENE)
 
 
 @pytest.fixture(scope="module")
@@ -99,14 +89,14 @@ def test_the_first_ball_moves_as_an_only_one():
 
 
 def test_balls_without_room_are_refused_in_one_line():
-    with pytest.raises(SettingsError, match=r"^balls: expected room for 8 of 18 mm in all 3 frames, got") as caught:
+    with pytest.raises(SettingsError, match="room for 8 of 18 mm") as caught:
         motions_of(SynthSettings(balls=8, frames=3, volume_mm=8.0))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["uneven_light", "highlights", "occlusion", "bubbles"])
 def test_what_lies_on_the_disk_of_one_ball_is_refused_of_several(name, tmp_path):
-    with pytest.raises(SettingsError, match=rf"^degradation {name}: expected one ball, got 4; leave it out"):
+    with pytest.raises(SettingsError, match=f"{name}: .* one ball, got 4"):
         write_synthetic_experiment(tmp_path / "new", SMALL, values={name: 2.0 if name == "uneven_light" else 0.5})
     assert not (tmp_path / "new").exists()
 

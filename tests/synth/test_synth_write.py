@@ -16,40 +16,18 @@ from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import OutputError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
-from sphereorient.synth import SynthSettings, make_scene, random_motion, render_frame, write_synthetic_experiment
+from sphereorient.synth import SynthSettings, make_scene, render_frame, write_synthetic_experiment
 from sphereorient.synth.scene import seeded
-from sphereorient.synth.write import default_cameras
+from sphereorient.synth.write import default_cameras, motion_of
 
 FRAMES = 6
 # Light paint on dark ground, so that the whole disk stands out.
-SETTINGS = SynthSettings(
-    name="tiny",
-    frames=FRAMES,
-    frame_rate=200.0,
-    image_size=(160, 140),
-    diameter_px=40.0,
-    volume_mm=12.0,
-    black=110.0,
-    white=180.0,
-    ambient=0.9,
-    background=10.0,
-    velocity_rms=1.5,
-    velocity_time=0.03,
-    seed=2,
-)
-TRUTH = {
-    "time": (FRAMES,),
-    "position": (FRAMES, 3),
-    "orientation": (FRAMES, 3, 3),
-    "velocity": (FRAMES, 3),
-    "acceleration": (FRAMES, 3),
-    "omega_lab": (FRAMES, 3),
-    "omega_body": (FRAMES, 3),
-    "alpha_lab": (FRAMES, 3),
-    "alpha_body": (FRAMES, 3),
-    "cam1/centre_px": (FRAMES, 2),
-    "cam2/centre_px": (FRAMES, 2),
-}
+SCENE = {"frames": FRAMES, "frame_rate": 200.0, "image_size": (160, 140), "diameter_px": 40.0, "volume_mm": 12.0}
+SCENE |= {"black": 110.0, "white": 180.0, "ambient": 0.9, "background": 10.0, "velocity_time": 0.03}
+SETTINGS = SynthSettings(name="tiny", velocity_rms=1.5, seed=2, **SCENE)
+RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
+TRUTH = {"time": (FRAMES,), "orientation": (FRAMES, 3, 3)} | dict.fromkeys(("position", *RATES), (FRAMES, 3))
+TRUTH |= dict.fromkeys(("cam1/centre_px", "cam2/centre_px"), (FRAMES, 2))
 
 
 @pytest.fixture(scope="module")
@@ -183,14 +161,7 @@ def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
     settings = SETTINGS.model_copy(update=noiseless)
     path = write_synthetic_experiment(tmp_path, settings)
     scene = make_scene(load_texture(path.parent / "texture.png"), settings)
-    motion = random_motion(
-        settings.velocity_rms,
-        settings.velocity_time,
-        settings.omega_rms,
-        settings.omega_time,
-        settings.volume_mm,
-        settings.seed,
-    )
+    motion = motion_of(settings)
     for name, camera in default_cameras(settings).items():
         for k, frame in enumerate(frames_of(path)[name]):
             # The middles of the exposure's halves: 1 ms before and after the frame's time.

@@ -61,16 +61,16 @@ def test_of_one_ball_without_name_the_file_is_that_of_a_trajectory(tmp_path: Pat
 
 
 def test_tracks_of_other_times_are_refused() -> None:
-    with pytest.raises(ShapeError, match="Tracks: expected the same times of every ball, got 7, 3 frames"):
+    with pytest.raises(ShapeError, match=r"same times .* 7, 3 frames"):
         Tracks({"a": full_trajectory(), "b": full_trajectory()[2:5]})
 
 
 def test_one_of_several_is_picked_by_name() -> None:
     assert list(several().picked("a")) == ["a"]
     assert several().picked(None).keys() == several().keys()
-    with pytest.raises(TrackError, match="--sphere: expected b, a, c, got 'd'"):
+    with pytest.raises(TrackError, match="b, a, c, got 'd'"):
         several().picked("d")
-    with pytest.raises(TrackError, match="expected one ball without name, got 'a'; leave --sphere out"):
+    with pytest.raises(TrackError, match="one ball without name"):
         Tracks.of(full_trajectory()).picked("a")
     assert several()["a"][1:3].sphere == "a"
     assert "ball a" in repr(several())
@@ -82,15 +82,11 @@ def test_one_ball_with_a_name_keeps_it_in_the_file_of_a_trajectory(tmp_path: Pat
     assert Tracks.load(tmp_path / "track.h5")["a"].bits["IDENTITY"] == 1024
 
 
-def test_equal_tracks_give_equal_bytes(tmp_path: Path) -> None:
+def test_equal_tracks_give_equal_bytes_which_are_no_trajectory_and_the_refusal_names_the_balls(tmp_path: Path) -> None:
     several().save(tmp_path / "one.h5")
-    several().save(tmp_path / "two.h5")
-    assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "two.h5").read_bytes()
-
-
-def test_a_file_of_several_balls_is_no_trajectory_and_the_refusal_names_the_balls(tmp_path: Path) -> None:
     several().save(tmp_path / "track.h5")
-    with pytest.raises(TrackError, match=r"expected the track of one ball, got b, a, c; read all with Tracks\.load"):
+    assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "track.h5").read_bytes()
+    with pytest.raises(TrackError, match=r"track\.h5: .* one ball, got b, a, c"):
         Trajectory.load(tmp_path / "track.h5")
 
 
@@ -99,15 +95,12 @@ def test_damaged_groups_are_refused_with_their_place(tmp_path: Path) -> None:
     several().save(path)
     with h5py.File(path, "r+") as file:
         del file["spheres/a/omega_lab"]
-    with pytest.raises(TrackError, match=r"track\.h5: /spheres/a/omega_lab: expected a dataset, got none"):
+    with pytest.raises(TrackError, match=r"track\.h5: /spheres/a/omega_lab"):
         Tracks.load(path)
-    with h5py.File(path, "r+") as file:
-        del file["spheres/a"]
-        file["spheres/a"] = h5py.ExternalLink("/etc/passwd", "/")
-    with pytest.raises(TrackError, match=r"spheres: expected groups with names, got 'a'"):
-        Tracks.load(path)
-    with h5py.File(path, "r+") as file:
-        del file["spheres"]
-        file.create_group("spheres")
-    with pytest.raises(TrackError, match="spheres: expected groups with names, got none"):
-        Tracks.load(path)
+    for name, got in (("a", "'a'"), ("", "none")):
+        with h5py.File(path, "r+") as file:
+            del file["spheres"]
+            if name:
+                file["spheres/a"] = h5py.ExternalLink("/etc/passwd", "/")
+        with pytest.raises(TrackError, match=f"spheres: .* got {got}"):
+            Tracks.load(path)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import builtins
 import json
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -25,12 +27,8 @@ FORMAT_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
 FORMAT_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
 FORMAT_SHAPES |= dict.fromkeys(("orientation_smooth", "orientation_smooth_cov"), (3, 3))
 # And what came later: docs/data-format.md.
-FORMAT_SHAPES |= {
-    "position_systematic_cov": (3, 3),
-    "orientation_systematic_cov": (3, 3),
-    "margin": (),
-    "margin_angle": (),
-}
+FORMAT_SHAPES |= dict.fromkeys(("position_systematic_cov", "orientation_systematic_cov"), (3, 3))
+FORMAT_SHAPES |= {"margin": (), "margin_angle": ()}
 MOTIONS = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 FORMAT_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
 FORMAT_CAMERA = {"centre_px", "centre_sigma_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov"}
@@ -195,12 +193,10 @@ def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_saving_makes_a_missing_folder(tmp_path: Path) -> None:
+def test_saving_makes_a_missing_folder_and_refuses_one_in_its_place(tmp_path: Path) -> None:
     full_trajectory().save(tmp_path / "new" / "track.h5")
     assert len(Trajectory.load(tmp_path / "new" / "track.h5")) == len(full_trajectory())
-
-
-def test_saving_where_nothing_can_be_written_is_refused(tmp_path: Path) -> None:
+    shutil.rmtree(tmp_path / "new")
     (tmp_path / "track.h5").mkdir()
     with pytest.raises(OutputError, match=r"track\.h5"):
         full_trajectory().save(tmp_path / "track.h5")
@@ -208,36 +204,32 @@ def test_saving_where_nothing_can_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_what_is_no_track_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(TrackError, match=r"absent\.h5.*no file"):
-        Trajectory.load(tmp_path / "absent.h5")
     (tmp_path / "text.h5").write_text("hello")
-    with pytest.raises(TrackError, match=r"text\.h5.*something else"):
-        Trajectory.load(tmp_path / "text.h5")
+    for name, got in (("absent", "no file"), ("text", "something else")):
+        with pytest.raises(TrackError, match=rf"{name}\.h5.*{got}"):
+            Trajectory.load(tmp_path / f"{name}.h5")
 
 
-def test_another_schema_is_refused(tmp_path: Path) -> None:
+def short_velocity(file: h5py.File) -> None:
+    del file["velocity"]
+    file["velocity"] = np.zeros((FRAMES - 1, 3))
+
+
+DAMAGE: dict[str, Callable[[h5py.File], object]] = {
+    "track/1, got sphereorient-track/9": lambda file: file.attrs.update(schema="sphereorient-track/9"),
+    "/alpha_body_sigma": lambda file: file.__delitem__("alpha_body_sigma"),
+    "/cameras/cam1/reason": lambda file: file.__delitem__("cameras/cam1/reason"),
+    "/cameras/cam2/candidates/offset": lambda file: file.__delitem__("cameras/cam2/candidates/offset"),
+    r"velocity: .* \(7, 3\), got \(6, 3\)": short_velocity,
+}
+
+
+@pytest.mark.parametrize("words", DAMAGE)
+def test_what_is_damaged_is_named(tmp_path: Path, words: str) -> None:
     full_trajectory().save(tmp_path / "track.h5")
     with h5py.File(tmp_path / "track.h5", "a") as file:
-        file.attrs["schema"] = "sphereorient-track/9"
-    with pytest.raises(TrackError, match="expected sphereorient-track/1, got sphereorient-track/9"):
-        Trajectory.load(tmp_path / "track.h5")
-
-
-@pytest.mark.parametrize("name", ["alpha_body_sigma", "cameras/cam1/reason", "cameras/cam2/candidates/offset"])
-def test_a_missing_dataset_is_named(tmp_path: Path, name: str) -> None:
-    full_trajectory().save(tmp_path / "track.h5")
-    with h5py.File(tmp_path / "track.h5", "a") as file:
-        del file[name]
-    with pytest.raises(TrackError, match=f"/{name}: expected a dataset"):
-        Trajectory.load(tmp_path / "track.h5")
-
-
-def test_a_dataset_of_wrong_length_is_named(tmp_path: Path) -> None:
-    full_trajectory().save(tmp_path / "track.h5")
-    with h5py.File(tmp_path / "track.h5", "a") as file:
-        del file["velocity"]
-        file["velocity"] = np.zeros((FRAMES - 1, 3))
-    with pytest.raises(TrackError, match=r"Trajectory\.velocity: expected shape \(7, 3\), got \(6, 3\)"):
+        DAMAGE[words](file)
+    with pytest.raises(TrackError, match=words):
         Trajectory.load(tmp_path / "track.h5")
 
 
@@ -297,16 +289,14 @@ def test_the_trajectory_does_not_import_torch() -> None:
 
 def test_a_track_of_before_the_systematic_errors_is_read_without_them(tmp_path: Path) -> None:
     track = full_trajectory()
-    path = tmp_path / "track.h5"
-    track.save(path)
+    track.save(tmp_path / "track.h5")
     names = ("position_systematic_cov", "orientation_systematic_cov")
-    with h5py.File(path, "a") as file:
+    with h5py.File(tmp_path / "track.h5", "a") as file:
         for name in names:
             del file[name]
-    old = Trajectory.load(path)
+    old = Trajectory.load(tmp_path / "track.h5")
     for name in names:
-        assert np.shape(getattr(old, name)) == (len(track), 3, 3)
-        assert np.isnan(getattr(old, name)).all()
+        np.testing.assert_array_equal(getattr(old, name), np.full((len(track), 3, 3), np.nan))
     np.testing.assert_array_equal(old.position_cov, track.position_cov)
 
 
@@ -329,9 +319,9 @@ def test_a_slice_is_a_part_with_its_candidates() -> None:
 @pytest.mark.parametrize(
     ("index", "error", "words"),
     [
-        (3, TypeError, r"expected a slice of frames, got 3; write track\[10:11\] for one frame"),
+        (3, TypeError, r"got 3; write track\[10:11\]"),
         ("time", TypeError, "got 'time'"),
-        (slice(None, None, -1), ShapeError, "expected a positive step, got -1"),
+        (slice(None, None, -1), ShapeError, "positive step"),
     ],
 )
 def test_other_indices_are_refused(index: Any, error: type[Exception], words: str) -> None:
