@@ -66,7 +66,6 @@ def same_balls(
 ) -> tuple[Indices, Floats]:
     """Return which row is which ball, (K, N): that of each ball in each frame, and the probability that the ball has
     kept its name, (K, N), NaN where that was never in doubt.
-
     Pieces of rows, which end where the row may have changed to another ball, are linked by the errors of extrapolating
     each of two pieces to the other, in place and rotation, over the errors that this makes within pieces.
 

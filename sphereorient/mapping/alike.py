@@ -71,7 +71,6 @@ def _joined(first: LearntMap, other: LearntMap, R_other_first: Tensor) -> Learnt
 
 def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison, float]:
     """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch.
-
     Return also the displacement against the old map, and the share of the sphere with the old map's texture.
     """
     comparison = compare_maps(learnt.texture, old)

@@ -69,7 +69,6 @@ class MapComparison:
 
 def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapComparison:
     """Measure the displacement of a map (H, 2 H), 0 black .. 1 white, against a reference (h, 2 h); NaN: unknown.
-
     `turned`: find the rotation between the body frames. Raise PaintError for different spheres, ShapeError if not 2:1.
     """
     maps = [_known(texture) for texture in (other, reference)]
@@ -132,7 +131,6 @@ def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
     """Return the change of grey (H, 2 H), -1 darker .. 1, of a map from an old one in the same frame; NaN: unknown.
-
     0: a displacement up to `RADIUS_DEG` explains it. The old grey levels are fitted to the new ones first.
     """
     gain, offset = fit_levels(old, new)
@@ -281,9 +279,7 @@ def compass(direction: Tensor) -> tuple[Tensor, Tensor]:
 
 def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: Patches) -> tuple[Tensor, Tensor]:
     """Return shifts (D, 2) float64, rad east and north, of the reference's patches in another map, and (D,) found.
-
     `rough` and `fine`: blurred tables of the other map and of the reference, for search and refinement.
-
     Source: normalised correlation, then direct alignment with gain and offset, Lucas and Kanade 1981.
     """
     shift = start = _searched(rough, patches)

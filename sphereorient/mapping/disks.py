@@ -259,7 +259,6 @@ class Disks:
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return each n-th (`every`) pixel of disks (R,): view directions (3, P), grey (R, P), weight (R, P).
-
         Weights are multiplied by the slant's cosine to the power `slant_power`.
         """
         far, size = self.distance_radii[:, camera].median(), self.size_px
@@ -329,7 +328,6 @@ def normalised_disks(
     shown: Tensor | None = None,
 ) -> Disks:
     """Return disks of pictures (N, C, S, S), any finite grey: difference from the local mean over the local deviation.
-
     R_lab_view (N, C, 3, 3), distance_radii (N, C) above 1, seen (N, C) bool, shown (N, C, S, S) 0 hidden .. 1, None: 1.
     """
     size = pictures.shape[-1]
@@ -367,7 +365,6 @@ def _with_slopes(grey: Tensor) -> Tensor:
 
 def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
     """Take off what stays with the camera (shading, sensor pattern), at rough orientations (N, 3, 3).
-
     It is each pixel's mean over the places of the ball that it has shown, as far as paint cannot explain it: the mean
     of n places keeps 1/n of the paint's power. Where paint explains all, the disks come back as they are.
     """
@@ -404,7 +401,6 @@ def reduced(disks: Disks, factor: int) -> Disks:
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return places (..., 2, P), radii, of directions (..., 3, P), view, on a disk seen from a distance (...), radii.
-
     Return also their derivative by x and y (..., 1, P) and the slant's cosine (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]

@@ -73,7 +73,6 @@ def linearise(
     unseen: TextureTable | None = None,
 ) -> Linearisation:
     """Linearise B * C disks, adjacent cameras, about a map (H, 2 H) of their blur and poses (B, 3) mm, (B, 3, 3).
-
     The light of each frame is at its best; the fitter gives views and light, not the map. `unseen`: as that of a
     `TextureTable`; pixels of such paint have no weight.
     """
@@ -116,9 +115,7 @@ def joint_step(
     parts: Sequence[LinearSystem], use: Tensor, texture: Tensor, smooth: float, radius_mm: float, fixed: bool
 ) -> Tensor:
     """Return the step of all poses (N, 6) float64, rad and mm, from one solution for poses and map together.
-
     The map (H, 2 H) has its squared slopes penalised by `smooth`; use is (N, C) bool; `fixed`: one shared position.
-
     Source: each frame's light projected out, Golub and Pereyra 1973; bundle adjustment, Agarwal et al. 2010.
     """
     count, cameras = use.shape

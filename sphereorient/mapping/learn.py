@@ -62,7 +62,6 @@ STATE_PARTS = ("position_lab_mm", "R_lab_body", "texture")  # kept
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LearntMap:
     """A texture map learnt from movies or photographs; the body frame is the lab at the first known orientation.
-
     Through a mirror it is mirrored, which one camera or parallel ones cannot detect: set `flip:` in the experiment.
     """
 
@@ -94,14 +93,12 @@ def fit_map(
     crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None, old: Tensor | None = None
 ) -> LearntMap:
     """Learn the texture map, all orientations and the light from the crops of opened movies.
-
     `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
     `old`: a map (h, 2 h) of the ball as it was, which noise does not change; the body frame is not that of it.
 
     Raises:
         PaintError: too few frames, no rotation, no common patch, or different spheres.
         OutputError: `kept` cannot be written.
-
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
     before = None if kept is None else read_kept(kept)

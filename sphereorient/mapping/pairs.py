@@ -205,7 +205,6 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
 
 def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
     """Return correlations (N, M) of all first disks of a camera with one disk, `second`, at rotations (M, 3, 3).
-
     `cameras`: of the first disks and of the second; the rotations take the first view frame to the second.
     """
     camera, other = cameras
@@ -227,7 +226,6 @@ def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tens
 
 def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) -> tuple[Tensor, Tensor]:
     """Fit orientations (N, 3, 3) float64, the first fixed, to relative rotations; return also residuals (E, 3), rad.
-
     Source: weights at `scale_rad`, Geman and McClure 1987, graduated non-convexity (Yang et al. 2020).
     """
     R = R_lab_body.clone()

@@ -73,9 +73,7 @@ class Evidence:
 
     def log_odds(self, pairs: RelativeRotations) -> Tensor:
         """Return the log-odds (E,) of pairs, from Fisher's z of their correlations over n independent places.
-
         Its mean is 0 for different patches, about twice that of `score_min` for the same; the variance is 1 / n.
-
         Source: Fisher 1921, On the probable error of a coefficient of correlation.
         """
         middle = math.atanh(self.score_min)

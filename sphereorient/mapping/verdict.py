@@ -23,7 +23,6 @@ WINDOW = 5  # rotations whose median is usual
 
 def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tensor:
     """Return correlations (n, C) of pictures with a map to which they were not fitted; NaN where not compared.
-
     Both are normalised as for pairs of pictures, so that shading counts for nothing.
     """
     rows = torch.arange(HELD_EVERY // 2, len(state.use), HELD_EVERY)
@@ -52,7 +51,6 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
 
 def jumps(R_lab_body: Tensor) -> Tensor:
     """Return the frames (J,) from which a ball with orientations (N, 3, 3) turns unlike before and after; NaN: unknown.
-
     A rotation is compared with the median of its neighbours': a lasting change of the rate is none.
     """
     turn = so3.log((R_lab_body[1:] @ R_lab_body[:-1].mT).nan_to_num())

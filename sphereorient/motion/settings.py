@@ -15,7 +15,6 @@ def check_separations(separations: Sequence[int], name: str = "separations") -> 
 
 class MotionSettings(BaseModel, frozen=True, extra="forbid"):
     """How positions and orientations become velocities and accelerations.
-
     The defaults fit the experiment of the paper, 600 Hz and 1 degree of attitude noise; they are widths in frames, so
     double them at twice the frame rate. Wider means less noise and more low-pass bias.
     """

@@ -53,7 +53,6 @@ def segment_sums(values: Floats, segment: Rows, segments: int) -> Floats:
 
 def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | None = None) -> Interval:
     """Return a statistic of the total of `sums` (S, ...) over segments, with BCa intervals from resampled segments.
-
     `statistic` maps totals (..., *sums.shape[1:]) to values with the same leading shape; values are NaN where it is.
     The intervals of a single segment are NaN; of none, the values too.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
@@ -114,7 +113,6 @@ def studentized(
     sums: Floats, statistic: Statistic, positive: NDArray[np.bool_], settings: BootstrapSettings | None = None
 ) -> Interval:
     """Return a statistic of the total of `sums` (S, G, K) over segments, with studentized bootstrap intervals.
-
     For statistics skewed by a few large events, such as the flatness. `statistic` maps totals (..., G, K) to values
     (..., G, Q) and gives the same for twice the totals; values are NaN where it is. `positive` (Q,) marks values that
     are positive by definition. Fewer than 20 segments: as `bootstrap`.

@@ -29,7 +29,6 @@ def camera_distances(
     tracks: Trajectory | Sequence[Trajectory], uncorrected: Sequence[Mapping[str, Floats] | None] = (), bins: int = 60
 ) -> list[CameraDistance]:
     """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
-
     `uncorrected` holds for each track the result of `without_perspective`; None or missing: unknown.
     Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
@@ -62,7 +61,6 @@ def _pooled(pair: tuple[str, str], apart: Floats, rough_parts: list[Floats] | No
 
 def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
     """Return R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
-
     These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """

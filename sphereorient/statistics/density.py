@@ -23,7 +23,6 @@ REACH = 10.0  # of the PDF to either side, standard deviations
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
     """Return the density of unit variance that the paper fits to accelerations, at x (...), in standard deviations.
-
     p(x) = exp(3 a^2 / 2) / (4 sqrt 3) erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)); a broadcasts against x.
     Source: Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245; the paper, section IV.
     """
@@ -73,7 +72,6 @@ def fit_stretched(
     x: Floats, segment: Rows, segments: int, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> StretchedFit:
     """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
-
     The fit leaves out `noise_share` of the variance (`moments.noise_let_through`); such noise would fill the peak of
     the density and lower a. `segment` (M,), 0 .. segments - 1, increases.
     """

@@ -41,7 +41,6 @@ class Isotropy:
 
 def isotropy(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Isotropy:
     """Test whether the covariance of a quantity (a name in UNITS) is the same in all directions of its frame.
-
     Samples are whole segments, since a track is correlated. With six segments or fewer the p-value is NaN.
     Source: Hotelling 1931; the paper, Table I, with docs/errata.md E6.
     """
@@ -128,7 +127,6 @@ class Uniformity:
 
 def uniformity(R_lab_body: Floats, segment: Rows | None = None) -> Uniformity:
     """Test whether rotations (M, 3, 3) are uniform on SO(3), by the first and second moments of the axes' directions.
-
     Statistic: 3 n |<R>|^2 + 5 n |<D>|^2, D of `five_dimensional`. The null distribution rotates whole segments, (M,),
     increasing; None: all rotations are independent. Twenty segments are few; with two the test has no power.
     Source: Rayleigh's and Gine's tests on SO(3): Mardia and Jupp 2000, Directional Statistics, 13.2.

@@ -53,7 +53,6 @@ def correlation(
     ensemble: Ensemble, quantity: str, longest_s: float | None = None, settings: BootstrapSettings | None = None
 ) -> Correlation:
     """Return the autocorrelation of a quantity (a name in UNITS) about its ensemble mean, and its integral times.
-
     A value is the mean product of pairs over their mean square: unbiased by the lengths of segments. Pairs over a gap
     count at their true lag. `longest_s` None: the longest lag at which a fiftieth of the samples has a partner.
     Source: textbook; the paper's T_L is the integral time of `velocity`, up to the first zero.
@@ -129,7 +128,6 @@ def increments(
     settings: BootstrapSettings | None = None,
 ) -> Increments:
     """Return rms and flatness of increments of a quantity (a name in UNITS), for lags that ten segments or more reach.
-
     `lags_s`, s, are rounded to frames; None: twelve, geometric, from one frame to `integral_time_s` (None: half the
     median segment). The flatness goes from the derivative's to 3 + (F - 3) / 2 at long lags.
     Source: the paper, section IV, with docs/errata.md E7.

@@ -53,13 +53,11 @@ def multi_lag(
     settings: BootstrapSettings | None = None,
 ) -> MultiLag:
     """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
-
     The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
     fit over four lags n or more separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
 
     Raises:
         TrackError: too few segments or lags for the fit.
-
     Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
@@ -143,7 +141,6 @@ def width_curve(
     settings: BootstrapSettings | None = None,
 ) -> WidthCurve:
     """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
-
     Narrow kernels let noise through, wide ones lose motion; a plateau between them is the rms. All widths use the
     frames that the widest one reaches; NaN where all segments are shorter. White noise and regular times are assumed.
     Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
