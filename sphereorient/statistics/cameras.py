@@ -49,13 +49,9 @@ def _pooled(pair: tuple[str, str], apart: Floats, rough_parts: list[Floats] | No
     rough = None if rough_parts is None else np.concatenate(rough_parts)
     top = max([float(x.max()) for x in (apart, rough) if x is not None and len(x)], default=np.pi)
     edges = np.linspace(0.0, max(top, 1e-9), bins + 1)
+    own, other = _pdf(apart, edges), None if rough is None else _pdf(rough, edges)
     return CameraDistance(
-        cameras=pair,
-        distance_rad=apart,
-        edges_rad=edges,
-        pdf=_pdf(apart, edges),
-        uncorrected_rad=rough,
-        uncorrected_pdf=None if rough is None else _pdf(rough, edges),
+        cameras=pair, distance_rad=apart, edges_rad=edges, pdf=own, uncorrected_rad=rough, uncorrected_pdf=other
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from sphereorient.errors import TrackError, refusal
 from sphereorient.motion import gaussian_kernel, rotvec_between
 from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums, studentized
+from sphereorient.statistics.lags import places
 from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
@@ -201,9 +202,8 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
     _, segment = np.unique(track.segment[rows], return_inverse=True)
     begin = np.searchsorted(segment, np.arange(segment.max() + 1))
     frame = np.rint((track.time[rows] - track.time[rows][begin][segment]) / _step(track)).astype(np.int64)
-    lengths = np.maximum.reduceat(frame, begin) + 2
-    place = frame + np.concatenate([[0], np.cumsum(lengths)])[:-1][segment]
-    number = np.full(int(lengths.sum()), -1, dtype=np.int64)
+    place = places(frame, segment)
+    number = np.full(int(place[-1]) + 2, -1, dtype=np.int64)
     number[place] = segment
     return rows, place, number
 
