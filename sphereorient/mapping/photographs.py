@@ -57,10 +57,8 @@ OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second 
 def finer_settings(settings: MapSettings, diameter_px: float) -> MapSettings:
     """Return settings of finer disks, up to the pictures' resolution: coarse ones are 2 degrees off at slants."""
     factor = min(max(diameter_px / settings.disk_px, 1.0), FINER, DISK_PX_MAX / settings.disk_px)
-    size = 2 * round(factor * settings.disk_px / 2)
-    return settings.model_copy(
-        update={"disk_px": size, "detail": settings.detail / factor, "window": settings.window / factor}
-    )
+    finer = {"detail": settings.detail / factor, "window": settings.window / factor}
+    return settings.model_copy(update={"disk_px": 2 * round(factor * settings.disk_px / 2), **finer})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

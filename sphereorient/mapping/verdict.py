@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from sphereorient import so3
+from sphereorient.mapping.compare import weighted_correlation
 from sphereorient.mapping.disks import Crops, disks_of, normalised_disks
 from sphereorient.mapping.grid import look_up
 from sphereorient.mapping.iterations import State, fitted, map_weight, with_map
 from sphereorient.mapping.settings import MapSettings
+from sphereorient.motion.stencil import windows
 from sphereorient.sphere.view import perspective_view
 
 HELD_EVERY = 5  # instants; the map of the others is compared with this one
@@ -43,9 +44,7 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
         model = normalised_disks(pictures[:, None], at.R_lab_view, at.distance_radii, at.seen, settings, at.shown)
         a, b = (disks.layers[:, 0, 0].flatten(1) for disks in (at, model))
         weight = filmed.share.flatten() * filmed.weight(slice(None), c) * (seen > SEEN_MIN).flatten(1)
-        a, b = (x - ((weight * x).sum(1) / weight.sum(1).clamp_min(1e-9))[:, None] for x in (a, b))
-        power = (weight * a * a).sum(1) * (weight * b * b).sum(1)
-        found[rows, c] = torch.where(power > 0, (weight * a * b).sum(1) / power.sqrt(), torch.nan).double()
+        found[rows, c] = weighted_correlation(a, b, weight).double()
     return found
 
 
@@ -55,7 +54,7 @@ def jumps(R_lab_body: Tensor) -> Tensor:
     """
     turn = so3.log((R_lab_body[1:] @ R_lab_body[:-1].mT).nan_to_num())
     turn = torch.where(R_lab_body.isfinite().flatten(1).all(1).unfold(0, 2, 1).all(1)[:, None], turn, torch.nan)
-    near = F.pad(turn.T[None], (WINDOW // 2, WINDOW // 2), value=torch.nan)[0].unfold(1, WINDOW, 1)
+    near = windows(turn.T, WINDOW // 2)
     off = (turn - near.nanmedian(2).values.T).norm(dim=1)
     usual = off[off.isfinite()].median() if off.isfinite().any() else off.new_zeros(())
     return torch.nonzero(off > (JUMPS * usual).clamp_min(JUMP_RAD))[:, 0]
