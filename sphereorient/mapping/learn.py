@@ -99,6 +99,7 @@ def fit_map(
     Raises:
         PaintError: too few frames, no rotation, no common patch, or different spheres.
         OutputError: `kept` cannot be written.
+
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
     before = None if kept is None else read_kept(kept)

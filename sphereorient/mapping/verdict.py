@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.mapping.compare import weighted_correlation
@@ -12,7 +13,6 @@ from sphereorient.mapping.disks import Crops, disks_of, normalised_disks
 from sphereorient.mapping.grid import look_up
 from sphereorient.mapping.iterations import State, fitted, map_weight, with_map
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.motion.stencil import windows
 from sphereorient.sphere.view import perspective_view
 
 HELD_EVERY = 5  # instants; the map of the others is compared with this one
@@ -54,7 +54,7 @@ def jumps(R_lab_body: Tensor) -> Tensor:
     """
     turn = so3.log((R_lab_body[1:] @ R_lab_body[:-1].mT).nan_to_num())
     turn = torch.where(R_lab_body.isfinite().flatten(1).all(1).unfold(0, 2, 1).all(1)[:, None], turn, torch.nan)
-    near = windows(turn.T, WINDOW // 2)
+    near = F.pad(turn.T[None], (WINDOW // 2, WINDOW // 2), value=torch.nan)[0].unfold(1, WINDOW, 1)
     off = (turn - near.nanmedian(2).values.T).norm(dim=1)
     usual = off[off.isfinite()].median() if off.isfinite().any() else off.new_zeros(())
     return torch.nonzero(off > (JUMPS * usual).clamp_min(JUMP_RAD))[:, 0]

@@ -107,12 +107,10 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     out = {one.name: np.full((len(t), 3, 3) if one.name in square else (len(t), 3), np.nan) for one in fields(Motion)}
     rejected, by_path = np.zeros(len(t), dtype=bool), np.zeros((len(t), 3, 3))
     ratio = 1.0 if known is None else frame_s / known.frame_s
-    process = [prior and prior.at_rate(ratio) for prior in ((known.place, known.turn) if known else (None, None))]
+    prior = [each and each.at_rate(ratio) for each in ((known.place, known.turn) if known else (None, None))]
     bands = [hz and hz * frame_s for hz in (settings.position_band_hz, settings.orientation_band_hz)]
-    estimates, position_scale, place = _estimates(
-        SegmentTrack, (X, X_cov, seen_X), segments, bands[0], settings, process[0]
-    )
-    for rows, at in estimates:
+    found, position_scale, place = _estimates(SegmentTrack, (X, X_cov, seen_X), segments, bands[0], settings, prior[0])
+    for rows, at in found:
         _put_places(out, rows, at, frame_s)
         rejected[rows] |= at.rejected
     if measured.coupling is not None:
@@ -124,10 +122,10 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         R[told], R_cov[told], by_path[told] = _given_path(
             R[told], R_cov[told], coupling[told], off[told], X_cov[told], path_cov[told]
         )
-    estimates, orientation_scale, turn = _estimates(
-        RotationTrack, (R, R_cov, seen_R), segments, bands[1], settings, process[1]
+    found, orientation_scale, turn = _estimates(
+        RotationTrack, (R, R_cov, seen_R), segments, bands[1], settings, prior[1]
     )
-    for rows, at in estimates:
+    for rows, at in found:
         _put_turns(out, rows, at, frame_s)
         rejected[rows] |= at.rejected
     # The path's error lasts: neighbours share it, and frames between them.

@@ -59,6 +59,7 @@ def multi_lag(
 
     Raises:
         TrackError: too few segments or lags for the fit.
+
     Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)

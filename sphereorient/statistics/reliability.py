@@ -31,6 +31,7 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
 
     Raises:
         ShapeError: unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin.
+
     Source: Naeini et al. 2015 (expected calibration error) with bins of equal count; interval: Wilson 1927.
     """
     said, came = np.asarray(probability, np.float64), np.asarray(outcome, np.bool_)

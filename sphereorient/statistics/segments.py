@@ -72,6 +72,7 @@ def ensemble_of(
     Raises:
         TrackError: no usable frame, fewer than `fewest` segments (if 0: no valid frame), or tracks of kernels and of
             smoothers together.
+
     Source: the paper, section IV: segments above 0.25 T_L; docs/errata.md, settings of the paper: 50 frames.
     """
     settings = settings or SegmentSettings()
@@ -182,6 +183,7 @@ def durations(span_s: Floats, truncated_s: float, *, bins: int = 20, level: floa
 
     Raises:
         TrackError: fewer than two durations are `truncated_s` or longer.
+
     Source: textbook (Epstein and Sobel 1953), maximum likelihood; the paper, section IV.
     """
     from scipy.stats import chi2

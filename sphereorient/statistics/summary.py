@@ -72,6 +72,7 @@ def summarise(
 
     Raises:
         TrackError: no valid frame, or tracks of kernels and of smoothers together.
+
     Source: the paper, section IV, with docs/errata.md A5, E6, E7.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
