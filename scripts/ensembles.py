@@ -276,8 +276,7 @@ def filtered_track(
         torch.from_numpy(track.segment),
         true.frame_rate,
         settings or motion.MotionSettings(),
-        position_sigma_mm=sigma_mm.double(),
-        orientation_sigma_rad=sigma_rad.double(),
+        (sigma_mm.double(), sigma_rad.double()),
     )
     return replace(track, **motion.datasets_of(found))
 

@@ -75,9 +75,8 @@ class BeamSearch:
             step, least, total = self._arrive(self._step(states, least, f), least, total)
             steps.append(step)
             totals.append(total)
-            last = self.last_pin[f]
-            if last > f:  # only one state is left: no search until the run's end
-                step = self._jump(step, last)
+            if self.last_pin[f] > f:  # only one state is left: no search until the run's end
+                step = self._jump(step, self.last_pin[f])
                 least, total = least + step.cost, total + step.cost
                 steps.append(step)
                 totals.append(total)
@@ -125,13 +124,9 @@ class BeamSearch:
     def _begin(self, source: Ints, cost: Floats, f: int) -> BeamStep:
         """Begin a motion at each candidate: it may have any orientation, so its ratio to the uniform density is 1."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
-        return BeamStep(
-            frame=f,
-            states=PathStates.begin(f, rows),
-            source=np.repeat(source, len(rows)),
-            target=np.tile(np.arange(len(rows)), len(source)),
-            cost=(cost[:, None] + self._candidate_cost(rows, np.zeros(len(rows)))).ravel(),
-        )
+        source, target = np.repeat(source, len(rows)), np.tile(np.arange(len(rows)), len(source))
+        total = (cost[:, None] + self._candidate_cost(rows, np.zeros(len(rows)))).ravel()
+        return BeamStep(frame=f, states=PathStates.begin(f, rows), source=source, target=target, cost=total)
 
     def _go_on(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
         """Continue states that have an omega, by the rotation nearest to its prediction."""
@@ -139,13 +134,9 @@ class BeamSearch:
         R, R_before = self.rows.R_lab_body[rows], self.rows.R_lab_body[states.row]
         expected = states.turn / states.span[:, None] * dt[:, None]
         off, axis_off = rotation_between(rotated(R_before, expected)[:, None], R)
-        variance = self.cost.predicted_variance(
-            dt[:, None],
-            states.span[:, None],
-            states.before[:, None],
-            self.rows.variance[states.row, None],
-            self.rows.variance[rows],
-        )
+        here, after = self.rows.variance[states.row, None], self.rows.variance[rows]
+        span, before = states.span[:, None], states.before[:, None]
+        variance = self.cost.predicted_variance(dt[:, None], span, before, here, after)
         angle, axis = rotation_between(R_before[:, None], R)
         zones = self.rows.zones(dt)[:, None]
         around = np.rint(((expected[:, None] * axis).sum(-1) - angle) / (2 * math.pi)).astype(np.int64)
@@ -203,15 +194,9 @@ class BeamSearch:
         place = np.full(size, -1)
         place[near] = np.arange(len(near))
         kept = place[step.target] >= 0
-        renumbered = np.cumsum(kept) - 1
-        pruned = replace(
-            step,
-            states=step.states.take(near),
-            source=step.source[kept],
-            target=place[step.target[kept]],
-            cost=step.cost[kept],
-            best=renumbered[first[near]],
-        )
+        states, source, target, cost = step.states.take(near), step.source[kept], step.target[kept], step.cost[kept]
+        best = (np.cumsum(kept) - 1)[first[near]]
+        pruned = replace(step, states=states, source=source, target=place[target], cost=cost, best=best)
         return pruned, new_least[near], new_total[near]
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Ints]:
@@ -257,13 +242,9 @@ class BeamSearch:
 
     def _jump(self, step: BeamStep, last: int) -> BeamStep:
         """Return the step to the last frame of a run, whose only state follows from the run's second frame."""
-        states = PathStates(
-            frame=np.array([last]),
-            row=self.main[[last]],
-            turn=self.chain_turn[[last]],
-            span=self.time[[last]] - self.time[[last - 1]],
-            before=self.rows.variance[self.main[[last - 1]]],
-        )
+        at, back = np.array([last]), np.array([last - 1])
+        span, before = self.time[at] - self.time[back], self.rows.variance[self.main[back]]
+        states = PathStates(frame=at, row=self.main[at], turn=self.chain_turn[at], span=span, before=before)
         cost, none = self.chain_cost[step.frame + 1 : last + 1].sum(keepdims=True), np.zeros(1, dtype=np.int64)
         return BeamStep(frame=last, states=states, source=none, target=none, cost=cost, best=none)
 
@@ -288,9 +269,8 @@ class BeamSearch:
             if begins[f] and place:
                 breaks[f] = self._alive(steps[place - 1].states, f)[1][end]
             ahead = soft_min(step.cost + ahead[step.target], step.source, len(totals[place - 1]) if place else 1)
-        return Histories(
-            row=row, begins=begins, breaks=breaks, turn_rad=turn, posterior=posterior, evidence=-everything
-        )
+        log = -everything
+        return Histories(row=row, begins=begins, breaks=breaks, turn_rad=turn, posterior=posterior, evidence=log)
 
 
 def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:

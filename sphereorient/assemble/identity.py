@@ -66,7 +66,6 @@ def same_balls(
 ) -> tuple[Indices, Floats]:
     """Return which row is which ball, (K, N): that of each ball in each frame, and the probability that the ball has
     kept its name, (K, N), NaN where that was never in doubt.
-
     Pieces of rows, which end where the row may have changed to another ball, are linked by the errors of extrapolating
     each of two pieces to the other, in place and rotation, over the errors that this makes within pieces.
 
@@ -120,12 +119,13 @@ def _whole(order: Indices, taken: NDArray[np.bool_]) -> Indices:
 
 def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
     """Return the pieces between breaks in which a row has poses."""
-    found = []
-    ends = sorted({0, *breaks, seen.shape[1]})
-    for row, there in enumerate(seen):
-        for first, last in pairwise(ends):
-            found += [_Piece(row, first + a, first + b) for a, b in runs_of(there[first:last])]
-    return found
+    spans = list(pairwise(sorted({0, *breaks, seen.shape[1]})))
+    return [
+        _Piece(row, first + a, first + b)
+        for row, there in enumerate(seen)
+        for first, last in spans
+        for a, b in runs_of(there[first:last])
+    ]
 
 
 def _before(piece: _Piece, frame: int) -> Indices:
@@ -176,11 +176,9 @@ def _links(motions: _Motions, pieces: Sequence[_Piece], scale: Floats) -> dict[t
             gap = later.first - early.last + 1
             if not 0 < gap <= FARTHEST:
                 continue
-            off = [
-                motions.away(_before(early, early.last), early.row, later.row, later.first),
-                motions.away(ahead, later.row, early.row, early.last - 1),
-            ]
-            links[i, j] = float(np.mean([((one / _error(scale, gap)) ** 2).sum() for one in off]))
+            onward = motions.away(_before(early, early.last), early.row, later.row, later.first)
+            back = motions.away(ahead, later.row, early.row, early.last - 1)
+            links[i, j] = float(np.mean([((off / _error(scale, gap)) ** 2).sum() for off in (onward, back)]))
     return links
 
 
@@ -195,13 +193,8 @@ def _linked(count: int, links: dict[tuple[int, int], float]) -> dict[int, int]:
     row = np.concatenate([ends, every, count + every, count + begins])
     column = np.concatenate([begins, count + every, every, count + ends])
     tiny = 1e-9  # 0 means no link
-    weight = np.concatenate(
-        [
-            np.minimum(np.array(list(links.values())), 1e9) + tiny,
-            np.full(2 * count, NO_LINK / 2),
-            np.full(len(pairs), tiny),
-        ]
-    )
+    chi2 = np.minimum(np.array(list(links.values())), 1e9) + tiny
+    weight = np.concatenate([chi2, np.full(2 * count, NO_LINK / 2), np.full(len(pairs), tiny)])
     matrix = coo_array((weight, (row, column)), shape=(2 * count, 2 * count)).tocsr()
     chosen = zip(*min_weight_full_bipartite_matching(matrix), strict=True)
     return {int(i): int(j) for i, j in chosen if i < count and j < count}

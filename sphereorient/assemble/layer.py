@@ -5,6 +5,7 @@ docs/differentiable.md connects the soft track to the cameras.
 
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -123,28 +124,22 @@ class PathLayer(nn.Module):
         score, variance = torch.where(there, score, 0.0), torch.where(there, variance, 0.0)
         if self.order == 2 and self.soft is None:
             return self._histories(R, -score, variance, there, time)
-        node: Tensor | None = None
-        triple: Tensor | None = None
         if self.order == 1:
             edge = edge_costs(R, score, time, there)
-        else:
-            edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
-        if self.soft is None:
-            return shortest_path(edge, there, node, triple)
+            return shortest_path(edge, there) if self.soft is None else soft_path(edge, there, self.soft)
+        assert self.soft is not None
+        edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
         return soft_path(edge, there, self.soft, node, triple)
 
     def _histories(self, R: Tensor, nll: Tensor, variance: Tensor, mask: Tensor, time_s: Tensor) -> Chosen:
         """Search movie after movie."""
-        settings, leading = self.settings, mask.shape[:-2]
-        assert isinstance(settings, PathSettings)
-        every = R, nll, variance, mask, time_s
-        R, nll, variance, known, time_s = (x.reshape(math.prod(leading), *x.shape[len(leading) :]) for x in every)
-        movies = zip(R, nll, variance, known, time_s, strict=True)
-        found = [vars(physical_path(*movie, settings)) for movie in movies]
+        assert isinstance(self._settings, PathSettings)
+        if mask.ndim == 2:
+            return physical_path(R, nll, variance, mask, time_s, self._settings)
+        found = [vars(self._histories(*movie)) for movie in zip(R, nll, variance, mask, time_s, strict=True)]
         if not found:
             return Chosen.nothing(mask)
-        parts = {name: torch.stack([one[name] for one in found]) for name in found[0]}
-        return Chosen(**{name: part.reshape(leading + part.shape[1:]) for name, part in parts.items()})
+        return Chosen(**{name: torch.stack([one[name] for one in found]) for name in found[0]})
 
     def _second_order_costs(
         self, R: Tensor, score: Tensor, time_s: Tensor, variance: Tensor, mask: Tensor
@@ -177,7 +172,7 @@ def triple_costs(
     (..., N, C). Frames without candidates are skipped; rotations between frames visited are below half a turn.
     """
     variance = cost.sigma_scale**2 * variance_rad2
-    links, steps, width = _links_of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
+    links, steps, width = _Links.of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
     still = _still(cost, links, R_lab_body, variance)
     chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
     parts = [_chunk(cost, links, variance, still, slice(at, min(at + chunk, steps))) for at in range(2, steps, chunk)]
@@ -194,13 +189,8 @@ def _chunk(cost: SecondOrderCost, links: "_Links", variance: Tensor, still: Tens
         expected = so3.exp(so3.log(expected) * ratio)
     expected = expected.flatten(-2).transpose(-3, -2)  # (..., j, i, 9)
     misfit = _squared_chord(expected, links.turn[..., steps, :, :, :, :].flatten(-2)).transpose(-3, -2)
-    predicted = cost.predicted_variance(
-        dt,
-        span,
-        taken(variance, earlier, 1)[..., :, None, None],
-        taken(variance, before, 1)[..., None, :, None],
-        variance[..., steps, None, None, :],
-    )
+    first, second = taken(variance, earlier, 1)[..., :, None, None], taken(variance, before, 1)[..., None, :, None]
+    predicted = cost.predicted_variance(dt, span, first, second, variance[..., steps, None, None, :])
     broken = torch.as_tensor(cost.break_probability)
     follows = torch.logaddexp(torch.log1p(-broken) + _log_ratio(cost, misfit, predicted), broken.log())
     return cost.candidate(follows, still[..., steps, None, None, :])
@@ -227,17 +217,16 @@ class _Links:
     dt_s: Tensor  # (..., N), the time between, 1 without a step before
     before: Tensor  # (..., N) int64, the step visited before, 0 without one
 
-
-def _links_of(R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> _Links:
-    """Return the rotations between all candidates of successive steps; those into empty steps are arbitrary."""
-    before = visited_before(mask)
-    dt = time_s - time_s.gather(-1, before)  # in this order: single precision cannot separate late times
-    # One product of (3C, 3) and (3, 3C) a step, not C^2 small ones, which take ten times as long.
-    width = mask.shape[-1]
-    after, first = R_lab_body.flatten(-3, -2), taken(R_lab_body, before, 3).flatten(-3, -2)
-    every = (after @ first.mT).reshape(*mask.shape[:-1], width, 3, width, 3)  # (..., to, 3, from, 3)
-    turn = every.permute(*range(mask.ndim - 1), -2, -4, -3, -1)
-    return _Links(turn=turn, dt_s=torch.where(dt > 0, dt, 1.0).to(R_lab_body), before=before)
+    @classmethod
+    def of(cls, R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> Self:
+        """Return the rotations between all candidates of successive steps; those into empty steps are arbitrary."""
+        before, width = visited_before(mask), mask.shape[-1]
+        dt = time_s - time_s.gather(-1, before)  # in this order: single precision cannot separate late times
+        # One product of (3C, 3) and (3, 3C) a step, not C^2 small ones, which take ten times as long.
+        after, first = R_lab_body.flatten(-3, -2), taken(R_lab_body, before, 3).flatten(-3, -2)
+        every = (after @ first.mT).reshape(*mask.shape[:-1], width, 3, width, 3)  # (..., to, 3, from, 3)
+        turn = every.permute(*range(mask.ndim - 1), -2, -4, -3, -1)
+        return cls(turn=turn, dt_s=torch.where(dt > 0, dt, 1.0).to(R_lab_body), before=before)
 
 
 def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
@@ -288,13 +277,10 @@ def soft_track(
     R = torch.where(mask[..., None, None], R_lab_body, unit)  # 0 times NaN would reach the gradients
     X = torch.where(mask[..., None], position_lab_mm, 0.0)
     soft = soft_path(turning_costs(R, mask, turn_rad), mask, temperature, torch.where(mask, misfit, 0.0))
-    position = torch.where(mask.any(-1)[..., None], (soft.marginals[..., None] * X).sum(-2), torch.nan)
-    return SoftTrack(
-        R_lab_body=expected_orientation(R, soft.marginals),
-        position_lab_mm=position,
-        marginals=soft.marginals,
-        free_energy=soft.free_energy,
-    )
+    share = soft.marginals
+    position = torch.where(mask.any(-1)[..., None], (share[..., None] * X).sum(-2), torch.nan)
+    mean = expected_orientation(R, share)
+    return SoftTrack(R_lab_body=mean, position_lab_mm=position, marginals=share, free_energy=soft.free_energy)
 
 
 def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:

@@ -33,10 +33,8 @@ class Track:
 
     def with_part(self, frames: Tensor, other: "Track") -> "Track":
         """Return the track with some frames from another one."""
-        return Track(
-            R_lab_body=self.R_lab_body.index_copy(0, frames, other.R_lab_body),
-            score=self.score.index_copy(0, frames, other.score),
-        )
+        R = self.R_lab_body.index_copy(0, frames, other.R_lab_body)
+        return Track(R_lab_body=R, score=self.score.index_copy(0, frames, other.score))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sphereorient.assemble.beam import BeamSearch, Histories
 from sphereorient.assemble.second_order_cost import SecondOrderCost
-from sphereorient.assemble.segments import number_segments
+from sphereorient.assemble.segments import flags_where, number_segments
 from sphereorient.assemble.settings import PathSettings
 from sphereorient.assemble.states import CandidateRows, Floats, Ints, rotated, rotation_between
 from sphereorient.trajectory import Flag
@@ -85,19 +85,14 @@ def physical_path(
         time_s=time[frames].numpy(),
         frame_s=float(time.diff().median()) if len(time) > 1 else 1.0,
     )
-    chosen = _chosen(mask, frames, rows, *_search(rows, cost, settings), settings)
+    chosen = _chosen(mask, frames, rows, _search(rows, cost, settings), settings)
     return Chosen(**{name: part.to(device) for name, part in vars(chosen).items()})
 
 
 def _chosen(
-    mask: Tensor,
-    frames: Tensor,
-    rows: CandidateRows,
-    histories: Histories,
-    cost: SecondOrderCost,
-    settings: PathSettings,
+    mask: Tensor, frames: Tensor, rows: CandidateRows, found: tuple[Histories, SecondOrderCost], settings: PathSettings
 ) -> Chosen:
-    empty = Chosen.nothing(mask)
+    (histories, cost), empty = found, Chosen.nothing(mask)
     place = torch.arange(mask.shape[1]).expand_as(mask)[mask]
     row = torch.from_numpy(histories.row)
     seen, choice = frames[row >= 0], place[row[row >= 0]]
@@ -112,18 +107,14 @@ def _chosen(
     present = torch.isfinite(probability)
     recovered = torch.zeros_like(begins)
     recovered[seen[1:]] = (begins | spike)[seen[1:]] | (seen.diff() > 1)
-    bits = {
-        Flag.AMBIGUOUS: present & (probability < settings.probability_min),
-        Flag.RECOVERED: recovered,
-        Flag.SPIKE: spike,
-    }
+    ambiguous = present & (probability < settings.probability_min)
     return Chosen(
         choice=empty.choice.index_put((seen,), choice),
         probability=probability,
         posterior=posterior,
         turn_rad=empty.turn_rad.index_put((frames,), torch.from_numpy(histories.turn_rad)),
         segment=number_segments(present, begins | spike, len(mask)),
-        flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
+        flags=flags_where({Flag.AMBIGUOUS: ambiguous, Flag.RECOVERED: recovered, Flag.SPIKE: spike}),
         acceleration_rad_s2=torch.tensor(float(cost.acceleration_rad_s2), dtype=torch.float64),
     )
 

@@ -115,6 +115,5 @@ def _log(number: float | Tensor, like: Floats | Tensor) -> Any:
 
 
 def _log_peak(tail: float | Tensor) -> Any:
-    if isinstance(tail, Tensor):
-        return torch.lgamma((tail + 3) / 2) - torch.lgamma(tail / 2) - 1.5 * (tail * math.pi).log()
-    return math.lgamma((tail + 3) / 2) - math.lgamma(tail / 2) - 1.5 * math.log(tail * math.pi)
+    lib: Any = torch if isinstance(tail, Tensor) else math
+    return lib.lgamma((tail + 3) / 2) - lib.lgamma(tail / 2) - 1.5 * lib.log(tail * math.pi)

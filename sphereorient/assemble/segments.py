@@ -1,12 +1,14 @@
 """xi, its spikes, and the segments between them."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble.settings import AssembleSettings
+from sphereorient.trajectory import Flag
 
 DEVIATIONS_PER_MAD = 1.4826  # of a normal distribution
 
@@ -44,6 +46,11 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     deviation = DEVIATIONS_PER_MAD * (windows - usual).abs().nanmedian(-1).values
     outstanding = xi > usual[:, 0] + settings.spike_factor * deviation
     return outstanding & (turn > math.radians(settings.spike_min_deg))
+
+
+def flags_where(bits: Mapping[Flag, Tensor]) -> Tensor:
+    """Return the flags (N,) int64 of frames by where each holds, (N,) bool."""
+    return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 
 
 def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tensor:

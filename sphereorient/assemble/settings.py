@@ -13,24 +13,16 @@ class AssembleSettings(BaseModel, frozen=True, extra="forbid"):
         6.0, gt=1, description="a spike is this many robust deviations (1.48 MAD) above the moving median of xi"
     )
     spike_min_deg: float = Field(
-        15.0,
-        gt=0,
-        description="a smaller rotation between frames is never a spike, even of a sphere at rest; 5 fine steps",
+        15.0, gt=0, description="a smaller rotation between frames is never a spike, not even of a sphere at rest"
     )
     repair_deg: float = Field(
-        30.0,
-        gt=0,
-        le=180,
-        description="cameras that differ by more than this are repaired, one from the other; the paper's 30",
+        30.0, gt=0, le=180, description="cameras that differ by more are repaired from each other; the paper's 30"
     )
     repair_margin: float = Field(
         0.02, ge=0, description="difference of mean T that decides a repair; below it, continuity decides"
     )
     weight_window_frames: int = Field(
-        51,
-        ge=5,
-        description="frames of the moving variance of xi that weighs the cameras; 50 degrees of freedom know the ratio"
-        " of two variances to 28 %, which costs 2 % of the mean's variance",
+        51, ge=5, description="frames of the moving variance of xi that weighs the cameras; 50 know its ratio to 28 %"
     )
 
 
@@ -41,27 +33,19 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
         None, gt=0, description="scale of the angular acceleration per axis, rad/s^2; null estimates it from the movie"
     )
     tail: float = Field(
-        4.0,
-        gt=2,
-        description="degrees of freedom of the Student-t of omega's change; smaller makes sudden changes less unlikely",
+        4.0, gt=2, description="degrees of freedom of the Student-t of omega's change; fewer: sudden changes likelier"
     )
     miss_probability: float = Field(
         0.01, gt=0, lt=1, description="probability that no candidate of a frame is right after a frame in which one was"
     )
     miss_again_probability: float = Field(
-        0.5,
-        gt=0,
-        lt=1,
-        description="probability that no candidate is right after a frame in which none was; misses come in bursts",
+        0.5, gt=0, lt=1, description="probability that no candidate is right after a frame in which none was"
     )
     break_probability: float = Field(
         1.0e-5, gt=0, lt=1, description="probability that the motion breaks off between two frames with an orientation"
     )
     stuck_probability: float = Field(
-        0.3,
-        gt=0,
-        lt=0.5,
-        description="probability that a false candidate stands where one stood in a frame before (glare, dirt)",
+        0.3, gt=0, lt=0.5, description="probability that a false candidate stands where one stood before (glare, dirt)"
     )
     follow_probability: float = Field(
         2.0e-3,
@@ -79,9 +63,7 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
         1.0, gt=0, description="factor on the sigmas that the orientations claim; above 1 where they claim too little"
     )
     gap_frames_max: int = Field(
-        16,
-        ge=0,
-        description="longest gap inside a segment, in usual frame intervals; a longer one begins a new segment",
+        16, ge=0, description="longest gap inside a segment, usual frame intervals; a longer one begins another"
     )
     probability_min: float = Field(
         0.9, ge=0, le=1, description="a chosen orientation that is less probable is flagged as ambiguous"
@@ -90,7 +72,5 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
         8.0, gt=1, description="a rotation this many standard deviations off the prediction of the motion is a spike"
     )
     spike_min_deg: float = Field(
-        10.0,
-        gt=0,
-        description="a rotation less than this off the prediction is never a spike, however smooth the motion",
+        10.0, gt=0, description="a rotation less than this off the prediction of the motion is never a spike"
     )

@@ -33,14 +33,9 @@ class CandidateRows:
     def part(self, first: int, last: int) -> "CandidateRows":
         """Return the frames first .. last - 1."""
         rows = slice(self.offset[first], self.offset[last])
-        return replace(
-            self,
-            R_lab_body=self.R_lab_body[rows],
-            variance=self.variance[rows],
-            log_weight=self.log_weight[rows],
-            offset=self.offset[first : last + 1] - self.offset[first],
-            time_s=self.time_s[first:last],
-        )
+        parts = {name: getattr(self, name)[rows] for name in ("R_lab_body", "variance", "log_weight")}
+        offset = self.offset[first : last + 1] - self.offset[first]
+        return replace(self, **parts, offset=offset, time_s=self.time_s[first:last])
 
     def zones(self, dt_s: Floats) -> Ints:
         """Return the number of possible rotations over a time: below half a turn in each frame interval."""
@@ -92,13 +87,9 @@ def concatenated(ways: list[BeamStep], *, shared_targets: bool = False) -> BeamS
     """Put several ways side by side; renumber their targets unless they are shared keys."""
     sizes = np.cumsum([0, *(0 if shared_targets else len(way.states.row) for way in ways)])
     parts = {e.name: np.concatenate([getattr(way.states, e.name) for way in ways]) for e in fields(PathStates)}
-    return BeamStep(
-        frame=ways[0].frame,
-        states=PathStates(**parts),
-        source=np.concatenate([way.source for way in ways]),
-        target=np.concatenate([way.target + size for way, size in zip(ways, sizes[:-1], strict=True)]),
-        cost=np.concatenate([way.cost for way in ways]),
-    )
+    source, cost = (np.concatenate([getattr(way, name) for way in ways]) for name in ("source", "cost"))
+    target = np.concatenate([way.target + size for way, size in zip(ways, sizes[:-1], strict=True)])
+    return BeamStep(frame=ways[0].frame, states=PathStates(**parts), source=source, target=target, cost=cost)
 
 
 def soft_min(values: Floats, group: Ints, size: int) -> Floats:
@@ -113,9 +104,7 @@ def soft_min(values: Floats, group: Ints, size: int) -> Floats:
 def rotation_between(R_from: Floats, R_to: Floats) -> tuple[Floats, Floats]:
     """Return angle (...), rad, 0 .. pi, and lab axis (..., 3), 0 without rotation, from R_from to R_to (..., 3, 3)."""
     turn = R_to @ np.swapaxes(R_from, -1, -2)
-    twice = np.stack(
-        [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1
-    )
+    twice = np.stack([turn[..., j, i] - turn[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1))], -1)
     sine = np.sqrt((twice**2).sum(-1)) / 2
     cosine = (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1) / 2
     return np.arctan2(sine, cosine), twice / np.maximum(2 * sine, SMALL)[..., None]

@@ -240,8 +240,6 @@ def turns_over_gaps(R_lab_body: Tensor, mask: Tensor) -> Tensor:
     last, width = visited_before(mask)[..., 1:], mask.shape[-1]
     before, after = (R.flatten(0, -4) for R in (taken(R_lab_body, last, 3), R_lab_body[..., 1:, :, :, :]))
     chunk = max(1, PAIRS_AT_ONCE // max(width, 1) ** 2)
-    parts = [
-        so3.geodesic_distance(a[:, :, None], b[:, None])
-        for a, b in zip(torch.split(before, chunk), torch.split(after, chunk), strict=True)
-    ]
-    return torch.cat(parts).reshape(*last.shape, width, width)
+    pieces = zip(torch.split(before, chunk), torch.split(after, chunk), strict=True)
+    turns = torch.cat([so3.geodesic_distance(a[:, :, None], b[:, None]) for a, b in pieces])
+    return turns.reshape(*last.shape, width, width)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble.path import Graph, Path, Track, graph_of
-from sphereorient.assemble.segments import find_spikes, links, moving, number_segments
+from sphereorient.assemble.segments import find_spikes, flags_where, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.search import Candidates
@@ -62,22 +62,19 @@ def fuse(
     variance = relative_variance([xi for xi, _ in linked], settings)
     spikes = [moving(find_spikes(xi, turn, settings).to(xi), settings.weight_window_frames) for xi, turn in linked]
     calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # no spike raises the variance
-    share = _shares(variance, present)
+    weight = torch.where(present, 1 / variance, 0.0)
+    total = weight.sum(0)
+    share = weight / torch.where(total > 0, total, 1.0)
     R = _mean(tracks, share)
-    xi, turn = links(R, time_s)
-    spike = find_spikes(xi, turn, settings)
+    spike = find_spikes(*links(R, time_s), settings)
     alone = present.sum(0) == 1 if len(tracks) > 1 else torch.ones_like(present[0])
-    bits = {
-        Flag.ONE_CAMERA: alone,
-        Flag.REPAIRED_FROM_OTHER_CAMERA: repaired.any(0),
-        Flag.AMBIGUOUS: ambiguous,
-        Flag.SPIKE: spike,
-    }
+    bits = {Flag.ONE_CAMERA: alone, Flag.REPAIRED_FROM_OTHER_CAMERA: repaired.any(0)}
+    bits |= {Flag.AMBIGUOUS: ambiguous, Flag.SPIKE: spike}
     return Fused(
         R_lab_body=R,
         sigma_rad=_sigma(variance, share, tracks, calm),
         segment=number_segments(present.any(0), spike, settings.gap_frames_max),
-        flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
+        flags=flags_where(bits),
         weight=dict(zip(names, share, strict=True)),
         repaired=dict(zip(names, repaired, strict=True)),
         R_lab_body_of={name: track.R_lab_body for name, track in zip(names, tracks, strict=True)},
@@ -101,22 +98,14 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     return torch.where(variance.isnan(), typical, within)
 
 
-def _shares(variance: Tensor, present: Tensor) -> Tensor:
-    """Return the weights (K, N), inverse variances of the cameras with an orientation, of sum 1; 0 without any."""
-    weight = torch.where(present, 1 / variance, 0.0)
-    total = weight.sum(0)
-    return weight / torch.where(total > 0, total, 1.0)
-
-
 def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
     """Return the weighted mean (N, 3, 3) of the cameras; with one camera exactly its orientation; NaN without any."""
     present = torch.stack([track.present for track in tracks])[..., None, None]
     R = torch.stack([track.R_lab_body for track in tracks])
     view = torch.eye(3, dtype=R.dtype, device=R.device)
     several = present.sum(0) > 1
-    mean = so3.weighted_mean(
-        torch.where(several, R, view).movedim(0, -3), torch.where(several[..., 0, 0], share, 1.0).movedim(0, -1)
-    )
+    share = torch.where(several[..., 0, 0], share, 1.0)
+    mean = so3.weighted_mean(torch.where(several, R, view).movedim(0, -3), share.movedim(0, -1))
     alone = torch.where(present, R, 0.0).sum(0)
     return torch.where(several, mean, torch.where(present.any(0), alone, torch.nan))
 
@@ -196,11 +185,11 @@ def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: Assembl
 
 def _only(path: Path, track: Track, where: Tensor) -> Path:
     """Return a path with the orientations of a track in some frames, where (N,) bool, and none elsewhere."""
-    return replace(
-        path,
-        R_lab_body=torch.where(where[:, None, None], track.R_lab_body, torch.nan),
-        score=torch.where(where, track.score, torch.nan),
+    R, score = (
+        torch.where(where[:, None, None], track.R_lab_body, torch.nan),
+        torch.where(where, track.score, torch.nan),
     )
+    return replace(path, R_lab_body=R, score=score)
 
 
 def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
@@ -218,17 +207,14 @@ def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: Asse
     decided: list[Track] = list(paths)  # the loser of a stretch has the leader's orientations
     repaired, ambiguous = torch.zeros_like(torch.stack([agreed, agreed])), torch.zeros_like(agreed)
     for frames in _stretches(apart, segment, limit):
-        followers = [_follow(paths[leader], graphs[1 - leader], frames, limit) for leader in (0, 1)]
-        scores = [paths[leader].score[frames] + followers[leader].score.nan_to_num(0.0) for leader in (0, 1)]
-        merits = [float(score.mean() / 2) for score in scores]
+        followers = [_follow(paths[k], graphs[1 - k], frames, limit) for k in (0, 1)]
+        merits = [float((paths[k].score[frames] + followers[k].score.nan_to_num(0.0)).mean() / 2) for k in (0, 1)]
         matched = any(bool(follower.present.any()) for follower in followers)
         guess = not matched or abs(merits[0] - merits[1]) < settings.repair_margin
+        leader = int(merits[1] > merits[0])
         if guess:
-            frames_beside = _beside(frames, torch.nonzero(agreed)[:, 0], settings.gap_frames_max)
-            rough = [_roughest_turn(track, frames_beside) for track in decided]
-            leader = int(rough[1] < rough[0])
-        else:
-            leader = int(merits[1] > merits[0])
+            beside = _beside(frames, torch.nonzero(agreed)[:, 0], settings.gap_frames_max)
+            leader = int(_roughest_turn(decided[1], beside) < _roughest_turn(decided[0], beside))
         loser = 1 - leader
         agreed[frames], ambiguous[frames] = True, guess
         decided[loser] = decided[loser].with_part(frames, paths[leader].part(frames))

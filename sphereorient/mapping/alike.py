@@ -34,30 +34,21 @@ def shared_maps(learnt: Mapping[str, LearntMap]) -> dict[str, SharedMap]:
                 continue
             R = compared.R_other_reference
             joined = _joined(found[first].learnt, one, R)
-            found[name] = SharedMap(
-                learnt=replace(one, R_lab_body=one.R_lab_body @ R), first=first, correlation=compared.correlation
-            )
+            own = replace(one, R_lab_body=one.R_lab_body @ R)
+            found[name] = SharedMap(learnt=own, first=first, correlation=compared.correlation)
             for same in [other for other in found if found[other].first == first]:
-                found[same] = replace(found[same], learnt=_with_map_of(found[same].learnt, joined))
+                own = found[same].learnt
+                own = replace(own, texture=joined.texture, seen=joined.seen, sigma=joined.sigma)
+                found[same] = replace(found[same], learnt=own)
             break
     return found
 
 
-def _with_map_of(own: LearntMap, other: LearntMap) -> LearntMap:
-    return replace(own, texture=other.texture, seen=other.seen, sigma=other.sigma)
-
-
 def _joined(first: LearntMap, other: LearntMap, R_other_first: Tensor) -> LearntMap:
     """Return the first map with what the other one shows: means by weight, 1 / sigma^2."""
-    height = len(first.texture)
-    grey, sigma, seen = (
-        turned_map(part, R_other_first, height)
-        for part in (
-            other.texture.double(),
-            torch.where(torch.isfinite(other.sigma), other.sigma.double(), torch.nan),
-            other.seen.double(),
-        )
-    )
+    known = torch.where(torch.isfinite(other.sigma), other.sigma.double(), torch.nan)
+    parts = (other.texture.double(), known, other.seen.double())
+    grey, sigma, seen = (turned_map(part, R_other_first, len(first.texture)) for part in parts)
     gain, offset = fit_levels(grey, first.texture.double())
     own, added = first.sigma.double().square().reciprocal(), (gain * sigma).square().reciprocal().nan_to_num()
     sums = own * first.texture.nan_to_num() + added * (gain * grey + offset).nan_to_num()
@@ -71,7 +62,6 @@ def _joined(first: LearntMap, other: LearntMap, R_other_first: Tensor) -> Learnt
 
 def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison, float]:
     """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch.
-
     Return also the displacement against the old map, and the share of the sphere with the old map's texture.
     """
     comparison = compare_maps(learnt.texture, old)

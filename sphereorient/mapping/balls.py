@@ -52,18 +52,17 @@ def take_crops_of_all(
     """
     names, streams = recording.experiment.names, recording.streams
     scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]
-    instants = []
+    sizes_px = [[scene[name].diameter_px for name in names] for scene in scenes]
+    radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}
     movies = [
         screened_frames(stream, scene[names[0]].background) for stream, scene in zip(streams, scenes, strict=True)
     ]
-    radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}
+    instants = []
     for k, shots in enumerate(zip(*movies, strict=True)):
-        disks = [
-            find_disks(shot.picture, shot.background, [scene[name].diameter_px for name in names], locating)
-            if shot.usable and shot.background is not None
-            else []
-            for shot, scene in zip(shots, scenes, strict=True)
-        ]
+        disks: list[list[Outline]] = []
+        for shot, size_px in zip(shots, sizes_px, strict=True):
+            usable = shot.usable and shot.background is not None
+            disks.append(find_disks(shot.picture, shot.background, size_px, locating) if usable else [])
         crops = [
             [cut_crop(shot.picture, one.u_px, one.v_px, one.radius_px) for one in seen]
             for shot, seen in zip(shots, disks, strict=True)
@@ -72,20 +71,12 @@ def take_crops_of_all(
         progress("balls", k + 1, 0)
     chosen = _linked(instants, scenes, radius_mm)
     places = [_places(chosen[:, n], instants) for n in range(len(names))]
-    return {
-        name: _crops_of(
-            name,
-            chosen[:, n],
-            instants,
-            [
-                CameraView.of(stream.name, stream.camera, scene[name])
-                for stream, scene in zip(streams, scenes, strict=True)
-            ],
-            radius_mm,
-            [places[n], *(place for m, place in enumerate(places) if m != n)],
-        )
-        for n, name in enumerate(names)
-    }
+    found = {}
+    for n, name in enumerate(names):
+        views = [CameraView.of(one.name, one.camera, scene[name]) for one, scene in zip(streams, scenes, strict=True)]
+        own_first = [places[n], *(place for m, place in enumerate(places) if m != n)]
+        found[name] = _crops_of(name, chosen[:, n], instants, views, radius_mm, own_first)
+    return found
 
 
 def _instant(
@@ -101,9 +92,7 @@ def _instant(
 
 
 def _linked(
-    instants: Sequence[_Instant],
-    scenes: Sequence[Mapping[str, CameraScene]],
-    radius_mm: Mapping[str, float],
+    instants: Sequence[_Instant], scenes: Sequence[Mapping[str, CameraScene]], radius_mm: Mapping[str, float]
 ) -> NDArray[np.int64]:
     """Return the match of each sphere in each frame, (N, K), by index; -1: none."""
     names = list(radius_mm)

@@ -100,11 +100,10 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
     first, second = _candidates(disks, R_lab_body, settings)
     about = R_lab_body[second] @ R_lab_body[first].mT
     reach = math.radians(settings.loop_reach_deg)
-    if reach >= math.pi:
-        grid = so3.lattman_grid(math.radians(SEARCH_STEP_DEG + 4))
-    else:
-        grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), reach)
     if len(first):
+        step = math.radians(SEARCH_STEP_DEG)
+        rough = math.radians(SEARCH_STEP_DEG + 4)
+        grid = so3.local_grid(step, reach) if reach < math.pi else so3.lattman_grid(rough)
         about = search_pairs(reduced(disks, SMALLER), first, second, about, grid, SEARCH_EVERY)
     found = refine_pairs(disks, first, second, about, ITERATIONS, EVERY)
     good = found.where((found.score > settings.score_min) & (found.overlap > OVERLAP_MIN))
@@ -119,12 +118,10 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
 
 
 def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:
-    keys = [0]
-    for k in range(1, len(R_lab_body)):
-        if float(so3.geodesic_distance(R_lab_body[keys[-1]], R_lab_body[k])) >= step_rad:
+    keys, last = [0], len(R_lab_body) - 1
+    for k in range(1, last + 1):
+        if k == last or float(so3.geodesic_distance(R_lab_body[keys[-1]], R_lab_body[k])) >= step_rad:
             keys.append(k)
-    if keys[-1] != len(R_lab_body) - 1:
-        keys.append(len(R_lab_body) - 1)
     return torch.tensor(keys)
 
 
@@ -153,10 +150,8 @@ def _check_one_ball(disks: Disks, R_lab_body: Tensor) -> None:
         return
     first, second = keys[:-1], keys[1:]
     start = R_lab_body[second] @ R_lab_body[first].mT
-    one, other = (
-        refine_pairs(disks.where(slice(None), slice(k, k + 1)), first, second, start, ITERATIONS, EVERY).R_ji
-        for k in (0, 1)
-    )
+    alone = (disks.where(slice(None), slice(k, k + 1)) for k in (0, 1))
+    one, other = (refine_pairs(own, first, second, start, ITERATIONS, EVERY).R_ji for own in alone)
     apart, turn = float(so3.geodesic_distance(one, other).median()), float(so3.log(one).norm(dim=-1).median())
     if apart > max(APART_RAD, APART_SHARE * turn):
         got = f"rotations that differ by {math.degrees(apart):.2g} of {math.degrees(turn):.2g} degrees"

@@ -69,7 +69,6 @@ class MapComparison:
 
 def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapComparison:
     """Measure the displacement of a map (H, 2 H), 0 black .. 1 white, against a reference (h, 2 h); NaN: unknown.
-
     `turned`: find the rotation between the body frames. Raise PaintError for different spheres, ShapeError if not 2:1.
     """
     maps = [_known(texture) for texture in (other, reference)]
@@ -113,8 +112,7 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
     """Return gain and offset, robust, that fit a map's grey levels to a reference's of the same size and frame."""
     known = torch.isfinite(texture) & torch.isfinite(reference)
     x, y = texture[known].double(), reference[known].double()
-    columns = torch.stack([x, torch.ones_like(x)], dim=1)
-    weight = torch.ones_like(x)
+    columns, weight = torch.stack([x, torch.ones_like(x)], dim=1), torch.ones_like(x)
     for _ in range(5):
         gain, offset = _weighted_fit(columns, weight, y).tolist()
         left = (y - gain * x - offset).abs()
@@ -126,13 +124,11 @@ def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
     """Return the coefficients (K,) of columns (n, K) that fit values (n,) at weights (n,) best."""
     weighted = columns * weight[:, None]
     ridge = 1e-9 * torch.eye(columns.shape[1], dtype=columns.dtype)
-    fitted: Tensor = torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values)
-    return fitted
+    return torch.as_tensor(torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values))
 
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
     """Return the change of grey (H, 2 H), -1 darker .. 1, of a map from an old one in the same frame; NaN: unknown.
-
     0: a displacement up to `RADIUS_DEG` explains it. The old grey levels are fitted to the new ones first.
     """
     gain, offset = fit_levels(old, new)
@@ -180,8 +176,7 @@ def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
 def _coarser(share: Tensor) -> Tensor:
     """Return the known shares (h, 2 h) of a mask (H, 2 H) in as few texels as its tables have: quick to look up."""
     rows = min(len(share), SIDE)
-    coarse: Tensor = F.adaptive_avg_pool2d(share[None, None], (rows, 2 * rows))[0, 0]
-    return coarse
+    return F.adaptive_avg_pool2d(share[None, None], (rows, 2 * rows))[0, 0]
 
 
 def _best_rotation(tables: dict[float, list[TextureTable]], shares: list[Tensor], place: Tensor) -> Tensor:
@@ -224,10 +219,15 @@ def _correlations(tables: list[TextureTable], shares: list[Tensor], place: Tenso
     a, _ = tables[0].sample(there.float())
     b, _ = tables[1].sample(place.T[None].float())
     weight = sample_texture(shares[1], place.float())[None] * sample_texture(shares[0], there.mT.float())
+    return weighted_correlation(a, b, weight).nan_to_num(0.0), weight.sum(1).clamp_min(1e-9) / len(place)
+
+
+def weighted_correlation(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
+    """Return the correlations (M,) of values (M, P) with others, by weights (M, P); NaN without contrast."""
     total = weight.sum(1).clamp_min(1e-9)
-    a, b = a - ((weight * a).sum(1) / total)[:, None], b - ((weight * b).sum(1) / total)[:, None]
+    a, b = (x - ((weight * x).sum(1) / total)[:, None] for x in (a, b))
     power = (weight * a * a).sum(1) * (weight * b * b).sum(1)
-    return (weight * a * b).sum(1) / power.clamp_min(1e-18).sqrt(), total / len(place)
+    return torch.where(power > 0, (weight * a * b).sum(1) / power.sqrt(), torch.nan)
 
 
 def _refined(tables: list[TextureTable], shares: list[Tensor], place: Tensor, R: Tensor) -> Tensor:
@@ -281,9 +281,7 @@ def compass(direction: Tensor) -> tuple[Tensor, Tensor]:
 
 def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: Patches) -> tuple[Tensor, Tensor]:
     """Return shifts (D, 2) float64, rad east and north, of the reference's patches in another map, and (D,) found.
-
     `rough` and `fine`: blurred tables of the other map and of the reference, for search and refinement.
-
     Source: normalised correlation, then direct alignment with gain and offset, Lucas and Kanade 1981.
     """
     shift = start = _searched(rough, patches)
@@ -325,10 +323,8 @@ def _searched(tables: list[TextureTable], patches: Patches) -> Tensor:
     steps = round(PATCH_REACH_DEG / ROUGH_DEG)
     at = torch.arange(-steps, steps + 1, dtype=torch.float64) * math.radians(ROUGH_DEG)
     tried = torch.stack(torch.meshgrid(at, at, indexing="ij"), dim=-1).reshape(-1, 2)
-    scores = [
-        _correlation(_sampled(tables[0], patches, offset, shift.expand(count, 2))[0], reference) for shift in tried
-    ]
-    return tried[torch.stack(scores).argmax(0)]
+    greys = (_sampled(tables[0], patches, offset, shift.expand(count, 2))[0] for shift in tried)
+    return tried[torch.stack([_correlation(grey, reference) for grey in greys]).argmax(0)]
 
 
 def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,22 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from sphereorient import locate
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
-from sphereorient.locate import (
-    CameraScene,
-    Found,
-    LocateSettings,
-    check_seen,
-    fill_gaps,
-    find_ball,
-    find_positions,
-    find_scene,
-    screened_frames,
-    sightings_of,
-)
+from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.settings import MapSettings
@@ -48,6 +38,7 @@ OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its med
 # found badly, both scatter alike.
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
 PLACES = 2  # per radius: places that far apart have paint of their own
+BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen")  # of `Disks`
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 
@@ -110,10 +101,10 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         if experiment.fixed:  # what changes in the pictures is the ball
             outline, scene = _fixed_scene(recording, stream, settings, locating)
         else:
-            scene = find_scene(recording, stream, settings.background_frames, locating)
+            scene = locate.find_scene(recording, stream, settings.background_frames, locating)
         found: list[Found] = []
         row: list[Crop | None] = []
-        for k, shot in enumerate(screened_frames(stream, scene.background)):
+        for k, shot in enumerate(locate.screened_frames(stream, scene.background)):
             one: Found = (outline if shot.usable else None, shot.reason)
             if shot.usable and outline is None:
                 one = find_ball(shot.picture, scene.background, scene.diameter_px, locating)
@@ -124,27 +115,21 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         views.append(CameraView.of(stream.name, stream.camera, scene))
         rows.append(row)
         seen = sightings_of(found)
-        sightings[stream.name] = seen if experiment.fixed else fill_gaps(seen, locating)
-    check_seen(sightings)
+        sightings[stream.name] = seen if experiment.fixed else locate.fill_gaps(seen, locating)
+    locate.check_seen(sightings)
     positions = find_positions(sightings, {view.name: view.camera for view in views}, experiment.diameter_mm)
     X = positions.position_lab_mm
     if experiment.fixed:
         X = X.nanmedian(0).values.expand(len(X), 3).clone()
     elif len(views) > 1:
         gap = positions.gap_mm[torch.isfinite(positions.gap_mm)]
-        if len(gap) and float(gap.median()) > GAP_SHARE * recording.experiment.radius_mm:
+        if len(gap) and float(gap.median()) > GAP_SHARE * experiment.radius_mm:
             got = f"lines of sight with a median distance of {float(gap.median()):.3g} mm"
             do = "check the cameras, or use one of them"
             raise PaintError(refusal("movies", expected="one ball in both movies", got=got, do=do))
-    there = torch.tensor([[crop is not None for crop in row] for row in rows]).T
-    return Crops(
-        views=views,
-        crops=rows,
-        position_lab_mm=X,
-        seen=there & torch.isfinite(X).all(1)[:, None],
-        radius_mm=recording.experiment.radius_mm,
-        fixed=experiment.fixed,
-    )
+    seen_by = torch.tensor([[crop is not None for crop in row] for row in rows]).T & torch.isfinite(X).all(1)[:, None]
+    radius_mm, fixed = experiment.radius_mm, experiment.fixed
+    return Crops(views=views, crops=rows, position_lab_mm=X, seen=seen_by, radius_mm=radius_mm, fixed=fixed)
 
 
 def _fixed_scene(
@@ -169,15 +154,10 @@ def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSet
         outline, scene = _fixed_scene(recording, stream, settings, locating)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = sightings_of([(outline, Reason.OK)])
-    cameras = {view.name: view.camera for view in views}
-    return Crops(
-        views=views,
-        crops=[[] for _ in views],
-        position_lab_mm=find_positions(sightings, cameras, recording.experiment.diameter_mm).position_lab_mm,
-        seen=torch.zeros(0, len(views), dtype=torch.bool),
-        radius_mm=recording.experiment.radius_mm,
-        fixed=True,
-    )
+    cameras, none = {view.name: view.camera for view in views}, torch.zeros(0, len(views), dtype=torch.bool)
+    X = find_positions(sightings, cameras, recording.experiment.diameter_mm).position_lab_mm
+    radius_mm = recording.experiment.radius_mm
+    return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=none, radius_mm=radius_mm, fixed=True)
 
 
 def _check_still(outlines: list[tuple[float, float, float]], name: str) -> None:
@@ -247,8 +227,7 @@ class Disks:
     def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> "Disks":
         """Select instants and cameras."""
         shown = None if self.shown is None else self.shown[rows, cameras]
-        names = ("layers", "R_lab_view", "distance_radii", "seen")
-        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in names})
+        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in BY_INSTANT})
 
     def weight(self, rows: Tensor | slice, camera: int) -> Tensor:
         """Return pixel weights (R, S * S) of some disks: 0 where not seen or hidden."""
@@ -259,7 +238,6 @@ class Disks:
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return each n-th (`every`) pixel of disks (R,): view directions (3, P), grey (R, P), weight (R, P).
-
         Weights are multiplied by the slant's cosine to the power `slant_power`.
         """
         far, size = self.distance_radii[:, camera].median(), self.size_px
@@ -287,9 +265,9 @@ class Disks:
     @classmethod
     def joined(cls, parts: Sequence["Disks"]) -> "Disks":
         """Join instants of the same cameras."""
-        first, names = parts[0], ("layers", "R_lab_view", "distance_radii", "seen")
-        shown = None if first.shown is None else torch.cat([one.shown for one in parts if one.shown is not None])
-        return cls(share=first.share, shown=shown, **{k: torch.cat([getattr(one, k) for one in parts]) for k in names})
+        shown = [one.shown for one in parts if one.shown is not None]
+        joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in BY_INSTANT}
+        return cls(share=parts[0].share, shown=torch.cat(shown) if shown else None, **joined)
 
 
 def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
@@ -329,7 +307,6 @@ def normalised_disks(
     shown: Tensor | None = None,
 ) -> Disks:
     """Return disks of pictures (N, C, S, S), any finite grey: difference from the local mean over the local deviation.
-
     R_lab_view (N, C, 3, 3), distance_radii (N, C) above 1, seen (N, C) bool, shown (N, C, S, S) 0 hidden .. 1, None: 1.
     """
     size = pictures.shape[-1]
@@ -367,7 +344,6 @@ def _with_slopes(grey: Tensor) -> Tensor:
 
 def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
     """Take off what stays with the camera (shading, sensor pattern), at rough orientations (N, 3, 3).
-
     It is each pixel's mean over the places of the ball that it has shown, as far as paint cannot explain it: the mean
     of n places keeps 1/n of the paint's power. Where paint explains all, the disks come back as they are.
     """
@@ -404,7 +380,6 @@ def reduced(disks: Disks, factor: int) -> Disks:
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return places (..., 2, P), radii, of directions (..., 3, P), view, on a disk seen from a distance (...), radii.
-
     Return also their derivative by x and y (..., 1, P) and the slant's cosine (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
 from sphereorient.mapping.grid import (
     ROUGH_SIDE,
     NormalMatrix,
+    SplineTable,
     coefficients_blur_rad,
     map_sums,
     map_table,
@@ -119,11 +121,12 @@ class State:
 
     def linearised(self) -> Iterator[Linearisation]:
         """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
-        return side_by_side(lambda batch: self.linearised_at(batch[0], batch[1], self.blur_px), self.batches())
+        return side_by_side(lambda batch: self.linearised_at(*batch, self.blur_px), self.batches())
 
     def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
         """Linearise the disks of some instants for the blur `blur_px`."""
-        at = linearise(self.fitter, self.texture, pixels, self.position_lab_mm[rows], self.R_lab_body[rows], blur_px)
+        X, R = self.position_lab_mm[rows], self.R_lab_body[rows]
+        at = linearise(self.fitter, SplineTable(self.texture, 0.0), pixels, X, R, blur_px)
         return replace(at, weight=at.weight * self.use[rows].reshape(-1, 1))
 
 
@@ -155,17 +158,10 @@ def first_state(
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
     table = optics_of(texture, crops.views, blur_px, ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
     fitter = first_fitter(crops.views, crops.radius_mm, table, blur_px)
-    return State(
-        frames=frames,
-        pixels=pixels_of(crops, fitter, frames, settings.pixels, extra_px),
-        use=crops.seen[frames],
-        position_lab_mm=crops.position_lab_mm[frames],
-        R_lab_body=R_lab_body,
-        texture=texture,
-        blur_px=blur_px,
-        fitter=fitter,
-        fixed=crops.fixed,
-    )
+    pixels, use = pixels_of(crops, fitter, frames, settings.pixels, extra_px), crops.seen[frames]
+    X = crops.position_lab_mm[frames]
+    paint: dict[str, Any] = {"texture": texture, "blur_px": blur_px, "fitter": fitter, "fixed": crops.fixed}
+    return State(frames=frames, pixels=pixels, use=use, position_lab_mm=X, R_lab_body=R_lab_body, **paint)
 
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
@@ -175,8 +171,7 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
         try:
             next(steps)
         except StopIteration as end:
-            state, iteration = end.value
-            return state, iteration
+            return end.value[0], end.value[1]
 
 
 def iterating(state: State, settings: MapSettings, k: int) -> Generator[None, None, tuple[State, Iteration]]:
@@ -234,14 +229,14 @@ def _with_light(state: State) -> State:
     cameras, basis = state.use.shape[1], light_basis(torch.zeros(1, 2, 1)).shape[-2]
     normal = torch.zeros(cameras, 2 * basis, 2 * basis, dtype=torch.float64)
     right = torch.zeros(cameras, 2 * basis, dtype=torch.float64)
-    greys: list[tuple[Tensor, Tensor, Tensor]] = []
+    greys: list[tuple[Tensor, ...]] = []
     some = slice(None, None, NOISE_EVERY)
     for (rows, pixels), at in zip(state.batches(), state.linearised(), strict=True):
         more_normal, more_right = light_sums(light_columns(at.view), at.view, pixels, at.precision)
         normal += more_normal.reshape(-1, cameras, *normal.shape[1:]).sum(0)
         right += more_right.reshape(-1, cameras, 2 * basis).sum(0)
         inside = pixels.inside & ~pixels.clipped & state.use[rows].reshape(-1, 1)
-        greys.append(((pixels.grey - at.residual)[:, some], at.residual[:, some], inside[:, some]))
+        greys.append(tuple(part[:, some] for part in (pixels.grey - at.residual, at.residual, inside)))
     difference, black = solved_light(normal, right).chunk(2, dim=-1)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
     noise = noise_curves(model, residual, inside, cameras)
@@ -294,14 +289,12 @@ def _better_blur(state: State) -> float:
 def _with_joint_step(state: State, smoothest: float) -> State:
     """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
-    parts, weight = [], np.zeros(2 * height * height)
 
     def system(batch: tuple[Tensor, Pixels]) -> LinearSystem:
-        return linear_system(state.linearised_at(batch[0], batch[1], state.blur_px), height)
+        return linear_system(state.linearised_at(*batch, state.blur_px), height)
 
-    for part in side_by_side(system, state.batches()):
-        parts.append(part)
-        weight += texel_sums(part.by_texel)
+    parts = list(side_by_side(system, state.batches()))
+    weight = sum((texel_sums(part.by_texel) for part in parts), np.zeros(2 * height * height))
     tie = max(smoothest * _typical(weight), state.tie)
     pose = joint_step(parts, state.use, _unexpected(state), tie, state.fitter.radius_mm, state.fixed)
     pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
@@ -316,14 +309,11 @@ def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
     """Return the state with its best map at the present poses, and chi2 per pixel before.
     `smoothest`: least weight of its squared slope, over that of a typical texel.
     """
-    height = len(state.texture)
     normal, right, chi2 = _map_equations(state)
     tie = max(smoothest * _typical(normal.diagonal()), state.tie)
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
-    right -= tie * (stiffness(height) @ _unexpected(state).double().numpy().ravel())
-    texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
-    weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
-    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight), chi2
+    right -= tie * (stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
+    return _changed(state, normal, right, tie), chi2
 
 
 def extended(state: State, new: State, tie: float, unseen: TextureTable | None) -> State:
@@ -333,17 +323,23 @@ def extended(state: State, new: State, tie: float, unseen: TextureTable | None) 
     """
     assert state.weight is not None
     height, held = len(state.texture), state.weight.reshape(-1).sqrt().float().numpy()
-    at = linearise(new.fitter, state.texture, new.pixels, new.position_lab_mm, new.R_lab_body, new.blur_px, unseen)
+    paint = SplineTable(state.texture, 0.0, unseen)
+    at = linearise(new.fitter, paint, new.pixels, new.position_lab_mm, new.R_lab_body, new.blur_px)
     weight = at.weight
     if at.view.known is not None:  # by it the light is found; the rest has any grey level
         weight = torch.where(at.view.known, weight, (new.pixels.inside & ~new.pixels.clipped).to(weight.dtype))
     at = replace(at, weight=weight * new.use.reshape(-1, 1))
     shown = at.by_texel(height)
     normal = NormalMatrix(vstack([shown, diags(held)], format="csr"))
-    right = shown.T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy()
+    return _changed(state, normal, shown.T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy(), tie)
+
+
+def _changed(state: State, normal: NormalMatrix, right: NDArray[np.float64], tie: float) -> State:
+    """Return the state with the change of its map that solves normal equations (T, T), (T,)."""
+    height = len(state.texture)
     texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
-    sums = torch.from_numpy(normal.diagonal().reshape(height, -1))
-    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=sums)
+    weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight)
 
 
 def sharp_map(state: State) -> Tensor:
@@ -353,7 +349,7 @@ def sharp_map(state: State) -> Tensor:
     tie = paint_tie(state.texture, state.blur_rad)
     expected = torch.zeros_like(state.texture)
     if state.expected is not None:
-        gain, offset = fit_levels(_as_filmed(state, state.expected), state.texture)
+        _, (gain, offset) = _as_filmed(state, state.expected)
         expected = gain * state.expected + offset
     return sharpened(normal, right, state.blur_rad, tie, expected)
 
@@ -362,16 +358,16 @@ def _unexpected(state: State) -> Tensor:
     """Return the map less the expected one, of the same blur and levels; all of it where nothing is expected."""
     if state.expected is None:
         return state.texture
-    filmed = _as_filmed(state, state.expected)
-    gain, offset = fit_levels(filmed, state.texture)
+    filmed, (gain, offset) = _as_filmed(state, state.expected)
     return state.texture - (gain * filmed + offset)
 
 
-def _as_filmed(state: State, paint: Tensor) -> Tensor:
-    """Return the coefficients (H, 2 H) of paint (H, 2 H) as the pictures blur it."""
+def _as_filmed(state: State, paint: Tensor) -> tuple[Tensor, tuple[float, float]]:
+    """Return the coefficients of paint (H, 2 H) as the pictures blur it, and gain and offset to the state's map."""
     height = len(paint)
     table = texture_table(paint, coefficients_blur_rad(state.blur_rad, height))
-    return table.sample(map_directions(height).reshape(-1, 3).float().T[None])[0].reshape(paint.shape)
+    filmed = table.sample(map_directions(height).reshape(-1, 3).float().T[None])[0].reshape(paint.shape)
+    return filmed, fit_levels(filmed, state.texture)
 
 
 def _map_equations(state: State) -> tuple[NormalMatrix, NDArray[np.float64], float]:

@@ -13,7 +13,6 @@ from sphereorient.mapping.grid import READS, Array, SplineTable, conjugate_gradi
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, grey_by_pose, residuals
-from sphereorient.sphere.texture_table import TextureTable
 
 DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
 POSE = 6  # unknowns of a pose
@@ -64,23 +63,15 @@ class Linearisation(Residuals):
 
 
 def linearise(
-    fitter: Fitter,
-    texture: Tensor,
-    pixels: Pixels,
-    position_lab_mm: Tensor,
-    R_lab_body: Tensor,
-    blur_px: float,
-    unseen: TextureTable | None = None,
+    fitter: Fitter, paint: SplineTable, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
 ) -> Linearisation:
-    """Linearise B * C disks, adjacent cameras, about a map (H, 2 H) of their blur and poses (B, 3) mm, (B, 3, 3).
-
-    The light of each frame is at its best; the fitter gives views and light, not the map. `unseen`: as that of a
-    `TextureTable`; pixels of such paint have no weight.
+    """Linearise B * C disks, adjacent cameras, about a new table of a map of their blur and poses (B, 3) mm, (B, 3, 3).
+    The light of each frame is at its best; the fitter gives views and light, not the map. Pixels of paint that the
+    table marks as unseen have no weight.
     """
-    table = SplineTable(texture, 0.0, unseen)
-    model = replace(fitter.model(fitter.optics.fine), paint=table, blur_px=blur_px)
+    model = replace(fitter.model(fitter.optics.fine), paint=paint, blur_px=blur_px)
     at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
-    return Linearisation(**vars(at), reads=table.reads, inner=pixels.inner)
+    return Linearisation(**vars(at), reads=paint.reads, inner=pixels.inner)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,11 +95,9 @@ def linear_system(at: Linearisation, height: int) -> LinearSystem:
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
     # Near the limb the map is not learnt; it must not move the pose there.
     by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over)
+    residual = at.residual * root
     return LinearSystem(
-        by_texel=at.by_texel(height),
-        by_pose=by_pose * root[:, None],
-        by_light=basis,
-        residual=at.residual * root,
+        by_texel=at.by_texel(height), by_pose=by_pose * root[:, None], by_light=basis, residual=residual
     )
 
 
@@ -116,19 +105,14 @@ def joint_step(
     parts: Sequence[LinearSystem], use: Tensor, texture: Tensor, smooth: float, radius_mm: float, fixed: bool
 ) -> Tensor:
     """Return the step of all poses (N, 6) float64, rad and mm, from one solution for poses and map together.
-
     The map (H, 2 H) has its squared slopes penalised by `smooth`; use is (N, C) bool; `fixed`: one shared position.
-
     Source: each frame's light projected out, Golub and Pereyra 1973; bundle adjustment, Agarwal et al. 2010.
     """
     count, cameras = use.shape
-    height = len(texture)
-    ties = (smooth * stiffness(height)).astype(np.float32)
+    ties = (smooth * stiffness(len(texture))).astype(np.float32)
     by_texel = vstack([part.by_texel for part in parts], format="csr")
-    back = by_texel.T
-    by_pose, by_light, residual = (
-        torch.cat([getattr(part, name) for part in parts]) for name in ("by_pose", "by_light", "residual")
-    )
+    back, names = by_texel.T, ("by_pose", "by_light", "residual")
+    by_pose, by_light, residual = (torch.cat([getattr(part, name) for part in parts]) for name in names)
     poses = 3 * count + 3 if fixed else POSE * count  # unknowns before those of the texels
 
     def unknowns(pose: Tensor, texels: Array) -> Array:
@@ -138,9 +122,7 @@ def joint_step(
         return torch.from_numpy(x[:poses]).reshape((-1,) if fixed else (count, POSE))
 
     def without_light(values: Tensor) -> Tensor:
-        along = by_light @ values[..., None]
-        left: Tensor = values - (by_light.mT @ along)[..., 0]
-        return left
+        return values - (by_light.mT @ (by_light @ values[..., None]))[..., 0]
 
     def pulled(values: Tensor) -> Array:
         pose = (by_pose @ values[..., None])[..., 0].reshape(count, cameras, POSE).sum(1)

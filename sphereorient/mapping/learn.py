@@ -62,7 +62,6 @@ STATE_PARTS = ("position_lab_mm", "R_lab_body", "texture")  # kept
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LearntMap:
     """A texture map learnt from movies or photographs; the body frame is the lab at the first known orientation.
-
     Through a mirror it is mirrored, which one camera or parallel ones cannot detect: set `flip:` in the experiment.
     """
 
@@ -94,7 +93,6 @@ def fit_map(
     crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None, old: Tensor | None = None
 ) -> LearntMap:
     """Learn the texture map, all orientations and the light from the crops of opened movies.
-
     `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
     `old`: a map (h, 2 h) of the ball as it was, which noise does not change; the body frame is not that of it.
 
@@ -164,10 +162,10 @@ def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tu
     chain = PairwiseAttitudes(rows=kept["chain_rows"], R_lab_body=kept["chain"], closure=closure)
     few = _settings_of_few(settings, crops, frames) if settings.unordered else settings
     first = first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
-    light = light_of(kept, bool(kept["known"]))
+    fitter = replace(first.fitter, light=light_of(kept, bool(kept["known"])))
     X, R, texture = (kept[name] for name in STATE_PARTS)
-    state = replace(first, position_lab_mm=X, R_lab_body=R, texture=texture, blur_px=float(kept["blur_px"]))
-    state = replace(state, fitter=replace(first.fitter, light=light))
+    state = replace(first, position_lab_mm=X, R_lab_body=R, texture=texture, fitter=fitter)
+    state = replace(state, blur_px=float(kept["blur_px"]))
     done = [Iteration(**dict(zip(Iteration.__dataclass_fields__, row, strict=True))) for row in kept["done"].tolist()]
     return _Start(crops=crops, frames=frames, rows=rows, chain=chain, state=first), state, done
 
@@ -211,13 +209,8 @@ def _start_from_photographs(crops: Crops, settings: MapSettings, progress: Progr
     R, X = _coarse(crops, frames, disks, chain.R_lab_body, few, progress)
     crops = replace(crops, position_lab_mm=crops.position_lab_mm.index_put((frames,), X))
     first = first_map(disks, R, map_height(crops.views, few))
-    return _Start(
-        crops=crops,
-        frames=frames,
-        rows=torch.arange(len(frames)),
-        chain=replace(chain, R_lab_body=R),
-        state=first_state(crops, frames, R, first, few),
-    )
+    rows, state = torch.arange(len(frames)), first_state(crops, frames, R, first, few)
+    return _Start(crops=crops, frames=frames, rows=rows, chain=replace(chain, R_lab_body=R), state=state)
 
 
 def _settings_of_few(settings: MapSettings, crops: Crops, frames: Tensor) -> MapSettings:
@@ -307,14 +300,14 @@ def recovered(crops: Crops, state: State, chain: Tensor) -> State:
     R = interpolated(chain, torch.nonzero(good)[:, 0], state.R_lab_body[good])[lost]
     X, use = state.position_lab_mm[lost], state.use[lost]
     fitter = state.map_fitter()
-    levels = (fitter.optics.coarse, fitter.optics.middle, fitter.optics.fine)
-    steps = [(level, 1, RECOVERY_ITERATIONS) for level in levels]
+    optics = fitter.optics
+    steps = [(level, 1, RECOVERY_ITERATIONS) for level in (optics.coarse, optics.middle, optics.fine)]
     fit = fitter.fit_through(steps, crops.pictures(state.frames[lost]), X, R, use, held=state.fixed)
     R, X = fit.R_lab_body, X if state.fixed else fit.position_lab_mm
     better = _scores(fit, use) > score[lost]
-    new_R, new_X = state.R_lab_body.clone(), state.position_lab_mm.clone()
-    new_R[lost[better]], new_X[lost[better]] = R[better], X[better]
-    return replace(state, R_lab_body=new_R, position_lab_mm=new_X)
+    rows = (lost[better],)
+    R, X = state.R_lab_body.index_put(rows, R[better]), state.position_lab_mm.index_put(rows, X[better])
+    return replace(state, R_lab_body=R, position_lab_mm=X)
 
 
 def _scores(fit: FittedPoses, use: Tensor) -> Tensor:

@@ -62,14 +62,10 @@ class Closure:
     @classmethod
     def of(cls, closed: RelativeRotations, before: Tensor, after: Tensor, *, pairs: int, loops: int) -> "Closure":
         """Compare orientations (N, 3, 3) before and after the loops `closed`."""
-        return cls(
-            pairs=pairs,
-            loops=loops,
-            closed=len(closed),
-            drift_before_rad=_rms(closed.residual(before)),
-            drift_after_rad=_rms(closed.residual(after)),
-            moved_rad=attitude_change_rad(before, after),
-        )
+        drift, left = (_rms(closed.residual(R)) for R in (before, after))
+        moved = attitude_change_rad(before, after)
+        counts = {"pairs": pairs, "loops": loops, "closed": len(closed)}
+        return cls(**counts, drift_before_rad=drift, drift_after_rad=left, moved_rad=moved)
 
 
 def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
@@ -119,11 +115,8 @@ def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slope
 
 def _first_views(disks: Disks, first: Tensor, every: int) -> list[Sampled]:
     """Return directions in the lab (E, 3, P), grey (E, P) and weight (E, P) of the first disks, camera by camera."""
-    views = []
-    for camera in range(disks.layers.shape[1]):
-        normal, grey, weight = disks.sampled(first, camera, every)
-        views.append((disks.R_lab_view[first, camera] @ normal, grey, weight))
-    return views
+    sampled = [disks.sampled(first, camera, every) for camera in range(disks.layers.shape[1])]
+    return [(disks.R_lab_view[first, c] @ normal, grey, weight) for c, (normal, grey, weight) in enumerate(sampled)]
 
 
 def refine_pairs(
@@ -141,10 +134,8 @@ def refine_pairs(
             turn = turn * (STEP_RAD / turn.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0)
             R = so3.exp(turn) @ R
         normal, _, score, overlap = _normal_equations(disks, j, R, views, slopes=True)
-        R = so3.nearest_rotation(R.double())
-        return RelativeRotations(
-            first=i, second=j, R_ji=R, information=normal.double(), score=score.double(), overlap=overlap.double()
-        )
+        R, normal, score, overlap = so3.nearest_rotation(R.double()), normal.double(), score.double(), overlap.double()
+        return RelativeRotations(first=i, second=j, R_ji=R, information=normal, score=score, overlap=overlap)
 
     return all_rotations(list(side_by_side(refined, torch.split(torch.arange(len(first)), BATCH))))
 
@@ -205,7 +196,6 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
 
 def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
     """Return correlations (N, M) of all first disks of a camera with one disk, `second`, at rotations (M, 3, 3).
-
     `cameras`: of the first disks and of the second; the rotations take the first view frame to the second.
     """
     camera, other = cameras
@@ -227,12 +217,10 @@ def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tens
 
 def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) -> tuple[Tensor, Tensor]:
     """Fit orientations (N, 3, 3) float64, the first fixed, to relative rotations; return also residuals (E, 3), rad.
-
     Source: weights at `scale_rad`, Geman and McClure 1987, graduated non-convexity (Yang et al. 2020).
     """
     R = R_lab_body.clone()
-    typical = pairs.information.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-12)
-    shape = pairs.information / typical
+    shape = pairs.information / pairs.information.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-12)
     for k in range(GRAPH_ITERATIONS):
         wide = scale_rad * max(1.0, 16.0 * 0.6**k)
         residual = pairs.residual(R)
@@ -251,19 +239,14 @@ def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: T
     carry = R[j] @ R[i].mT
     rows, columns, values = [], [], []
     axes = torch.arange(3)
-    for a, b, block in (
-        (i, i, carry.mT @ weight @ carry),
-        (i, j, -carry.mT @ weight),
-        (j, i, -weight @ carry),
-        (j, j, weight),
-    ):
+    left = carry.mT @ weight
+    for a, b, block in ((i, i, left @ carry), (i, j, -left), (j, i, -weight @ carry), (j, j, weight)):
         rows.append((3 * a[:, None, None] + axes[:, None]).expand(-1, 3, 3).reshape(-1))
         columns.append((3 * b[:, None, None] + axes).expand(-1, 3, 3).reshape(-1))
         values.append(block.reshape(-1))
     pulled = (weight @ residual[..., None])[..., 0]
-    right = torch.zeros(count, 3, dtype=R.dtype)
-    right.index_add_(0, j, pulled)
-    right.index_add_(0, i, -(carry.mT @ pulled[..., None])[..., 0])
+    right = torch.zeros(count, 3, dtype=R.dtype).index_add(0, j, pulled)
+    right = right.index_add(0, i, -(carry.mT @ pulled[..., None])[..., 0])
     # The first orientation is fixed; unconnected ones stay.
     diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
     diagonal[:3] = 1e9

@@ -57,10 +57,8 @@ OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second 
 def finer_settings(settings: MapSettings, diameter_px: float) -> MapSettings:
     """Return settings of finer disks, up to the pictures' resolution: coarse ones are 2 degrees off at slants."""
     factor = min(max(diameter_px / settings.disk_px, 1.0), FINER, DISK_PX_MAX / settings.disk_px)
-    size = 2 * round(factor * settings.disk_px / 2)
-    return settings.model_copy(
-        update={"disk_px": size, "detail": settings.detail / factor, "window": settings.window / factor}
-    )
+    finer = {"detail": settings.detail / factor, "window": settings.window / factor}
+    return settings.model_copy(update={"disk_px": 2 * round(factor * settings.disk_px / 2), **finer})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,9 +71,7 @@ class Evidence:
 
     def log_odds(self, pairs: RelativeRotations) -> Tensor:
         """Return the log-odds (E,) of pairs, from Fisher's z of their correlations over n independent places.
-
         Its mean is 0 for different patches, about twice that of `score_min` for the same; the variance is 1 / n.
-
         Source: Fisher 1921, On the probable error of a coefficient of correlation.
         """
         middle = math.atanh(self.score_min)

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
+from sphereorient.mapping.compare import weighted_correlation
 from sphereorient.mapping.disks import Crops, disks_of, normalised_disks
 from sphereorient.mapping.grid import look_up
 from sphereorient.mapping.iterations import State, fitted, map_weight, with_map
@@ -23,7 +24,6 @@ WINDOW = 5  # rotations whose median is usual
 
 def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tensor:
     """Return correlations (n, C) of pictures with a map to which they were not fitted; NaN where not compared.
-
     Both are normalised as for pairs of pictures, so that shading counts for nothing.
     """
     rows = torch.arange(HELD_EVERY // 2, len(state.use), HELD_EVERY)
@@ -44,15 +44,12 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
         model = normalised_disks(pictures[:, None], at.R_lab_view, at.distance_radii, at.seen, settings, at.shown)
         a, b = (disks.layers[:, 0, 0].flatten(1) for disks in (at, model))
         weight = filmed.share.flatten() * filmed.weight(slice(None), c) * (seen > SEEN_MIN).flatten(1)
-        a, b = (x - ((weight * x).sum(1) / weight.sum(1).clamp_min(1e-9))[:, None] for x in (a, b))
-        power = (weight * a * a).sum(1) * (weight * b * b).sum(1)
-        found[rows, c] = torch.where(power > 0, (weight * a * b).sum(1) / power.sqrt(), torch.nan).double()
+        found[rows, c] = weighted_correlation(a, b, weight).double()
     return found
 
 
 def jumps(R_lab_body: Tensor) -> Tensor:
     """Return the frames (J,) from which a ball with orientations (N, 3, 3) turns unlike before and after; NaN: unknown.
-
     A rotation is compared with the median of its neighbours': a lasting change of the rate is none.
     """
     turn = so3.log((R_lab_body[1:] @ R_lab_body[:-1].mT).nan_to_num())

@@ -57,8 +57,7 @@ def track(job: Job, follower: Follower | None, measured: Iterable[Measured], pro
         fused.segment,
         rate_hz if np.isfinite(rate_hz) else 1 / grid.timeline.frame_s,
         settings.motion,
-        position_sigma_mm=positions.covariance_mm2.diagonal(dim1=-2, dim2=-1).sqrt(),
-        orientation_sigma_rad=fused.sigma_rad,
+        (positions.covariance_mm2.diagonal(dim1=-2, dim2=-1).sqrt(), fused.sigma_rad),
     )
     tracks = {name: results.paper_camera(sightings[name], candidates[name], paths[name]) for name in cameras}
     whole = results.paper_track(grid.experiment, clock, positions, fused, moved, tracks)

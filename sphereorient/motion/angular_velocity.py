@@ -12,12 +12,7 @@ FEWEST_POINTS = 3  # points that determine a rotation
 
 
 def omega_from_orientations(
-    R_lab_body: Tensor,
-    dt_s: float,
-    separations: Sequence[int],
-    *,
-    segment: Tensor | None = None,
-    min_separations: int = 1,
+    R_lab_body: Tensor, dt_s: float, separations: Sequence[int], segment: Tensor | None = None, min_separations: int = 1
 ) -> tuple[Tensor, Tensor]:
     """Return omega_lab (..., N, 3), rad/s, averaged over symmetric separations, and its standard error (..., N, 3).
     A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt), weight m^2, optimal for white attitude noise. It damps f
@@ -96,9 +91,8 @@ def mean_over_separations(
     enough = count >= max(min_separations, 1)
     scattered = enough & (count > 1) & (variance > 0)
     # the root's gradient at 0 is infinite: without any scatter the answer is 0 by itself
-    error = torch.where(
-        scattered, torch.where(scattered, variance, 1).sqrt(), torch.where(enough & (count > 1), 0.0, torch.nan)
-    )
+    alike = torch.where(enough & (count > 1), 0.0, torch.nan)
+    error = torch.where(scattered, torch.where(scattered, variance, 1).sqrt(), alike)
     return torch.where(enough, mean, torch.nan), error
 
 
@@ -118,12 +112,7 @@ def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) ->
 
 
 def omega_from_markers(
-    points_lab: Tensor,
-    dt_s: float,
-    separations: Sequence[int],
-    *,
-    segment: Tensor | None = None,
-    min_separations: int = 1,
+    points_lab: Tensor, dt_s: float, separations: Sequence[int], segment: Tensor | None = None, min_separations: int = 1
 ) -> tuple[Tensor, Tensor]:
     """Return omega_lab and its standard error as `omega_from_orientations`, from markers seen in both frames of a pair.
     `points_lab` (..., N, K, 3), any unit, is NaN where a marker is not seen. The body components stay unknown.

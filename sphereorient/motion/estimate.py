@@ -123,8 +123,7 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
     if out.any():
         off = path.away()[out]
         whole = path.covariance[out] + states.covariance[out][:, VALUE, VALUE]
-        mahalanobis = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
-        used[out] = mahalanobis < AGAIN * limit
+        used[out] = mahalanobis2(off, whole) < AGAIN * limit
     # beyond the limit, and beyond all near them; those near are tested again without them
     away = states.mahalanobis
     wrong = away > limit
@@ -136,12 +135,16 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
     return used
 
 
+def mahalanobis2(off: Floats, covariance: Floats) -> Floats:
+    """Return the squared Mahalanobis distances (n,) of deviations (n, 3) of covariances (n, 3, 3)."""
+    return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off))
+
+
 def _wanted(pole: float) -> Floats:
-    view = np.eye(3)
+    """Return the rows (9, SIZE) of value, rate and change in a state."""
     wanted = np.zeros((9, SIZE))
-    wanted[VALUE, DELTA] = view
-    wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = view
-    wanted[CHANGE, 9:12] = pole * view
+    wanted[VALUE, DELTA] = wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = np.eye(3)
+    wanted[CHANGE, 9:12] = pole * np.eye(3)
     return wanted
 
 
@@ -160,19 +163,16 @@ def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
     if count < 3:
         change = np.full_like(change, np.nan)
         covariance[:, CHANGE] = covariance[:, :, CHANGE] = np.nan
-    return Estimate(
-        value=settled.reference, rate=rate, change=change, covariance=covariance, rejected=settled.seen & ~settled.used
-    )
+    rejected = settled.seen & ~settled.used
+    return Estimate(value=settled.reference, rate=rate, change=change, covariance=covariance, rejected=rejected)
 
 
 def _alone(path: SegmentTrack) -> Estimate:
-    unknown = np.full((len(path.time), 3), np.nan)
-    covariance = np.full((len(path.time), 9, 9), np.nan)
-    covariance[path.seen, VALUE, VALUE] = path.covariance[path.seen]
-    value = np.full_like(path.value, np.nan)
-    value[path.seen] = path.value[path.seen]
-    none = np.zeros(len(path.time), dtype=bool)
-    return Estimate(value=value, rate=unknown, change=unknown, covariance=covariance, rejected=none)
+    count, seen = len(path.time), path.seen
+    unknown, covariance = np.full((count, 3), np.nan), np.full((count, 9, 9), np.nan)
+    covariance[seen, VALUE, VALUE] = path.covariance[seen]
+    value = np.where(seen.reshape(-1, *(1,) * (path.value.ndim - 1)), path.value, np.nan)
+    return Estimate(value=value, rate=unknown, change=unknown, covariance=covariance, rejected=np.zeros(count, bool))
 
 
 def estimate_process(
@@ -183,31 +183,32 @@ def estimate_process(
     Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form.
     """
     sigma = float(np.median([path.sigma for path in paths]))
-    if band is not None:
-        prior = prior_of_band(band, sigma)
-    else:
-
-        def prior_at(theta: Floats) -> Prior:
-            pole, spread = np.exp(np.clip(theta, np.log([POLES[0], SPREADS[0]]), np.log([POLES[1], SPREADS[1]])))
-            return Prior(pole=float(pole), deviation=float(spread * sigma))
-
-        def cost(theta: Floats) -> float:
-            return _cost(paths, prior_at(theta), scales)[0]
-
-        if before is None:
-            rates = [path.rates() for path in paths]
-            usual = 1.48 * np.median(np.concatenate([np.abs(each - np.median(each, axis=0)) for each in rates]))
-            spread = np.clip(usual / sigma, 10 * SPREADS[0], 0.1 * SPREADS[1])
-            start, reach = min((np.log([pole, spread]) for pole in FIRST_TRIES), key=cost), 0.4
-        else:
-            start = np.log([before.prior.pole, before.prior.deviation / before.scale / sigma])
-            reach = 0.1
-        simplex = start + reach * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.02, "maxfev": 60}
-        found = minimize(cost, start, method="Nelder-Mead", options=options)  # type: ignore[call-overload]
-        prior = prior_at(found.x)
+    prior = _likeliest(paths, scales, sigma, before) if band is None else prior_of_band(band, sigma)
     scale = _cost(paths, prior, scales)[1]
     return ProcessPrior(prior=Prior(pole=prior.pole, deviation=prior.deviation * scale), scale=scale)
+
+
+def _likeliest(
+    paths: Sequence[SegmentTrack], scales: tuple[float, float], sigma: float, before: ProcessPrior | None
+) -> Prior:
+    def prior_at(theta: Floats) -> Prior:
+        pole, spread = np.exp(np.clip(theta, np.log([POLES[0], SPREADS[0]]), np.log([POLES[1], SPREADS[1]])))
+        return Prior(pole=float(pole), deviation=float(spread * sigma))
+
+    def cost(theta: Floats) -> float:
+        return _cost(paths, prior_at(theta), scales)[0]
+
+    if before is None:
+        rates = [path.rates() for path in paths]
+        usual = 1.48 * np.median(np.concatenate([np.abs(each - np.median(each, axis=0)) for each in rates]))
+        spread = np.clip(usual / sigma, 10 * SPREADS[0], 0.1 * SPREADS[1])
+        start, reach = min((np.log([pole, spread]) for pole in FIRST_TRIES), key=cost), 0.4
+    else:
+        start, reach = np.log([before.prior.pole, before.prior.deviation / before.scale / sigma]), 0.1
+    simplex = start + reach * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.02, "maxfev": 60}
+    found = minimize(cost, start, method="Nelder-Mead", options=options)  # type: ignore[call-overload]
+    return prior_at(found.x)
 
 
 def _cost(paths: Sequence[SegmentTrack], prior: Prior, scales: tuple[float, float]) -> tuple[float, float]:

@@ -42,7 +42,6 @@ UNKNOWN = Rate(value=np.full(3, np.nan), sigma=np.full(3, np.nan))
 
 class ForwardRate:
     """The rate of a position, or of an orientation, at each of its measurements, causally; memory is constant.
-
     The prior is that of `smooth_motion`. Its parameters, in units of the usual step and sigma, and the factor on the
     sigmas of the measurements are those of highest likelihood of late. The principal axes of the usual covariance have
     a filter each. A measurement that contradicts the motion so far begins it anew.

@@ -48,7 +48,7 @@ class Filtered:
     """Estimates from the past, frame by frame; made by `run_filter`."""
 
     state: Floats  # (N, D), after the frame's own measurement
-    covariance: Floats  # (M, D, D), of every EVERY-th state from the first on: all of them would be most of the memory
+    stored: Floats  # (M, D, D), covariance of every EVERY-th state from the first on: all would be most of the memory
     gain: Floats  # (N, D, 3)
     innovation: Floats  # (N, 3)
     inverse: Floats  # (N, 3, 3), inverse covariance of the innovation
@@ -58,13 +58,21 @@ class Filtered:
 
 def run_filter(chain: StateSpace) -> Filtered:
     """Run Kalman's filter (Kalman 1960)."""
+    count, size = len(chain.measured), chain.start.shape[0]
+    found = {
+        "state": np.empty((count, size)),
+        "stored": np.empty((-(-count // EVERY), size, size)),
+        "gain": np.zeros((count, size, 3)),
+        "innovation": np.zeros((count, 3)),
+        "inverse": np.zeros((count, 3, 3)),
+    }
     code = library()
     if code is not None:
-        return _filtered_compiled(code, chain)
-    count, size = len(chain.measured), chain.start.shape[0]
+        sums = np.zeros(2)
+        _run(code, "kalman_filter", chain, **found, sums=sums)
+        return Filtered(**found, misfit=float(sums[0]), log_determinant=float(sums[1]))
+    states, covariances, gains, innovations, inverses = found.values()
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
-    states, covariances = np.empty((count, size)), np.empty((-(-count // EVERY), size, size))
-    gains, innovations, inverses = np.zeros((count, size, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for k in range(count):  # a recursion: each frame needs the one before
         if k:
             F = chain.transition(k - 1, F)
@@ -81,16 +89,8 @@ def run_filter(chain: StateSpace) -> Filtered:
         states[k] = x
         if k % EVERY == 0:
             covariances[k // EVERY] = P
-    seen = chain.used
-    return Filtered(
-        state=states,
-        covariance=covariances,
-        gain=gains,
-        innovation=innovations,
-        inverse=inverses,
-        misfit=float(np.einsum("ni,nij,nj->", innovations, inverses, innovations)),
-        log_determinant=-float(np.linalg.slogdet(inverses[seen])[1].sum()),
-    )
+    misfit = float(np.einsum("ni,nij,nj->", innovations, inverses, innovations))
+    return Filtered(**found, misfit=misfit, log_determinant=-float(np.linalg.slogdet(inverses[chain.used])[1].sum()))
 
 
 def _carried(chain: StateSpace, k: int, P: Floats, F: Floats) -> Floats:
@@ -107,7 +107,7 @@ def _updated(P: Floats, gain: Floats) -> Floats:
 def _covariances(chain: StateSpace, filtered: Filtered, first: int) -> Floats:
     """Recompute the covariances of the states from a stored one to the next."""
     count = min(EVERY, len(filtered.state) - first)
-    P = filtered.covariance[first // EVERY]
+    P = filtered.stored[first // EVERY]
     F = np.zeros_like(P)
     found = np.empty((count, *P.shape))
     found[0] = P
@@ -125,23 +125,24 @@ class SmoothedStates:
 
     state: Floats  # (N, D)
     covariance: Floats  # (N, K, K), of the wanted combinations of each state
-    mahalanobis: (
-        Floats  # (N,), squared Mahalanobis distance of a used measurement from the estimate of all others; else 0
-    )
+    mahalanobis: Floats  # (N,), squared Mahalanobis distance of a used measurement from all others' estimate; else 0
 
 
 def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
     """Run backwards over a filtered chain; `wanted` (K, D) holds the rows whose covariance is returned.
     Source: Bierman 1973 (modified Bryson-Frazier); the distance from the others: de Jong 1988.
     """
-    code = library()
-    if code is not None:
-        return _smoothed_compiled(code, chain, filtered, wanted)
     count, size = filtered.state.shape
-    F = np.zeros((size, size))
-    pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
     state, mahalanobis = filtered.state.copy(), np.zeros(count)
     covariance = np.empty((count, len(wanted), len(wanted)))
+    code = library()
+    if code is not None:
+        given = {key: array for key, array in vars(filtered).items() if isinstance(array, np.ndarray)}
+        found = {"smoothed": state, "spread": covariance, "mahalanobis": mahalanobis}
+        _run(code, "kalman_smooth", chain, **given, wanted=np.ascontiguousarray(wanted), **found)
+        return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)
+    F = np.zeros((size, size))
+    pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
     for k in range(count - 1, -1, -1):
         if k == count - 1 or k % EVERY == EVERY - 1:
             block = _covariances(chain, filtered, k - k % EVERY)
@@ -180,39 +181,3 @@ def _run(code: ctypes.CDLL, name: str, chain: StateSpace, **arrays: Floats) -> N
     task = _Chain(**numbers, **{key: array.ctypes.data for key, array in given.items()})
     if code[name](ctypes.byref(task)):
         raise MemoryError
-
-
-def _filtered_compiled(code: ctypes.CDLL, chain: StateSpace) -> Filtered:
-    count, size = len(chain.measured), len(chain.start)
-    found = {
-        "state": np.empty((count, size)),
-        "stored": np.empty((-(-count // EVERY), size, size)),
-        "gain": np.zeros((count, size, 3)),
-        "innovation": np.zeros((count, 3)),
-        "inverse": np.zeros((count, 3, 3)),
-        "sums": np.zeros(2),
-    }
-    _run(code, "kalman_filter", chain, **found)
-    misfit, log_determinant = found.pop("sums").tolist()
-    return Filtered(covariance=found.pop("stored"), misfit=misfit, log_determinant=log_determinant, **found)
-
-
-def _smoothed_compiled(code: ctypes.CDLL, chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
-    count, size = filtered.state.shape
-    state, mahalanobis = np.empty((count, size)), np.empty(count)
-    spread = np.empty((count, len(wanted), len(wanted)))
-    _run(
-        code,
-        "kalman_smooth",
-        chain,
-        state=filtered.state,
-        stored=filtered.covariance,
-        gain=filtered.gain,
-        innovation=filtered.innovation,
-        inverse=filtered.inverse,
-        wanted=np.ascontiguousarray(wanted),
-        smoothed=state,
-        spread=spread,
-        mahalanobis=mahalanobis,
-    )
-    return SmoothedStates(state=state, covariance=spread, mahalanobis=mahalanobis)

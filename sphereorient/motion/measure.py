@@ -42,9 +42,7 @@ def measure_motion(
     segment: Tensor,
     frame_rate_hz: float,
     settings: MotionSettings,
-    *,
-    position_sigma_mm: Tensor | None = None,
-    orientation_sigma_rad: Tensor | None = None,
+    sigmas: tuple[Tensor | None, Tensor | None] = (None, None),
 ) -> Motion:
     """Return smooth pose, velocity, acceleration, omega, alpha of all frames whose neighbours determine them, else NaN.
     Positions are smoothed with the Gaussian of velocity, orientations with that of alpha, by the chordal mean on SO(3).
@@ -57,8 +55,8 @@ def measure_motion(
         segment: (..., N) int, number of the segment, -1 outside any.
         frame_rate_hz: constant.
         settings: widths and limits.
-        position_sigma_mm: (..., N) or (..., N, 3), of a coordinate; NaN where unknown.
-        orientation_sigma_rad: (..., N) or (..., N, 3), of delta in R_true = exp([delta]x) R; NaN where unknown.
+        sigmas: of the position's coordinates, mm, and of delta in R_true = exp([delta]x) R, rad, (..., N) or
+            (..., N, 3) each; None or NaN: unknown.
 
     Raises:
         ShapeError: wrong last axes, or unequal numbers of frames.
@@ -70,35 +68,34 @@ def measure_motion(
         do = "give all three the same frames"
         raise ShapeError(refusal("motion", expected="(..., N, 3), (..., N, 3, 3), (..., N)", got=shapes, do=do))
     dt_s = 1.0 / frame_rate_hz
+    found: dict[str, Tensor] = {}
+    R, eye = R_lab_body.flatten(-2), torch.eye(3, dtype=position_mm.dtype, device=position_mm.device)
+    position_sigma, orientation_sigma = (_by_axis(sigma, position_mm) for sigma in sigmas)
+    for name, covariance, width, x, sigma in (
+        ("position_lab_mm", "position_cov_mm2", settings.velocity_sigma_frames, position_mm, position_sigma),
+        ("R_lab_body", "orientation_cov_rad2", settings.alpha_sigma_frames, R, orientation_sigma),
+    ):
+        stencil = _stencil(x, segment, width, 0, settings)
+        found[name], found[covariance] = apply(stencil, x), propagated_sigma(stencil, sigma).square()[..., None] * eye
+    found["R_lab_body"] = nearest_rotation(found["R_lab_body"].reshape(R_lab_body.shape))
     moves: tuple[tuple[str, str, float, Order], ...] = (
         ("velocity", "m_s", settings.velocity_sigma_frames, 1),
         ("acceleration", "m_s2", settings.acceleration_sigma_frames, 2),
     )
-    found: dict[str, Tensor] = {}
-    R, eye = R_lab_body.flatten(-2), torch.eye(3, dtype=position_mm.dtype, device=position_mm.device)
-    poses = (
-        ("position_lab_mm", "position_cov_mm2", settings.velocity_sigma_frames, position_mm, position_sigma_mm),
-        ("R_lab_body", "orientation_cov_rad2", settings.alpha_sigma_frames, R, orientation_sigma_rad),
-    )
-    for name, covariance, width, x, noise in poses:
-        stencil = _stencil(x, segment, width, 0, settings)
-        found[name] = apply(stencil, x)
-        found[covariance] = propagated_sigma(stencil, _by_axis(noise, position_mm)).square()[..., None] * eye
-    found["R_lab_body"] = nearest_rotation(found["R_lab_body"].reshape(R_lab_body.shape))
     for name, unit, width, order in moves:
         stencil, scale = _stencil(position_mm, segment, width, order, settings), M_PER_MM / dt_s**order
-        sigma = propagated_sigma(stencil, _by_axis(position_sigma_mm, position_mm))
+        sigma = propagated_sigma(stencil, position_sigma)
         found[f"{name}_{unit}"], found[f"{name}_sigma_{unit}"] = apply(stencil, position_mm) * scale, sigma * scale
-    omega, alpha = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
+    omega, alpha = _rotation(R_lab_body, orientation_sigma, segment, dt_s, settings)
     for name, unit, (x, sigma) in (("omega", "rad_s", omega), ("alpha", "rad_s2", alpha)):
         found[f"{name}_lab_{unit}"], found[f"{name}_lab_sigma_{unit}"] = x, sigma
         found[f"{name}_body_{unit}"] = _to_body(R_lab_body, x)
-        found[f"{name}_body_sigma_{unit}"] = _sigma_in_body(R_lab_body, x, sigma, orientation_sigma_rad)
+        found[f"{name}_body_sigma_{unit}"] = _sigma_in_body(R_lab_body, x, sigma, orientation_sigma)
     return Motion(**found)
 
 
 def _rotation(
-    R_lab_body: Tensor, sigma_rad: Tensor | None, segment: Tensor, dt_s: float, settings: MotionSettings
+    R_lab_body: Tensor, sigma_rad: Tensor, segment: Tensor, dt_s: float, settings: MotionSettings
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Return omega_lab and its sigma, alpha_lab and its sigma."""
     separations, fewest = settings.separations, settings.min_separations
@@ -107,9 +104,9 @@ def _rotation(
     alpha = apply(slope, omega) / dt_s
     # neighbouring omegas share orientations: their noise is not white, that of the orientations is
     usable = usable_separations(_oriented(R_lab_body), separations, segment)
-    turn, sigma = omega_stencil(usable, separations, fewest, omega.dtype), _by_axis(sigma_rad, omega)
-    omega_sigma = propagated_sigma(turn, sigma) / dt_s
-    return (omega, omega_sigma), (alpha, propagated_sigma(compose(slope, turn), sigma) / dt_s**2)
+    turn = omega_stencil(usable, separations, fewest, omega.dtype)
+    omega_sigma = propagated_sigma(turn, sigma_rad.to(omega)) / dt_s
+    return (omega, omega_sigma), (alpha, propagated_sigma(compose(slope, turn), sigma_rad.to(omega)) / dt_s**2)
 
 
 def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:
@@ -139,11 +136,11 @@ def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     return torch.where(there, to_body(R, x), torch.nan)
 
 
-def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
+def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor) -> Tensor:
     """Return the sigmas of R^T x by axis; an orientation error delta adds delta x x, independent of that of x."""
     from_x = _to_body(R_lab_body.square(), x_sigma.square())
     unit = torch.eye(3, dtype=x_lab.dtype, device=x_lab.device).expand(*x_lab.shape, 3)
     turned = torch.linalg.cross(unit, x_lab[..., None, :])  # (..., 3, 3), row j: delta along axis j crossed with x
     lever = torch.stack([_to_body(R_lab_body, turned[..., j, :]) for j in range(3)], dim=-1)  # (..., 3 body, 3 lab)
-    from_R = (lever.square() * _by_axis(sigma_rad, x_lab)[..., None, :].square()).sum(-1)
+    from_R = (lever.square() * sigma_rad.to(x_lab)[..., None, :].square()).sum(-1)
     return (from_x + from_R).sqrt()

@@ -6,7 +6,7 @@ w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,18 +80,10 @@ class SegmentTrack:
         mean = velocity.mean(0)
         rate = np.zeros((len(time), ORDER, 3))
         rate[:, 0] = velocity - mean
-        return cls(
-            time=time,
-            covariance=covariance,
-            seen=seen,
-            used=trusted,
-            unknown_rate=2 * float(np.sqrt((rate[:, 0] ** 2).mean())),
-            mean=mean,
-            rate=rate,
-            pole=1.0,
-            value=value,
-            reference=reference,
-        )
+        given: dict[str, Any] = {"time": time, "value": value, "covariance": covariance, "seen": seen}
+        guess = {"used": trusted, "mean": mean, "rate": rate, "reference": reference}
+        unknown_rate = 2 * float(np.sqrt((rate[:, 0] ** 2).mean()))
+        return cls(**given, **guess, unknown_rate=unknown_rate, pole=1.0)
 
     def moved(self, state: Floats, prior: Prior) -> Self:
         """Return the path about the states (N, SIZE)."""
@@ -163,17 +155,8 @@ class SegmentTrack:
         start[DELTA, DELTA] = (UNKNOWN * self.sigma) ** 2 * view
         start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * view
         start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, view)
-        return StateSpace(
-            carried=carried,
-            drift=drift,
-            kind=kind,
-            grown=grown_by,
-            noise=noise,
-            start=start,
-            measured=self.away(),
-            covariance=self.covariance,
-            used=self.used,
-        )
+        steps: dict[str, Any] = {"carried": carried, "drift": drift, "kind": kind, "grown": grown_by, "noise": noise}
+        return StateSpace(**steps, start=start, measured=self.away(), covariance=self.covariance, used=self.used)
 
 
 def _by_axis(blocks: Floats) -> Floats:
@@ -223,17 +206,13 @@ class RotationTrack(SegmentTrack):
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
         """Return the reference's own rotations, exact for any angle, and the jumps."""
-        step = np.diff(self.time)
-        rate = self.scaled(prior)[:-1]
+        step, rate, pole = np.diff(self.time), self.scaled(prior)[:-1], prior.pole
         at, _ = nodes(step)
         to_end = np.concatenate([step[:, None] - at, step[:, None]], axis=1)
-        pole = prior.pole
         over_step = integral(step * pole)[:, None]
         gone = np.concatenate([over_step - integral(at * pole), over_step], axis=1) / pole
-        angle = to_end[..., None] * self.mean + gone @ rate
-        carry = rotation_of(angle)
-        whole = propagated(self.mean, rate, pole, step)
-        carry[:, NODES] = whole
+        carry = rotation_of(to_end[..., None] * self.mean + gone @ rate)
+        carry[:, NODES] = whole = propagated(self.mean, rate, pole, step)
         return carry, rotvec_between(whole @ self.reference[:-1], self.reference[1:])
 
 

@@ -15,7 +15,6 @@ def check_separations(separations: Sequence[int], name: str = "separations") -> 
 
 class MotionSettings(BaseModel, frozen=True, extra="forbid"):
     """How positions and orientations become velocities and accelerations.
-
     The defaults fit the experiment of the paper, 600 Hz and 1 degree of attitude noise; they are widths in frames, so
     double them at twice the frame rate. Wider means less noise and more low-pass bias.
     """
@@ -24,9 +23,7 @@ class MotionSettings(BaseModel, frozen=True, extra="forbid"):
         3.5, gt=0, description="width of the Gaussian for velocity, frames; 0.1 mm of white noise at 600 Hz: 0.003 m/s"
     )
     acceleration_sigma_frames: float = Field(
-        5.0,
-        gt=0,
-        description="width of the Gaussian that acceleration is taken with, frames; noise falls as its power 2.5",
+        5.0, gt=0, description="width of the Gaussian for acceleration, frames; noise falls as its power 2.5"
     )
     alpha_sigma_frames: float = Field(
         2.0, gt=0, description="width of the Gaussian that takes alpha from omega, frames; omega is already an average"
@@ -35,11 +32,7 @@ class MotionSettings(BaseModel, frozen=True, extra="forbid"):
         3.0, gt=0, description="half width of these windows in units of their sigma; 3 holds 99.7 % of the Gaussian"
     )
     min_share: float = Field(
-        0.55,
-        gt=0,
-        le=1,
-        description="share of a Gaussian's weight whose frames must be there, else NaN; lower reaches closer to ends "
-        "and across more lost frames, with more noise; 0.55 passes two neighbouring lost frames",
+        0.55, gt=0, le=1, description="measured share of a Gaussian's weight, else NaN; 0.55 passes two lost frames"
     )
     separations: tuple[int, ...] = Field(
         (1, 2, 3, 4, 5),
@@ -48,9 +41,7 @@ class MotionSettings(BaseModel, frozen=True, extra="forbid"):
         "2 m omega / frame_rate, must stay well below 180 degrees",
     )
     min_separations: int = Field(
-        3,
-        ge=1,
-        description="how many of the separations must be measurable, else omega is NaN; 3 loses 3 frames at ends",
+        3, ge=1, description="separations that must be measurable, else omega is NaN; 3 loses 3 frames at ends"
     )
 
     @model_validator(mode="after")
@@ -73,19 +64,11 @@ class SmoothSettings(BaseModel, frozen=True, extra="forbid"):
         None, gt=0, description="frequency up to which orientations are followed, Hz; null learns it likewise"
     )
     learn_frames: int = Field(
-        600,
-        ge=20,
-        description="frames from which band and noise are learnt, longest segments first; more only cost time",
+        600, ge=20, description="frames from which band and noise are learnt, at most; more only cost time"
     )
-    least_frames: int = Field(
-        10, ge=5, description="measured frames in all below which nothing can be learnt and nothing is smoothed"
-    )
-    least_scale: float = Field(
-        0.5, gt=0, description="least factor on the given sigmas of the measurements that is believed"
-    )
-    most_scale: float = Field(
-        4.0, gt=0, description="largest factor on the given sigmas of the measurements that is believed"
-    )
+    least_frames: int = Field(10, ge=5, description="measured frames in all below which nothing is smoothed")
+    least_scale: float = Field(0.5, gt=0, description="least factor on the measurements' sigmas")
+    most_scale: float = Field(4.0, gt=0, description="largest factor on the measurements' sigmas")
     slow_share: float = Field(
         0.25,
         ge=0,

@@ -1,5 +1,6 @@
 """Motion from the precise track: smoothed position and orientation, their derivatives, with sigmas."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
@@ -9,11 +10,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, ProcessPrior, estimate
+from sphereorient.motion.estimate import (
+    CHANGE,
+    SPEED,
+    VALUE,
+    Estimate,
+    ProcessNoise,
+    ProcessPrior,
+    estimate,
+    mahalanobis2,
+)
 from sphereorient.motion.kalman import Bools, Floats
 from sphereorient.motion.measure import M_PER_MM, Motion
 from sphereorient.motion.path import RotationTrack, SegmentTrack, rotation_of
 from sphereorient.motion.settings import SmoothSettings
+
+Rows = NDArray[np.int64]
 
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
@@ -51,18 +63,14 @@ class MeasuredPoses:
     coupling: Tensor | None = None  # (N, 3, 3), rad mm, covariance of delta (rows) with the position; None: none
 
     def __post_init__(self) -> None:
-        check_tail("position_lab_mm", self.position_lab_mm, 3)
-        coupling = () if self.coupling is None else (self.coupling,)
-        square = (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2, *coupling)
-        for name, part in zip(
-            ("position_cov_mm2", "R_lab_body", "orientation_cov_rad2", "coupling"), square, strict=False
-        ):
-            check_tail(name, part, 3, 3)
-        shapes = [self.time_s.shape, self.position_lab_mm.shape[:-1], *(part.shape[:-2] for part in square)]
-        shapes.append(self.segment.shape)
+        shapes = [self.time_s.shape, self.segment.shape]
+        for name, part in vars(self).items():
+            if part is not None and name not in ("time_s", "segment"):
+                tail = (3,) if name == "position_lab_mm" else (3, 3)
+                check_tail(name, part, *tail)
+                shapes.append(part.shape[: -len(tail)])
         if self.time_s.dim() != 1 or len(set(shapes)) > 1:
-            got = ", ".join(str(tuple(shape)) for shape in shapes)
-            do = "give all the same frames"
+            got, do = ", ".join(str(tuple(shape)) for shape in shapes), "give all the same frames"
             raise ShapeError(refusal("smooth_motion", expected="N frames in each", got=got, do=do))
 
 
@@ -92,42 +100,34 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     parts = (getattr(measured, name) for name in names)
     t, X, X_cov, R, R_cov = (part.detach().cpu().to(torch.float64).numpy() for part in parts)
     numbers = measured.segment.cpu().numpy()
-    steps = np.diff(t)[(numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)]
-    frame_s = float(np.median(steps)) if len(steps) else 1.0
-    rows = [np.flatnonzero(numbers == n) for n in np.unique(numbers[numbers >= 0])]
-    if any((np.diff(t[k]) <= 0).any() for k in rows):
-        expected, do = "times that increase within a segment", "sort the frames"
-        raise ShapeError(refusal("time_s", expected=expected, got="others", do=do))
+    segments, frame_s = _segments(t, numbers)
     seen_X = np.isfinite(X).all(1) & np.isfinite(X_cov).all((1, 2))
     seen_R = np.isfinite(R).all((1, 2)) & np.isfinite(R_cov).all((1, 2))
-    ratio = 1.0 if known is None else frame_s / known.frame_s
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
     out = {one.name: np.full((len(t), 3, 3) if one.name in square else (len(t), 3), np.nan) for one in fields(Motion)}
     rejected, by_path = np.zeros(len(t), dtype=bool), np.zeros((len(t), 3, 3))
-
-    def put_smooth(
-        kind: type[SegmentTrack], values: Floats, covariance: Floats, seen: Bools, process: ProcessPrior | None
-    ) -> tuple[float, ProcessPrior | None]:
-        turning = kind is RotationTrack
-        band_hz, put = (
-            (settings.orientation_band_hz, _put_turns) if turning else (settings.position_band_hz, _put_places)
-        )
-        instants = [_Instants.of(k, t[k] / frame_s, seen[k]) for k in rows if seen[k].any()]
-        paths = [kind.of(at.time, at.spread(values), at.spread(covariance), at.used) for at in instants]
-        band = None if band_hz is None else band_hz * frame_s
-        estimates, scale, process = estimate(paths, band, settings, process and process.at_rate(ratio))
-        for at, found in zip(instants, estimates, strict=True):
-            put(out, at.rows, at.take(found), frame_s)
-            rejected[at.rows] |= found.rejected[at.frames]
-        return scale, process
-
-    position_scale, place = put_smooth(SegmentTrack, X, X_cov, seen_X, None if known is None else known.place)
+    ratio = 1.0 if known is None else frame_s / known.frame_s
+    prior = [each and each.at_rate(ratio) for each in ((known.place, known.turn) if known else (None, None))]
+    bands = [hz and hz * frame_s for hz in (settings.position_band_hz, settings.orientation_band_hz)]
+    found, position_scale, place = _estimates(SegmentTrack, (X, X_cov, seen_X), segments, bands[0], settings, prior[0])
+    for rows, at in found:
+        _put_places(out, rows, at, frame_s)
+        rejected[rows] |= at.rejected
     if measured.coupling is not None:
-        both = measured.coupling.detach().cpu().to(torch.float64).numpy()
-        told = seen_X & seen_R & ~rejected & np.isfinite(out["position_lab_mm"]).all(1)
-        off = out["position_lab_mm"] - X
-        R, R_cov, by_path = _given_path(told, R, R_cov, both, off, X_cov, out["position_cov_mm2"])
-    orientation_scale, turn = put_smooth(RotationTrack, R, R_cov, seen_R, None if known is None else known.turn)
+        coupling = measured.coupling.detach().cpu().to(torch.float64).numpy()
+        off, path_cov = out["position_lab_mm"] - X, out["position_cov_mm2"]
+        told = np.flatnonzero(seen_X & seen_R & ~rejected & np.isfinite(off).all(1))
+        told = told[mahalanobis2(off[told], X_cov[told]) < ON_PATH**2]
+        R, R_cov = R.copy(), R_cov.copy()
+        R[told], R_cov[told], by_path[told] = _given_path(
+            R[told], R_cov[told], coupling[told], off[told], X_cov[told], path_cov[told]
+        )
+    found, orientation_scale, turn = _estimates(
+        RotationTrack, (R, R_cov, seen_R), segments, bands[1], settings, prior[1]
+    )
+    for rows, at in found:
+        _put_turns(out, rows, at, frame_s)
+        rejected[rows] |= at.rejected
     # The path's error lasts: neighbours share it, and frames between them.
     shared = np.abs(by_path).sum((1, 2)) > 0
     usual = by_path[shared].mean(0) if shared.any() else np.zeros((3, 3))
@@ -144,24 +144,45 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     )
 
 
+def _segments(time_s: Floats, numbers: Rows) -> tuple[list[tuple[Rows, Floats]], float]:
+    """Return rows and times, frames, of each segment, and the usual duration of a frame, s."""
+    steps = np.diff(time_s)[(numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)]
+    frame_s = float(np.median(steps)) if len(steps) else 1.0
+    rows = [np.flatnonzero(numbers == n) for n in np.unique(numbers[numbers >= 0])]
+    if any((np.diff(time_s[k]) <= 0).any() for k in rows):
+        do = "sort the frames"
+        raise ShapeError(refusal("time_s", expected="times that increase within a segment", got="others", do=do))
+    return [(k, time_s[k] / frame_s) for k in rows], frame_s
+
+
+def _estimates(
+    kind: type[SegmentTrack],
+    poses: tuple[Floats, Floats, Bools],
+    segments: Sequence[tuple[Rows, Floats]],
+    band: float | None,
+    settings: SmoothSettings,
+    known: ProcessPrior | None,
+) -> tuple[list[tuple[Rows, Estimate]], float, ProcessPrior | None]:
+    """Return rows and estimate of each segment, the scale of the sigmas and the process, by positions or orientations:
+    values, covariances, and whether measured, (N, ...) each; `band` in cycles per frame.
+    """
+    values, covariance, seen = poses
+    instants = [_Instants.of(rows, time, seen[rows]) for rows, time in segments if seen[rows].any()]
+    paths = [kind.of(at.time, at.spread(values), at.spread(covariance), at.used) for at in instants]
+    estimates, scale, process = estimate(paths, band, settings, known)
+    return [(at.rows, at.take(found)) for at, found in zip(instants, estimates, strict=True)], scale, process
+
+
 def _given_path(
-    rows: Bools, R: Floats, R_cov: Floats, coupling: Floats, off: Floats, X_cov: Floats, path_cov: Floats
+    R: Floats, R_cov: Floats, coupling: Floats, off: Floats, X_cov: Floats, path_cov: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return orientations, covariances given the positions of the path, and those that the path's own error adds.
-    `off` (N, 3), mm: path less measured position. Paint that shifts in the picture is a turn or a move of the sphere;
-    the limb alone tells them apart, and the path knows the move better than the limb of one frame. Frames outside
-    `rows`, or whose position contradicts the path, keep their own.
+    `off` (n, 3), mm: path less measured position, which agree. Paint that shifts in the picture is a turn or a move of
+    the sphere; the limb alone tells them apart, and the path knows the move better than the limb of one frame.
     """
-    R, R_cov, added = R.copy(), R_cov.copy(), np.zeros_like(R_cov)
-    inverse = np.linalg.inv(np.where(rows[:, None, None], X_cov, np.eye(3)))
-    away = np.einsum("ni,nij,nj->n", off, inverse, off)
-    told = np.flatnonzero(rows & (away < ON_PATH**2))
-    both = coupling[told]
-    gain = both @ inverse[told]
-    R[told] = rotation_of((gain @ off[told][..., None])[..., 0]) @ R[told]
-    R_cov[told] -= gain @ both.mT
-    added[told] = gain @ path_cov[told] @ gain.mT
-    return R, R_cov, added
+    gain = coupling @ np.linalg.inv(X_cov)
+    turned = rotation_of((gain @ off[..., None])[..., 0]) @ R
+    return turned, R_cov - gain @ coupling.mT, gain @ path_cov @ gain.mT
 
 
 def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: float) -> float:
@@ -188,13 +209,13 @@ def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: f
 class _Instants:
     """Rows of one segment, and its instants: its frames, and more inside long steps."""
 
-    rows: NDArray[np.int64]  # (n,), of the track
-    frames: NDArray[np.int64]  # (n,), which of the instants are frames
+    rows: Rows  # (n,), of the track
+    frames: Rows  # (n,), which of the instants are frames
     time: Floats  # (M,), frames
     used: Bools  # (M,), instants with a measurement
 
     @classmethod
-    def of(cls, rows: NDArray[np.int64], time: Floats, seen: Bools) -> Self:
+    def of(cls, rows: Rows, time: Floats, seen: Bools) -> Self:
         """Return the instants of a segment's frames, times (n,) in frames."""
         more = (np.ceil(np.diff(time) / LONGEST_STEP) - 1).clip(0, MOST_BETWEEN).astype(np.int64)
         frames = np.arange(len(time)) + np.concatenate([[0], np.cumsum(more)])
@@ -219,7 +240,7 @@ def _sigma(covariance: Floats) -> Floats:
         return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
-def _put_places(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, frame_s: float) -> None:
+def _put_places(out: dict[str, Floats], rows: Rows, at: Estimate, frame_s: float) -> None:
     """Write the positions of one segment; mm per frame become m/s."""
     speed, change = M_PER_MM / frame_s, M_PER_MM / frame_s**2
     out["position_lab_mm"][rows] = at.value
@@ -230,7 +251,7 @@ def _put_places(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, f
     out["acceleration_sigma_m_s2"][rows] = _sigma(at.covariance[:, CHANGE, CHANGE]) * change
 
 
-def _put_turns(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, frame_s: float) -> None:
+def _put_turns(out: dict[str, Floats], rows: Rows, at: Estimate, frame_s: float) -> None:
     """Write the orientations of one segment; rad per frame become rad/s, in the lab and in the body."""
     C = at.covariance.copy()
     lost = _sigma(C[:, VALUE, VALUE]).max(1) > LOST_RAD
@@ -240,8 +261,7 @@ def _put_turns(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, fr
     C[lost] = np.nan
     out["R_lab_body"][rows] = R
     out["orientation_cov_rad2"][rows] = C[:, VALUE, VALUE]
-    kinds = (("omega", "rad_s", 1, SPEED, rate), ("alpha", "rad_s2", 2, CHANGE, change))
-    for name, unit, power, part, values in kinds:
+    for name, unit, power, part, values in (("omega", "rad_s", 1, SPEED, rate), ("alpha", "rad_s2", 2, CHANGE, change)):
         scale = 1.0 / frame_s**power
         # in the body an error delta of the orientation turns the vector too: R_true' x = R' (x + x cross delta)
         lever = np.cross(values[:, None, :], np.eye(3)).mT
@@ -253,16 +273,8 @@ def _put_turns(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, fr
         out[f"{name}_body_sigma_{unit}"][rows] = _sigma(R.mT @ whole @ R) * scale
 
 
-RATE_UNITS = {
-    "velocity": "m_s",
-    "acceleration": "m_s2",
-    "omega_lab": "rad_s",
-    "omega_body": "rad_s",
-    "alpha_lab": "rad_s2",
-    "alpha_body": "rad_s2",
-}
-
-
+RATE_UNITS = {"velocity": "m_s", "acceleration": "m_s2"}
+RATE_UNITS |= {"omega_lab": "rad_s", "omega_body": "rad_s", "alpha_lab": "rad_s2", "alpha_body": "rad_s2"}
 POSES = {
     "position_smooth": "position_lab_mm",
     "position_smooth_cov": "position_cov_mm2",

@@ -51,9 +51,13 @@ def segment_sums(values: Floats, segment: Rows, segments: int) -> Floats:
     return out
 
 
+def segment_counts(place: Rows, bins: int, segment: Rows, segments: int) -> Rows:
+    """Return how many rows (M,) of each segment are in each of some bins, (S, bins)."""
+    return np.bincount(segment * bins + place, minlength=segments * bins).reshape(segments, bins)
+
+
 def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | None = None) -> Interval:
     """Return a statistic of the total of `sums` (S, ...) over segments, with BCa intervals from resampled segments.
-
     `statistic` maps totals (..., *sums.shape[1:]) to values with the same leading shape; values are NaN where it is.
     The intervals of a single segment are NaN; of none, the values too.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
@@ -62,9 +66,9 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
     flat = sums.reshape(len(sums), math.prod(sums.shape[1:]))
     total = flat.sum(0)
 
+    @np.errstate(all="ignore")
     def at(totals: Floats) -> Floats:
-        with np.errstate(all="ignore"):
-            return np.asarray(statistic(totals.reshape(*totals.shape[:-1], *sums.shape[1:])), np.float64)
+        return np.asarray(statistic(totals.reshape(*totals.shape[:-1], *sums.shape[1:])), np.float64)
 
     value = at(total)
     if len(sums) < FEWEST:
@@ -74,8 +78,7 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
     drawn = _by_blocks(lambda rows: at(_weights(len(flat), rows, settings) @ flat), settings.resamples, some)
     some = max(1, AT_ONCE // (len(flat) + flat.shape[1]))
     without = _by_blocks(lambda rows: at(total - flat[rows]), len(flat), some)
-    below = ((drawn < value).mean(0) + (drawn <= value).mean(0)) / 2
-    rest = 0.5 / len(drawn)
+    below, rest = ((drawn < value).mean(0) + (drawn <= value).mean(0)) / 2, 0.5 / len(drawn)
     bias = ndtri(np.clip(below, rest, 1 - rest))
     pull = without.mean(0) - without
     with np.errstate(all="ignore"):
@@ -114,7 +117,6 @@ def studentized(
     sums: Floats, statistic: Statistic, positive: NDArray[np.bool_], settings: BootstrapSettings | None = None
 ) -> Interval:
     """Return a statistic of the total of `sums` (S, G, K) over segments, with studentized bootstrap intervals.
-
     For statistics skewed by a few large events, such as the flatness. `statistic` maps totals (..., G, K) to values
     (..., G, Q) and gives the same for twice the totals; values are NaN where it is. `positive` (Q,) marks values that
     are positive by definition. Fewer than 20 segments: as `bootstrap`.
@@ -124,10 +126,10 @@ def studentized(
     if len(sums) < ENOUGH:
         return bootstrap(sums, statistic, settings)
 
+    @np.errstate(all="ignore")
     def at(totals: Floats) -> Floats:
-        with np.errstate(all="ignore"):
-            values = np.asarray(statistic(totals), np.float64)
-            return np.where(positive, np.log(values), values)
+        values = np.asarray(statistic(totals), np.float64)
+        return np.where(positive, np.log(values), values)
 
     value = at(sums.sum(0))
     error = _error(at, sums.sum(0), np.einsum("sgk,sgl->gkl", sums, sums))
@@ -142,15 +144,14 @@ def studentized(
 
     drawn, drawn_error = np.moveaxis(_by_blocks(resampled, settings.resamples, RESAMPLES_AT_ONCE), 1, 0)
     with np.errstate(all="ignore"):
-        t = (drawn - value) / drawn_error
-    t = np.where(drawn_error > 0, t, 0.0)
+        t = np.where(drawn_error > 0, (drawn - value) / drawn_error, 0.0)
     known = np.isfinite(drawn).all(0) & np.isfinite(value)
     tail = (1 - settings.level) / 2
     late, early = (np.quantile(np.where(known, t, 0.0), share, axis=0) for share in (1 - tail, tail))
 
+    @np.errstate(over="ignore")
     def back(x: Floats) -> Floats:
-        with np.errstate(over="ignore"):
-            return np.where(known, np.where(positive, np.exp(x), x), np.nan)
+        return np.where(known, np.where(positive, np.exp(x), x), np.nan)
 
     plain = np.where(positive, np.exp(value), value)
     spread = np.where(known, np.where(positive, plain * error, error), np.nan)
@@ -162,14 +163,13 @@ def _error(at: Statistic, totals: Floats, squares: Floats) -> Floats:
     squares = np.nan_to_num(squares)  # unknown sums of a group enter only statistics that are NaN
     # Twice the totals give the same value: the gradient is orthogonal to them, contributions of segments have mean 0.
     slopes = []
-    for k in range(totals.shape[-1]):
-        step = STEP * np.sqrt(squares[..., k, k])
-        step = np.where(step > 0, step, 1.0)  # no segment contributes: the slope is multiplied by 0 below
-        moved = np.zeros_like(totals)
-        moved[..., k] = step
-        with np.errstate(all="ignore"):
-            slopes.append((at(totals + moved) - at(totals - moved)) / (2 * step[..., None]))
-    gradient = np.stack(slopes, axis=-1)  # (..., G, Q, K)
     with np.errstate(all="ignore"):
+        for k in range(totals.shape[-1]):
+            step = STEP * np.sqrt(squares[..., k, k])
+            step = np.where(step > 0, step, 1.0)  # no segment contributes: the slope is multiplied by 0 below
+            moved = np.zeros_like(totals)
+            moved[..., k] = step
+            slopes.append((at(totals + moved) - at(totals - moved)) / (2 * step[..., None]))
+        gradient = np.stack(slopes, axis=-1)  # (..., G, Q, K)
         variance = np.einsum("...gqk,...gkl,...gql->...gq", gradient, squares, gradient)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -29,7 +29,6 @@ def camera_distances(
     tracks: Trajectory | Sequence[Trajectory], uncorrected: Sequence[Mapping[str, Floats] | None] = (), bins: int = 60
 ) -> list[CameraDistance]:
     """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
-
     `uncorrected` holds for each track the result of `without_perspective`; None or missing: unknown.
     Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
@@ -50,19 +49,14 @@ def _pooled(pair: tuple[str, str], apart: Floats, rough_parts: list[Floats] | No
     rough = None if rough_parts is None else np.concatenate(rough_parts)
     top = max([float(x.max()) for x in (apart, rough) if x is not None and len(x)], default=np.pi)
     edges = np.linspace(0.0, max(top, 1e-9), bins + 1)
+    own, other = _pdf(apart, edges), None if rough is None else _pdf(rough, edges)
     return CameraDistance(
-        cameras=pair,
-        distance_rad=apart,
-        edges_rad=edges,
-        pdf=_pdf(apart, edges),
-        uncorrected_rad=rough,
-        uncorrected_pdf=None if rough is None else _pdf(rough, edges),
+        cameras=pair, distance_rad=apart, edges_rad=edges, pdf=own, uncorrected_rad=rough, uncorrected_pdf=other
     )
 
 
 def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
     """Return R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
-
     These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """

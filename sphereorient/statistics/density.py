@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erfcx, log_ndtr, logsumexp
 
-from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_counts, segment_sums
 from sphereorient.statistics.moments import noise_let_through
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
@@ -18,12 +18,11 @@ FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
 TINY = 1e-300
 HERMITE = 24  # nodes for the noise
-REACH = 10.0  # of the PDF to either side, standard deviations
+REACH, BINS = 10.0, 61  # of the PDF to either side, standard deviations; odd: one bin is about 0
 
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
     """Return the density of unit variance that the paper fits to accelerations, at x (...), in standard deviations.
-
     p(x) = exp(3 a^2 / 2) / (4 sqrt 3) erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)); a broadcasts against x.
     Source: Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245; the paper, section IV.
     """
@@ -73,7 +72,6 @@ def fit_stretched(
     x: Floats, segment: Rows, segments: int, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> StretchedFit:
     """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
-
     The fit leaves out `noise_share` of the variance (`moments.noise_let_through`); such noise would fill the peak of
     the density and lower a. `segment` (M,), 0 .. segments - 1, increases.
     """
@@ -83,7 +81,7 @@ def fit_stretched(
     bins = np.clip(((logs - edges[0]) / (edges[1] - edges[0])).astype(np.int64), 0, FINE_BINS - 1)
     middle = (edges[1:] + edges[:-1]) / 2
     used = np.flatnonzero(np.bincount(bins, minlength=FINE_BINS))
-    counts = np.bincount(segment * FINE_BINS + bins, minlength=segments * FINE_BINS).reshape(segments, FINE_BINS)
+    counts = segment_counts(bins, FINE_BINS, segment, segments)
     squares = segment_sums(np.stack([normal, normal**2], axis=1), segment, segments)
     sums = np.concatenate([counts[:, used].astype(np.float64), squares], axis=1)
     found = bootstrap(sums, _Likelihood(middle[used], noise_share).fit, settings)
@@ -147,20 +145,14 @@ def density(ensemble: Ensemble, quantity: str, component: int, *, settings: Boot
 
 
 def density_of(
-    x: Floats,
-    segment: Rows,
-    segments: int,
-    *,
-    bins: int = 61,
-    settings: BootstrapSettings | None = None,
-    noise_share: float = 0.0,
+    x: Floats, segment: Rows, segments: int, *, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> Density:
     """Return the PDF of values (M,) sorted by segment, over 10 standard deviations to either side; as `density`."""
-    normal = (x - x.mean()) / x.std()
+    normal, bins = (x - x.mean()) / x.std(), BINS
     edges = np.linspace(-REACH, REACH, bins + 1)
     place = np.searchsorted(edges, normal, side="right") - 1
     inside = (place >= 0) & (place < bins)
-    flat = np.bincount(segment[inside] * bins + place[inside], minlength=segments * bins).reshape(segments, bins)
+    flat = segment_counts(place[inside], bins, segment[inside], segments)
     sums = np.concatenate([flat, np.bincount(segment, minlength=segments)[:, None]], axis=1).astype(np.float64)
     width = edges[1] - edges[0]
     pdf = bootstrap(sums, lambda totals: totals[..., :-1] / (totals[..., -1:] * width), settings)

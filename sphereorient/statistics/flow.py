@@ -61,7 +61,6 @@ class Comparison:
 
 def comparisons(table: Mapping[str, Moments], around: Surroundings) -> list[Comparison]:
     """Return the dimensionless numbers that the surroundings allow, from the moments by quantity.
-
     Rms values are of one component; the sphere's are corrected for noise. Needs a diameter and a moving centre.
     Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
     """

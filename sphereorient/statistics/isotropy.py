@@ -8,7 +8,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.motion import rotvec_between
-from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_counts, segment_sums
 from sphereorient.statistics.lags import Pairs
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
@@ -17,6 +17,7 @@ ALIKE = 0.3  # largest residual of a row against the rotations, relative to the 
 DRAWS = 20_000  # of the null distribution; its 5 % point is then known to 0.2 %
 SEED = 2011
 AT_ONCE = 50_000  # rotations of a block
+BINS = 24  # of an Euler angle
 # Orthonormal symmetric traceless matrices; R acts on them as the five-dimensional representation
 _TENSORS = np.array(
     [
@@ -41,18 +42,15 @@ class Isotropy:
 
 def isotropy(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Isotropy:
     """Test whether the covariance of a quantity (a name in UNITS) is the same in all directions of its frame.
-
     Samples are whole segments, since a track is correlated. With six segments or fewer the p-value is NaN.
     Source: Hotelling 1931; the paper, Table I, with docs/errata.md E6.
     """
     x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
-    xy, xz, yz = x[:, 0] * x[:, 1], x[:, 0] * x[:, 2], x[:, 1] * x[:, 2]
-    products = np.column_stack([x * x, xy, xz, yz])
+    products = np.column_stack([x * x, x[:, [0, 0, 1]] * x[:, [1, 2, 2]]])
     sums = segment_sums(products, ensemble.segment, ensemble.segments)
     found = bootstrap(sums, _variance_shares, settings)
     xx, yy, zz = sums[:, :3].T
-    traceless = np.column_stack([xx - yy, (2 * zz - xx - yy) / np.sqrt(3), 2 * sums[:, 3:]])
-    p_value = zero_mean_p_value(traceless)
+    p_value = zero_mean_p_value(np.column_stack([xx - yy, (2 * zz - xx - yy) / np.sqrt(3), 2 * sums[:, 3:]]))
     return Isotropy(quantity=quantity, variance_share=found.part(0), cross_correlation=found.part(1), p_value=p_value)
 
 
@@ -128,7 +126,6 @@ class Uniformity:
 
 def uniformity(R_lab_body: Floats, segment: Rows | None = None) -> Uniformity:
     """Test whether rotations (M, 3, 3) are uniform on SO(3), by the first and second moments of the axes' directions.
-
     Statistic: 3 n |<R>|^2 + 5 n |<D>|^2, D of `five_dimensional`. The null distribution rotates whole segments, (M,),
     increasing; None: all rotations are independent. Twenty segments are few; with two the test has no power.
     Source: Rayleigh's and Gine's tests on SO(3): Mardia and Jupp 2000, Directional Statistics, 13.2.
@@ -174,21 +171,17 @@ class EulerDensity:
     uniform: Floats  # (B,), mean density of uniform rotations in each bin
 
 
-def euler_densities(
-    ensemble: Ensemble, bins: int = 24, settings: BootstrapSettings | None = None
-) -> list[EulerDensity]:
+def euler_densities(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> list[EulerDensity]:
     """Return PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
     theta = so3.to_tait_bryan(torch.from_numpy(ensemble.R_lab_body)).numpy()
     out = []
     for i, name in enumerate(("theta_x", "theta_y", "theta_z")):
         half = np.pi / 2 if i == 1 else np.pi
-        edges = np.linspace(-half, half, bins + 1)
+        edges = np.linspace(-half, half, BINS + 1)
         width = edges[1] - edges[0]
-        place = np.clip(((theta[:, i] + half) / width).astype(np.int64), 0, bins - 1)
-        each = np.zeros((len(theta), bins))
-        each[np.arange(len(theta)), place] = 1.0
-        sums = segment_sums(each, ensemble.segment, ensemble.segments)
+        place = np.clip(((theta[:, i] + half) / width).astype(np.int64), 0, BINS - 1)
+        sums = segment_counts(place, BINS, ensemble.segment, ensemble.segments).astype(np.float64)
         share = bootstrap(sums, lambda totals: np.asarray(totals / totals.sum(-1, keepdims=True)), settings)
-        law = np.diff(np.sin(edges)) / 2 / width if i == 1 else np.full(bins, 1 / (2 * np.pi))
+        law = np.diff(np.sin(edges)) / 2 / width if i == 1 else np.full(BINS, 1 / (2 * np.pi))
         out.append(EulerDensity(name=name, edges_rad=edges, pdf=share.scaled(1 / width), uniform=law))
     return out

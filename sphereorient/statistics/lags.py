@@ -16,16 +16,22 @@ EVERY_LAG, MORE_LAGS = 40, 40  # the first lags, and how many sparser ones follo
 FEWEST_SEGMENTS = 10  # of a lag; with fewer its error bar means little
 
 
+def places(frame: Rows, segment: Rows) -> Rows:
+    """Return the places of rows (M,) on one regular grid: `frame` of its segment, an empty place after each segment.
+    Frames increase within a segment; segments 0 .. S - 1 increase.
+    """
+    lengths = frame[np.flatnonzero(np.append(np.diff(segment), 1))] + 2
+    return np.asarray(frame + (np.cumsum(lengths) - lengths)[segment], np.int64)
+
+
 class Pairs:
     """Pairs of samples of one segment at a given lag, on a regular grid with empty places for lost frames."""
 
     def __init__(self, ensemble: Ensemble) -> None:
-        frames = np.maximum.reduceat(ensemble.frame, ensemble.starts[:-1]) + 1
-        self.longest = int(frames.max()) - 1  # lag, frames
-        begin = np.concatenate([[0], np.cumsum(frames)[:-1]])
+        self.longest = int(ensemble.frame.max())  # lag, frames
         self._segment = ensemble.segment
-        self._place = begin[ensemble.segment] + ensemble.frame
-        self._row = np.full(int(frames.sum()) + self.longest, -1, dtype=np.int64)
+        self._place = places(ensemble.frame, ensemble.segment)
+        self._row = np.full(int(self._place[-1]) + 1 + self.longest, -1, dtype=np.int64)
         self._row[self._place] = np.arange(len(self._place))
 
     def at(self, lag: int) -> tuple[Rows, Rows]:
@@ -53,7 +59,6 @@ def correlation(
     ensemble: Ensemble, quantity: str, longest_s: float | None = None, settings: BootstrapSettings | None = None
 ) -> Correlation:
     """Return the autocorrelation of a quantity (a name in UNITS) about its ensemble mean, and its integral times.
-
     A value is the mean product of pairs over their mean square: unbiased by the lengths of segments. Pairs over a gap
     count at their true lag. `longest_s` None: the longest lag at which a fiftieth of the samples has a partner.
     Source: textbook; the paper's T_L is the integral time of `velocity`, up to the first zero.
@@ -67,16 +72,12 @@ def correlation(
         products = np.stack([a * b, (a * a + b * b) / 2], axis=-1)
         sums.append(segment_sums(products, ensemble.segment[first], ensemble.segments))
         counts.append(len(first))
-    lag_s = np.asarray(lags * ensemble.step_s, np.float64)
+    lag_s, number = np.asarray(lags * ensemble.step_s, np.float64), np.array(counts)
     found = bootstrap(np.stack(sums, axis=1), lambda totals: _curve_and_times(totals, lag_s), settings)
-    curve = found.part(slice(0, -1))
+    curve, times = found.part(slice(0, -1)), found.part(-1)
+    zero = np.asarray((curve.value <= 0).any(0))
     return Correlation(
-        quantity=quantity,
-        lag_s=lag_s,
-        value=curve,
-        pairs=np.array(counts),
-        integral_time_s=found.part(-1),
-        reached_zero=np.asarray((curve.value <= 0).any(0)),
+        quantity=quantity, lag_s=lag_s, value=curve, pairs=number, integral_time_s=times, reached_zero=zero
     )
 
 
@@ -129,7 +130,6 @@ def increments(
     settings: BootstrapSettings | None = None,
 ) -> Increments:
     """Return rms and flatness of increments of a quantity (a name in UNITS), for lags that ten segments or more reach.
-
     `lags_s`, s, are rounded to frames; None: twelve, geometric, from one frame to `integral_time_s` (None: half the
     median segment). The flatness goes from the derivative's to 3 + (F - 3) / 2 at long lags.
     Source: the paper, section IV, with docs/errata.md E7.

@@ -84,7 +84,6 @@ def without_noise(
     var: Floats, fourth: Floats, s2: Floats, s4: Floats, mixed: Floats, sign: float
 ) -> tuple[Floats, Floats]:
     """Return variance and fourth moment (...) of the motion from the measured ones.
-
     `s2`, `s4` and `mixed` (...) are the means of sigma^2, sigma^4 and (x - mean)^2 sigma^2. Sign 1 subtracts
     independent normal noise; -1 adds the motion that a smoother removed, taken to be as intermittent as the rest.
     """

@@ -9,6 +9,7 @@ import numpy as np
 from sphereorient.errors import TrackError, refusal
 from sphereorient.motion import gaussian_kernel, rotvec_between
 from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums, studentized
+from sphereorient.statistics.lags import places
 from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
@@ -53,7 +54,6 @@ def multi_lag(
     settings: BootstrapSettings | None = None,
 ) -> MultiLag:
     """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
-
     The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
     fit over four lags n or more separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
 
@@ -143,7 +143,6 @@ def width_curve(
     settings: BootstrapSettings | None = None,
 ) -> WidthCurve:
     """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
-
     Narrow kernels let noise through, wide ones lose motion; a plateau between them is the rms. All widths use the
     frames that the widest one reaches; NaN where all segments are shorter. White noise and regular times are assumed.
     Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
@@ -204,9 +203,8 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
     _, segment = np.unique(track.segment[rows], return_inverse=True)
     begin = np.searchsorted(segment, np.arange(segment.max() + 1))
     frame = np.rint((track.time[rows] - track.time[rows][begin][segment]) / _step(track)).astype(np.int64)
-    lengths = np.maximum.reduceat(frame, begin) + 2
-    place = frame + np.concatenate([[0], np.cumsum(lengths)])[:-1][segment]
-    number = np.full(int(lengths.sum()), -1, dtype=np.int64)
+    place = places(frame, segment)
+    number = np.full(int(place[-1]) + 2, -1, dtype=np.int64)
     number[place] = segment
     return rows, place, number
 

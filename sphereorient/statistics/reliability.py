@@ -27,7 +27,6 @@ class Reliability:
 
 def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
     """Compare probabilities (N,), 0 .. 1 or NaN (left out), with outcomes (N,), bool, in at most `bins` bins.
-
     Bins have equal counts, but equal probabilities stay in one bin.
 
     Raises:
@@ -51,26 +50,15 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     inner = np.searchsorted(said, wanted, side="left")
     edges = np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
     count = np.diff(edges)
-    mean, spread = _means(said, edges), _means(said * (1 - said), edges)
-    share = _means(came.astype(np.float64), edges)
+    columns = np.stack([said, said * (1 - said), came.astype(np.float64)])
+    sums = np.add.reduceat(columns, edges[:-1], axis=1) if len(edges) > 1 else np.zeros((3, 0))
+    mean, spread, share = sums / count
     low, high = wilson(share, count)
-    weight = count / max(len(said), 1)
+    weight = count / len(said) if len(said) else np.full(1, np.nan)
     # The mean absolute deviation of a normal variable is sqrt(2 / pi) sigma.
-    by_chance = float((weight * np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)).sum())
-    return Reliability(
-        probability=mean,
-        share=share,
-        low=low,
-        high=high,
-        count=count,
-        error=float((weight * np.abs(share - mean)).sum()) if len(said) else math.nan,
-        chance=by_chance if len(said) else math.nan,
-    )
-
-
-def _means(values: Floats, edges: Rows) -> Floats:
-    sums = np.add.reduceat(values, edges[:-1]) if len(edges) > 1 else np.zeros(0)
-    return np.asarray(sums / np.diff(edges), np.float64)
+    chance = float((weight * np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)).sum()) if len(said) else math.nan
+    error = float((weight * np.abs(share - mean)).sum()) if len(said) else math.nan
+    return Reliability(probability=mean, share=share, low=low, high=high, count=count, error=error, chance=chance)
 
 
 def wilson(share: Floats, count: Rows) -> tuple[Floats, Floats]:

@@ -66,7 +66,6 @@ def ensemble_of(
     fewest: int = FEWEST,
 ) -> Ensemble:
     """Collect the usable segments of one or many tracks; `name` is for messages.
-
     A frame is usable if all six quantities and the smooth pose are finite, and it was not extrapolated. A segment
     counts if it has enough usable frames; frames with larger errors at its ends are then left out.
 

@@ -11,9 +11,7 @@ class SegmentSettings(BaseModel, frozen=True, extra="forbid"):
         0.25, ge=0, description="segments shorter than this many integral times are left out"
     )
     integral_time_s: float | None = Field(
-        None,
-        gt=0,
-        description="integral time, s; null: the flow's in experiment.yaml, else that of the velocity on these tracks",
+        None, gt=0, description="integral time, s; null: the flow's in experiment.yaml, else that of the velocity"
     )
     max_duration_s: float | None = Field(
         None,

@@ -68,7 +68,6 @@ def summarise(
     name: str = "tracks",
 ) -> Summary:
     """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
-
     A single segment gives only the table, without intervals; without a segment that counts its numbers are NaN.
 
     Raises:

@@ -99,8 +99,7 @@ def test_each_sigma_is_the_scatter_that_white_noise_causes(rng: torch.Generator)
         segment.expand(draws, frames),
         RATE,
         MotionSettings(),
-        position_sigma_mm=position_sigma.expand(draws, frames, 3),
-        orientation_sigma_rad=orientation_sigma.expand(draws, frames, 3),
+        (position_sigma.expand(draws, frames, 3), orientation_sigma.expand(draws, frames, 3)),
     )
     for quantity, unit in (
         ("velocity", "m_s"),
@@ -120,7 +119,7 @@ def test_a_sigma_is_nan_where_a_sigma_that_goes_into_it_is_unknown() -> None:
     position_mm, R, segment = steady(60)
     sigma = torch.full((60,), 0.1, dtype=torch.float64)
     sigma[30] = torch.nan
-    motion = measure_motion(position_mm, R, segment, RATE, MotionSettings(), position_sigma_mm=sigma)
+    motion = measure_motion(position_mm, R, segment, RATE, MotionSettings(), (sigma, None))
     assert motion.velocity_m_s[25:35].isfinite().all()
     assert motion.velocity_sigma_m_s[25].isnan().all()
     assert motion.velocity_sigma_m_s[15].isfinite().all()
@@ -134,9 +133,7 @@ def test_smooth_poses_are_the_means_that_their_kernels_make_and_bridge_a_lost_fr
     position_mm, R = position_mm + 0.1 * noise[0], so3.exp(0.02 * noise[1]) @ R
     position_mm[18], R[18] = torch.nan, torch.nan
     sigma = torch.tensor([0.1, 0.2, 0.3]).double().expand(frames, 3)
-    motion = measure_motion(
-        position_mm, R, segment, RATE, settings, position_sigma_mm=sigma, orientation_sigma_rad=0.1 * sigma
-    )
+    motion = measure_motion(position_mm, R, segment, RATE, settings, (sigma, 0.1 * sigma))
     for k in (15, 18, 20):
         j = torch.arange(-11, 12)
         used = position_mm[k + j].isfinite().all(-1) & position_mm[k - j].isfinite().all(-1)
@@ -196,11 +193,9 @@ def test_a_batch_is_the_stack_of_its_singles(batch: tuple[int, ...], dtype: torc
     position_mm, R, segment = steady(30, dtype)
     many = (position_mm.expand(*batch, 30, 3), R.expand(*batch, 30, 3, 3), segment.expand(*batch, 30))
     sigma = torch.full((*batch, 30), 0.01, dtype=dtype)
-    got = measure_motion(*many, RATE, MotionSettings(), position_sigma_mm=sigma, orientation_sigma_rad=sigma)
+    got = measure_motion(*many, RATE, MotionSettings(), (sigma, sigma))
     one_sigma = torch.full((30,), 0.01, dtype=dtype)
-    one = measure_motion(
-        position_mm, R, segment, RATE, MotionSettings(), position_sigma_mm=one_sigma, orientation_sigma_rad=one_sigma
-    )
+    one = measure_motion(position_mm, R, segment, RATE, MotionSettings(), (one_sigma, one_sigma))
     for entry in fields(Motion):
         values, single = getattr(got, entry.name), getattr(one, entry.name)
         assert values.dtype == dtype

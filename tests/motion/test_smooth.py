@@ -13,11 +13,20 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.motion import MeasuredPoses, Smoothed, SmoothSettings, lasting_share, off_middle, smooth_motion
+from sphereorient.motion import (
+    RATE_UNITS,
+    MeasuredPoses,
+    Smoothed,
+    SmoothSettings,
+    lasting_share,
+    off_middle,
+    smooth_motion,
+)
 from sphereorient.synth.motion import Motion6D, random_motion
 
 RATE = 600.0
 WHITE = SmoothSettings(slow_share=0.0)
+BANDS = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
 POSITION_MM, ORIENTATION_RAD = 0.01, math.radians(0.036)
 
 
@@ -47,17 +56,9 @@ def smoothed(
     frames = len(truth.time_s)
     unit = torch.eye(3, dtype=torch.float64).expand(frames, 3, 3)
     segment = torch.zeros(frames, dtype=torch.long) if segment is None else segment
-    covariances = POSITION_MM**2 * unit, ORIENTATION_RAD**2 * unit
-    poses = MeasuredPoses(
-        time_s=truth.time_s,
-        position_lab_mm=position,
-        position_cov_mm2=covariances[0],
-        R_lab_body=R,
-        orientation_cov_rad2=covariances[1],
-        segment=segment,
-        coupling=coupling,
-    )
-    return smooth_motion(poses, settings)
+    covariances = {"position_cov_mm2": POSITION_MM**2 * unit, "orientation_cov_rad2": ORIENTATION_RAD**2 * unit}
+    given = {"time_s": truth.time_s, "position_lab_mm": position, "R_lab_body": R, "segment": segment}
+    return smooth_motion(MeasuredPoses(**given, **covariances, coupling=coupling), settings)
 
 
 def rel_rms(got: Tensor, true: Tensor) -> float:
@@ -75,19 +76,13 @@ def turn_off(truth: Motion6D, result: Smoothed) -> Tensor:
 
 def errors(truth: Motion6D, result: Smoothed) -> dict[str, tuple[Tensor, Tensor]]:
     """Return every derivative's error and sigma."""
-    to_body = truth.R_lab_body.mT
-    body = {
-        "omega": (to_body @ truth.omega_lab_rad_s[..., None])[..., 0],
-        "alpha": (to_body @ truth.alpha_lab_rad_s2[..., None])[..., 0],
-    }
-    return {
-        "velocity": (result.velocity_m_s - truth.velocity_m_s, result.velocity_sigma_m_s),
-        "acceleration": (result.acceleration_m_s2 - truth.acceleration_m_s2, result.acceleration_sigma_m_s2),
-        "omega_lab": (result.omega_lab_rad_s - truth.omega_lab_rad_s, result.omega_lab_sigma_rad_s),
-        "omega_body": (result.omega_body_rad_s - body["omega"], result.omega_body_sigma_rad_s),
-        "alpha_lab": (result.alpha_lab_rad_s2 - truth.alpha_lab_rad_s2, result.alpha_lab_sigma_rad_s2),
-        "alpha_body": (result.alpha_body_rad_s2 - body["alpha"], result.alpha_body_sigma_rad_s2),
-    }
+    found = {}
+    for name, unit in RATE_UNITS.items():
+        true = getattr(truth, f"{name.replace('body', 'lab')}_{unit}")
+        if name.endswith("body"):
+            true = (truth.R_lab_body.mT @ true[..., None])[..., 0]
+        found[name] = getattr(result, f"{name}_{unit}") - true, getattr(result, f"{name}_sigma_{unit}")
+    return found
 
 
 # oracle: planted truth
@@ -103,15 +98,9 @@ def test_the_motion_of_the_experiment_is_recovered_as_a_plain_gaussian_process_d
 ) -> None:
     with h5py.File(SHARED / "experiment" / "truth.h5") as file:
         read = {name: torch.from_numpy(file[name][()]) for name in file if isinstance(file[name], h5py.Dataset)}
-    truth = Motion6D(
-        time_s=read["time"],
-        position_lab_mm=read["position"],
-        velocity_m_s=read["velocity"],
-        acceleration_m_s2=read["acceleration"],
-        R_lab_body=read["orientation"],
-        omega_lab_rad_s=read["omega_lab"],
-        alpha_lab_rad_s2=read["alpha_lab"],
-    )
+    names = {"time": "time_s", "position": "position_lab_mm", "orientation": "R_lab_body"}
+    names |= {name: f"{name}_{unit}" for name, unit in RATE_UNITS.items() if not name.endswith("body")}
+    truth = Motion6D(**{own: read[name] for name, own in names.items()})
     position, _ = measured(truth, rng)
     noise = math.radians(noise_deg) * torch.randn(len(position), 3, generator=rng, dtype=torch.float64)
     # the claimed sigma is that of 0.036 degrees throughout: the factor on it is learnt
@@ -284,9 +273,8 @@ def test_a_turned_lab_turns_the_result(rng: torch.Generator) -> None:
     truth = planted(60.0, clock(80))
     position, R = measured(truth, rng)
     turn = so3.exp(torch.tensor([1.0, -0.5, 2.0], dtype=torch.float64))
-    settings = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
-    one = smoothed(truth, position, R, settings=settings)
-    other = smoothed(truth, position @ turn.mT, turn @ R, settings=settings)
+    one = smoothed(truth, position, R, settings=BANDS)
+    other = smoothed(truth, position @ turn.mT, turn @ R, settings=BANDS)
     assert_close(other.velocity_m_s, one.velocity_m_s @ turn.mT, atol=1e-9)
     assert_close(other.R_lab_body, turn @ one.R_lab_body, atol=1e-9)
     assert_close(other.alpha_lab_rad_s2, one.alpha_lab_rad_s2 @ turn.mT, atol=1e-3)  # of some thousands
@@ -297,9 +285,8 @@ def test_a_turned_lab_turns_the_result(rng: torch.Generator) -> None:
 def test_time_backwards_turns_rates_around(rng: torch.Generator) -> None:
     truth = planted(time_s=clock(80))
     position, R = measured(truth, rng)
-    settings = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
-    one = smoothed(truth, position, R, settings=settings)
-    other = smoothed(truth, position.flip(0), R.flip(0), settings=settings)
+    one = smoothed(truth, position, R, settings=BANDS)
+    other = smoothed(truth, position.flip(0), R.flip(0), settings=BANDS)
     assert_close(other.velocity_m_s.flip(0), -one.velocity_m_s, atol=1e-6)
     assert_close(other.omega_lab_rad_s.flip(0), -one.omega_lab_rad_s, atol=2e-3)
     assert_close(other.acceleration_m_s2.flip(0), one.acceleration_m_s2, atol=1e-4)
@@ -311,11 +298,10 @@ def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
     position, R = measured(truth, rng)
     segment = torch.zeros(len(R), dtype=torch.long)
     segment[90:], segment[85:90] = 7, -1
-    settings = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
-    one = smoothed(truth, position, R, segment, settings)
+    one = smoothed(truth, position, R, segment, BANDS)
     position[90:] += 30.0
     R[90:] = R[90:] @ so3.exp(torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64))
-    other = smoothed(truth, position, R, segment, settings)
+    other = smoothed(truth, position, R, segment, BANDS)
     for entry in fields(Smoothed):
         values = getattr(one, entry.name)
         if isinstance(values, Tensor) and values.is_floating_point():
@@ -329,12 +315,9 @@ def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
 @pytest.mark.slow
 def test_a_narrower_band_follows_less() -> None:
     truth = planted()
-    narrow, wide = (
-        smoothed(
-            truth, truth.position_lab_mm, truth.R_lab_body, settings=SmoothSettings(orientation_band_hz=band)
-        ).alpha_lab_rad_s2
-        for band in (5.0, 100.0)
-    )
+    bands = (SmoothSettings(orientation_band_hz=band) for band in (5.0, 100.0))
+    found = (smoothed(truth, truth.position_lab_mm, truth.R_lab_body, settings=band) for band in bands)
+    narrow, wide = (each.alpha_lab_rad_s2 for each in found)
     assert rel_rms(wide, truth.alpha_lab_rad_s2) < 0.05
     assert rel_rms(narrow, truth.alpha_lab_rad_s2) > 0.3
 
@@ -431,28 +414,24 @@ def coupled(truth: Motion6D, rng: torch.Generator) -> tuple[Tensor, Tensor, Tens
     return truth.position_lab_mm - POSITION_MM * place, so3.exp(-turn) @ truth.R_lab_body, coupling
 
 
-def turn_of(found: Tensor, truth: Motion6D) -> Tensor:
-    return so3.log(truth.R_lab_body @ found.mT)
-
-
 def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(rng: torch.Generator) -> None:
     truth = planted()
     X, R, coupling = coupled(truth, rng)
     alone, told = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
     assert torch.equal(alone.R_given_path, R)
     assert torch.equal(told.position_lab_mm, alone.position_lab_mm)
-    rms = [float(turn_of(x.R_given_path, truth).square().mean().sqrt()) for x in (alone, told)]
+    rms = [float(so3.log(truth.R_lab_body @ x.R_given_path.mT).square().mean().sqrt()) for x in (alone, told)]
     # Of the shared error the part remains that the smoothed positions have.
     left = float((told.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
     expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
     assert rms[1] == pytest.approx(expected, rel=0.1)
     assert rms[1] < 0.8 * rms[0]
-    assert 0.85 < over_sigma(turn_of(told.R_given_path, truth), told.cov_given_path_rad2) < 1.15
+    assert 0.85 < over_sigma(so3.log(truth.R_lab_body @ told.R_given_path.mT), told.cov_given_path_rad2) < 1.15
     own = (1 - SHARED_PART**2) * (ORIENTATION_RAD * told.orientation_scale) ** 2 * torch.eye(3, dtype=torch.float64)
     by_path = (SHARED_PART * ORIENTATION_RAD / POSITION_MM) ** 2 * told.position_cov_mm2
     assert_close(told.cov_given_path_rad2, own + by_path, 1e-9 * ORIENTATION_RAD**2)
-    assert 0.8 < over_sigma(turn_of(told.R_lab_body, truth), told.orientation_cov_rad2) < 1.25
-    smooth = [float(turn_of(x.R_lab_body, truth).square().mean()) for x in (told, alone)]
+    assert 0.8 < over_sigma(turn_off(truth, told), told.orientation_cov_rad2) < 1.25
+    smooth = [float(turn_off(truth, x).square().mean()) for x in (told, alone)]
     assert smooth[0] < smooth[1]
 
 

@@ -158,7 +158,7 @@ def test_compiled_recursions_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch)
         expected = smooth(chain, plain, wanted)
     assert compiled.misfit == pytest.approx(plain.misfit, rel=1e-9)
     assert compiled.log_determinant == pytest.approx(plain.log_determinant, rel=1e-9)
-    for name in ("state", "covariance", "gain", "innovation", "inverse"):
+    for name in ("state", "stored", "gain", "innovation", "inverse"):
         one, other = getattr(compiled, name), getattr(plain, name)
         np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max(), err_msg=name)
     for name in ("state", "covariance", "mahalanobis"):
