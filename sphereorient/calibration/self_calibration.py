@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, majority
+from sphereorient.calibration.comparison import GAP_PX, TURN_DEG, Limits, Seen, gaps_between
+from sphereorient.calibration.contradictions import majority
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
-from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras, triangulate
+from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras
 from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import TrackError
@@ -29,7 +30,6 @@ BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alon
 SHARED = 12  # consecutive frames that share one error of the centre: they have the same light
 HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
 FRAMES_MIN = 20
-GAP_PX, TURN_DEG = 1.0, 0.2  # by which cameras that agree may differ, in any light
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
 ROUNDS = 4
 
@@ -94,10 +94,12 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
     for pair in combinations(cameras, 2):
         both = torch.isfinite(torch.stack([observed[name].centre_px for name in pair])).all(-1).all(0)
         if bool(both.any()):
-            pixels = {name: observed[name].centre_px[both] for name in pair}
-            middle, gap = triangulate(*(cameras[name].rays(pixels[name]) for name in pair))
-            missed = torch.stack([(cameras[name].project(middle) - pixels[name]).norm(dim=-1) for name in pair])
-            checks.append(CameraCheck(names=pair, gap_mm=gap.numpy(), miss_px=missed.amax(0).numpy()))
+            two = {name: (cameras[name], observed[name].centre_px[both]) for name in pair}
+            gaps = gaps_between(*zip(*two.values(), strict=True))
+            middle = gaps.position_lab_mm
+            missed = [(camera.project(middle) - pixels).norm(dim=-1) for camera, pixels in two.values()]
+            miss_px = torch.stack(missed).amax(0).numpy()
+            checks.append(CameraCheck(names=pair, gap_mm=gaps.signed_mm.abs().numpy(), miss_px=miss_px))
     return checks
 
 
@@ -162,16 +164,10 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
 
 def _agreeing(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> tuple[int, ...]:
     """Return the cameras that agree where these are more than half of three or more; else none."""
-    if len(cameras) < 3:
-        return ()
+    centre_px = torch.stack([observed[name].centre_px for name in cameras], 1)
+    unknown = torch.full(centre_px.shape[:2], torch.nan, dtype=torch.float64)  # nothing is known of sizes
     R = torch.stack([observed[name].R_lab_body for name in cameras], 1)
-    seen = Seen(
-        cameras=cameras,
-        centre_px=torch.stack([observed[name].centre_px for name in cameras], 1),
-        radius_px=torch.full(R.shape[:2], torch.nan, dtype=torch.float64),
-        R_lab_body=R,
-        diameter_mm=1.0,  # nothing is known of sizes
-    )
+    seen = Seen(cameras=cameras, centre_px=centre_px, radius_px=unknown, R_lab_body=R)
     return majority(seen, Limits(gap_px=GAP_PX, turn_deg=TURN_DEG, size=1.0))
 
 

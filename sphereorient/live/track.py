@@ -10,6 +10,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
+from sphereorient.calibration.systematic import with_systematic_errors
 from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
 from sphereorient.experiment import input_files
 from sphereorient.experiment.recording import Recording
@@ -18,8 +19,9 @@ from sphereorient.follow.poses import Poses, no_pose, pose_table
 from sphereorient.live.feed import Tell
 from sphereorient.live.live import LiveTracker, Measured
 from sphereorient.live.outputs import DISK_S, MOST_ROWS, Spool, check_new
-from sphereorient.methods.results import measured_track, with_lasting_errors, with_systematic_errors
+from sphereorient.methods.results import measured_track
 from sphereorient.methods.settings import Settings, settings_yaml
+from sphereorient.pose.lasting import with_lasting_errors
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory, journal
 
 BLOCK_S = 0.5  # from one write to the next
