@@ -13,7 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
 from sphereorient.calibration.targets import PlateView
-from sphereorient.cameras import Camera, ParameterCovariance, PortCamera
+from sphereorient.cameras import Camera, ParameterCovariance, in_air
 from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
 
@@ -58,8 +58,7 @@ def gathered(views: Mapping[int, PlateView]) -> SeenPoints:
 
 def fitted_parameters(camera: Camera, of_port: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the names of the fitted parameters: lens, pose, and of the port those in `of_port`."""
-    inner = camera.camera if isinstance(camera, PortCamera) else camera
-    return (*(name for name in parameter_names(inner) if name not in HELD), *of_port)
+    return (*(name for name in parameter_names(in_air(camera)) if name not in HELD), *of_port)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,7 +1,6 @@
 """Calibration from pictures of a plate or tables of points: points -> guess -> joint fit -> cameras."""
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +17,12 @@ from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubt
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
-from sphereorient.cameras import Camera, ParameterCovariance, Port, PortCamera, TsaiCamera, centre_lab_mm
+from sphereorient.cameras import Camera, ParameterCovariance, Port, PortCamera, TsaiCamera, centre_lab_mm, in_air
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
+from sphereorient.files.threads import side_by_side
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
@@ -78,13 +78,15 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     plate = document.plate
     # Read all files first, to report a faulty one before the long computation.
     grey = [read_plate_picture(picture.path, document.keys.image_size) for picture in document.pictures]
-    views = {}
-    with ThreadPoolExecutor(2) as pool:
-        seen = pool.map(lambda one, it: see_plate(one, plate, it.path.name, it.clicked_px), grey, document.pictures)
-        progress("pictures", 0, len(grey))
-        for picture, view in zip(document.pictures, seen, strict=True):
-            views[picture] = view
-            progress("pictures", len(views), len(grey))
+
+    def see(k: int) -> PlateView:
+        return see_plate(grey[k], plate, document.pictures[k].path.name, document.pictures[k].clicked_px)
+
+    views: dict[Picture, PlateView] = {}
+    progress("pictures", 0, len(grey))
+    for view in side_by_side(see, range(len(grey))):
+        views[document.pictures[len(views)]] = view
+        progress("pictures", len(views), len(grey))
     return views
 
 
@@ -191,10 +193,10 @@ def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
 
 def _loose_sigmas(camera: Camera) -> dict[str, float]:
     """Return the sigmas from which parameters are undetermined, by the begin of their names."""
-    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
-    focal, width = float((lens.f_mm if isinstance(lens, TsaiCamera) else lens.f_px).max()), camera.image_size[0]
+    lens = in_air(camera)
+    focal = float((lens.f_mm if isinstance(lens, TsaiCamera) else lens.f_px).max())
     scale = {"f": focal, "T_": float(camera.T_cam_lab_mm.norm())}
-    return {begin: share * scale.get(begin, width) for begin, share in LOOSE_SHARE.items()} | LOOSE
+    return {begin: share * scale.get(begin, camera.image_size[0]) for begin, share in LOOSE_SHARE.items()} | LOOSE
 
 
 def _collected(

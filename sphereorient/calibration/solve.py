@@ -103,11 +103,8 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
 
 def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_px: Tensor) -> AnyCamera:
     """Fit the parameters `names` of any camera, also behind a port, to lab points (n, 3), mm, and pixels (n, 2).
-    The start must be near. The covariance is from the residuals, at least 0.05 px.
-
-    Raises:
-        CameraError: too few points, numbers that are not finite, or undetermined parameters, named.
-        ShapeError: arrays of another shape.
+    The start must be near. The covariance is from the residuals, at least 0.05 px. Raises CameraError (too few points,
+    numbers that are not finite, or undetermined parameters, named), ShapeError (arrays of another shape).
     """
     x_lab_mm, uv_px = checked_points(x_lab_mm, uv_px)
     size, least = len(names), -(-len(names) // 2)

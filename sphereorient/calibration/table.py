@@ -1,7 +1,6 @@
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import torch
 from rich.table import Column, Table
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.calibration.calibrated import Calibrated
 from sphereorient.calibration.self_calibration import MOVED, OBSERVED, CameraCheck, Repaired
-from sphereorient.cameras import Camera, PortCamera
+from sphereorient.cameras import Camera, PortCamera, in_air
 from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
 from sphereorient.trajectory import Reason, Trajectory
 
@@ -96,7 +95,7 @@ def contradiction_lines(track: Trajectory) -> list[str]:
 def _values(camera: Camera) -> dict[str, float]:
     """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
     known = () if camera.covariance is None else camera.covariance.names
-    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
+    lens = in_air(camera)
     found: dict[str, Tensor] = {}
     for name, (field, place) in lens.parameter_fields().items():
         found[name] = getattr(lens, field)[... if place is None else place]

@@ -42,9 +42,8 @@ def tsai_stages(
         image_size: (W, H), px.
         pixel_pitch_mm: along u and v; s_x is 1.
 
-    Raises:
-        CameraError: points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels.
-        ShapeError: arrays of another shape.
+    Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels),
+    ShapeError (arrays of another shape).
     """
     points, pixels = checked_points(x_lab_mm, uv_px)
     _check_count(points, POINTS_OF_PLANE, "in one plane")

@@ -131,11 +131,10 @@ def measured_track(
     covariance = picked["covariance"]
     margin, angle = _margin(table, choice)
     cameras = {view.name: precise_camera(k, table, picked, learnt) for k, view in enumerate(learnt.fitter.views)}
-    shown = ((view, cameras[view.name]) for view in learnt.fitter.views)
-    disks = (
-        (view, one.reason, torch.from_numpy(one.centre_px), torch.from_numpy(one.radius_px)) for view, one in shown
-    )
-    missed = [missed_by(*one) for one in disks]
+    missed = [
+        missed_by(view, one.reason, torch.from_numpy(one.centre_px), torch.from_numpy(one.radius_px))
+        for view, one in zip(learnt.fitter.views, cameras.values(), strict=True)
+    ]
     seeing = table.use & (choice >= 0)[:, None]
     flags = fit_flags(learnt, seeing, picked["score"], picked["excess"], np.sum(missed, axis=0))
     return replace(
@@ -173,16 +172,13 @@ def precise_track(
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
-    known = {
-        "position_cov": track.position_cov * smoothed.position_scale**2,
-        "orientation_cov": smoothed.cov_given_path_rad2.numpy(),
-        **datasets_of(smoothed, experiment.length_unit),
-    }
     return replace(
         track,
         position=track.position - move_mm.numpy(),
+        position_cov=track.position_cov * smoothed.position_scale**2,
         orientation=smoothed.R_given_path.numpy(),
-        **known,
+        orientation_cov=smoothed.cov_given_path_rad2.numpy(),
+        **datasets_of(smoothed, experiment.length_unit),
         segment=chosen.segment.numpy(),
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,

@@ -18,7 +18,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.methods.method import Learnt
 from sphereorient.methods.results import TWO_BALLS
 from sphereorient.methods.settings import Settings
-from sphereorient.preflight.finding import FAULT, OK, WARNING, Finding, judged, warning
+from sphereorient.preflight.finding import FAULT, OK, WARNING, Finding, Severity, judged, warning
 from sphereorient.preflight.in_step import OffsetScan, in_step
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.run import MemoryStore, Request, run
@@ -50,6 +50,9 @@ class Tracked:
 
     findings: tuple[Finding, ...] = ()  # on the number of balls, then on the cameras
     overrules: bool = False  # poses fitted to the paint tell more than outlines, which jump where paint is dark
+
+
+NOT_TRACKED = Tracked()
 
 
 def track_stretch(
@@ -104,6 +107,8 @@ def camera_findings(
     experiment: Experiment, samples: Sequence[MovieSample], scans: Sequence[OffsetScan], tracked: Tracked
 ) -> Iterator[Finding]:
     """Yield what outlines and the tracked stretch say of the cameras; where these tell, outlines raise no complaint."""
+    if not samples:
+        return
     between, diameter_mm = [], experiment.diameter_mm
     if scans and all(sample.balls for sample in samples):  # else the finding on the ball tells enough
         in_step_px = max(scan.in_step_px for scan in scans) if any(scan.shift for scan in scans) else None
@@ -196,22 +201,20 @@ def ball_size(samples: Sequence[MovieSample], diameter_mm: float) -> Finding:
         return warning(title, f"unknown: no frame shows the ball to {both} cameras", SEE_BALL)
     spread = {name: 1.4826 * float((ratio - ratio.nanmedian()).abs().nanmedian()) for name, ratio in ratios.items()}
     words = ", ".join(f"{name} {ratio:.3f} +- {spread[name]:.3f}" for name, ratio in middle.items())
-    measured = f"measured over expected: {words}"
-    mean = sum(middle.values()) / len(middle)
+    mean, apart = sum(middle.values()) / len(middle), max(middle.values()) - min(middle.values())
     tolerance = OUTLINE_PX / min(float(sample.sightings.radius_px.nanmedian()) for sample in samples)
-    apart = max(middle.values()) - min(middle.values())
-    error = max(apart, abs(mean - 1))
-    if apart > GOOD + tolerance:
-        usual = 1.0 if len(samples) == 2 else median(middle.values())
-        name = max(middle, key=lambda one: abs(middle[one] - usual))
-        advice = f"check f, pixel_pitch and T of {name} in cameras.yaml: the cameras do not agree on the size"
-    else:
-        advice = (
-            f"measure the ball: sphere.diameter {diameter_mm * mean:.4g} mm would fit; if it is {diameter_mm:g} mm, "
-            f"the lengths of the calibration are wrong (pitch of the plate)"
-        )
-    complaints = (error > BAD + tolerance, FAULT, advice), (error > GOOD + tolerance, WARNING, advice)
-    return judged(title, measured, *complaints)
+    usual = 1.0 if len(samples) == 2 else median(middle.values())
+    name = max(middle, key=lambda one: abs(middle[one] - usual))
+    advice = f"check f, pixel_pitch and T of {name} in cameras.yaml: the cameras do not agree on the size"
+    if apart <= GOOD + tolerance:
+        advice = f"measure the ball: sphere.diameter {diameter_mm * mean:.4g} mm would fit; "
+        advice += f"if it is {diameter_mm:g} mm, the lengths of the calibration are wrong (pitch of the plate)"
+    return judged(title, f"measured over expected: {words}", *off_size(max(apart, abs(mean - 1)), tolerance, advice))
+
+
+def off_size(error: float, tolerance: float, advice: str) -> list[tuple[bool, Severity, str]]:
+    """Return the complaints of a size with a relative error, of outlines with this tolerance."""
+    return [(error > BAD + tolerance, FAULT, advice), (error > GOOD + tolerance, WARNING, advice)]
 
 
 def ball_size_px(sample: MovieSample) -> Finding:

@@ -30,15 +30,15 @@ class Preflight:
 
     experiment: Experiment
     timeline: Timeline
-    samples: tuple[MovieSample, ...]
-    closer: tuple[tuple[MovieSample, ...], ...]  # consecutive frames: by stretch, then by camera
-    scans: tuple[OffsetScan, ...]  # of each other camera against the first
-    texture: Tensor | None  # (H, 2 H)
-    unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
-    measures: texture_map.TextureMeasures | None
-    similar: texture_map.ViewPair | None
-    tracked: cameras.Tracked  # a short stretch; no findings with one camera or without a map
-    matches: tuple[texture_map.TextureMatch, ...]
+    samples: tuple[MovieSample, ...] = ()
+    closer: tuple[tuple[MovieSample, ...], ...] = ()  # consecutive frames: by stretch, then by camera
+    scans: tuple[OffsetScan, ...] = ()  # of each other camera against the first
+    texture: Tensor | None = None  # (H, 2 H)
+    unseen: Tensor | None = None  # (H, 2 H) bool, texels that are no paint; None: all are
+    measures: texture_map.TextureMeasures | None = None
+    similar: texture_map.ViewPair | None = None
+    tracked: cameras.Tracked = cameras.NOT_TRACKED  # a short stretch; no findings with one camera or without a map
+    matches: tuple[texture_map.TextureMatch, ...] = ()
     scene: tuple[SceneView, ...] = ()  # of several balls: a picture of each camera
     findings: tuple[Finding, ...] = ()
 
@@ -85,7 +85,7 @@ def preflight(
         progress("frames", len(samples), len(samples))
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
-        tracked = cameras.Tracked()
+        tracked = cameras.NOT_TRACKED
         if learning is not None and closer and any(sample.balls for sample in samples):
             first = int(recording.timeline.number[closer[0][0].frame[0]])
             tracked = cameras.track_stretch(experiment, planned, learning, closer[0], first)
@@ -109,35 +109,23 @@ def preflight(
 def _of_scene(recording: Recording, settings: Settings, progress: Progress) -> Preflight:
     """Check an experiment of several balls."""
     scene, found = look_at_scene(recording, settings, progress)
-    experiment = recording.experiment
-    return Preflight(
-        experiment=experiment,
-        timeline=recording.timeline,
-        samples=(),
-        closer=(),
-        scans=(),
-        texture=None,
-        unseen=None,
-        matches=(),
-        measures=None,
-        similar=None,
-        tracked=cameras.Tracked(),
-        scene=scene,
-        findings=(movies.frames(experiment, recording.timeline), *movies.outside(experiment), *found),
-    )
+    checked = Preflight(experiment=recording.experiment, timeline=recording.timeline, scene=scene)
+    return replace(checked, findings=tuple(_findings(checked, found)))
 
 
-def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:
+def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield all findings; those that are told `first` are known."""
     yield movies.frames(seen.experiment, seen.timeline)
     yield from movies.outside(seen.experiment)
-    yield from wrong_sizes
+    yield from first
     for k, sample in enumerate(seen.samples):
         yield movies.movie_file(sample)
         yield movies.pictures([sample, *(stretch[k] for stretch in seen.closer)])
         yield movies.background(sample, seen.experiment)
         yield movies.ball(sample)
     yield from cameras.camera_findings(seen.experiment, seen.samples, seen.scans, seen.tracked)
-    yield from _texture_findings(seen)
+    if seen.samples:
+        yield from _texture_findings(seen)
     for sample in seen.samples:
         yield movies.exposure(sample)
         yield movies.sharpness(sample)

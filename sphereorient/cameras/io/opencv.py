@@ -27,10 +27,8 @@ Array = NDArray[np.float64]
 def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera:
     """Read a camera that OpenCV's calibration has written; the first pixel's centre is (0, 0).
     The file has `camera_matrix`, `distortion_coefficients`, optional `R` or `rvec`, `T` or `tvec` (mm; without them the
-    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px).
-
-    Raises:
-        CameraError: no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3.
+    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px). Raises
+    CameraError (no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3).
     """
     storage = _opened(Path(path))
     try:
@@ -52,9 +50,7 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
 
 def save_opencv(path: Path | str, camera: BrownCamera) -> None:
     """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
-
-    Raises:
-        OutputError: an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written.
+    Raises OutputError (an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written).
     """
     path = Path(path)
     check_ending(path, "OpenCV file", SUFFIXES)
