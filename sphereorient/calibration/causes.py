@@ -20,6 +20,7 @@ from sphereorient.cameras import Camera, Rays
 Floats = NDArray[np.float64]
 LATEST = 8  # frames by which a movie may be late
 PLAUSIBLE = 0.2  # largest deviation: relative, rad, 100 mm
+FIT: dict[str, Any] = {"loss": "soft_l1", "x_scale": 0.01, "max_nfev": 30}
 FLIPS = {"horizontal": (0,), "vertical": (1,), "both": (0, 1)}  # axes of the picture
 
 
@@ -69,11 +70,10 @@ def likely_causes(compare: Comparison, found: Tensor) -> Iterator[Cause]:
         measured: Callable[[Floats], Tensor], count: int, words: str, numbers: Callable[[Floats], list[float]]
     ) -> Cause:
         def residuals(p: Floats) -> Floats:
-            flat: Floats = measured(p).flatten().nan_to_num(nan=0.0).numpy()
-            return flat
+            return np.asarray(measured(p).flatten().nan_to_num(nan=0.0))
 
         bounds = np.full(count, -PLAUSIBLE), np.full(count, PLAUSIBLE)
-        best: Any = least_squares(residuals, np.zeros(count), bounds=bounds, loss="soft_l1", x_scale=0.01, max_nfev=30)
+        best: Any = least_squares(residuals, np.zeros(count), bounds=bounds, **FIT)
         return Cause(words=words.format(*numbers(best.x)), left=misfit(measured(best.x)) / whole, parameters=count)
 
     words = f"sphere.diameter {mm:.4g} explains the pictures if it is {{:.4g}}, or the calibration's lengths are off"

@@ -15,6 +15,7 @@ RUNS, RUN = 3, 20  # causes are tried in some runs of frames that follow each ot
 STRETCH = 0.01  # by how much outlines may be wider than high, where nothing is wrong
 GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
+NAN = torch.tensor(torch.nan, dtype=torch.float64)
 Sight = tuple[Rays, Tensor]  # what one camera says of N frames: lines of sight, and R_lab_body (N, 3, 3)
 
 
@@ -36,7 +37,7 @@ class Seen:
     radius_px: Tensor  # (N, C), of the sphere's picture, along the camera's x
     R_lab_body: Tensor  # (N, C, 3, 3)
     diameter_mm: float = 1.0  # without it only ratios of sizes between cameras count
-    outline_stretch: Tensor | None = None  # (N, C), by how much outlines are wider than the cameras say, relative
+    outline_stretch: Tensor = NAN  # (N, C) or (): by how much outlines are wider than the cameras say, relative
     frame: Tensor | None = None  # (N,) int64, increasing, at even times; None: no camera is tested for being late
 
     @classmethod
@@ -44,11 +45,6 @@ class Seen:
         """Return what outlines (N, C, 2), (N, C), px, alone say."""
         R = torch.full((*radius_px.shape, 3, 3), torch.nan, dtype=torch.float64)
         return cls(cameras=cameras, centre_px=centre_px, radius_px=radius_px, R_lab_body=R)
-
-    @property
-    def stretch(self) -> Tensor:
-        """(N, C): `outline_stretch`, NaN if unknown."""
-        return torch.full_like(self.radius_px, torch.nan) if self.outline_stretch is None else self.outline_stretch
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
@@ -119,28 +115,24 @@ class Comparison:
             starts = torch.linspace(0, len(rows) - RUN, RUNS).round().long()
             rows = rows[(starts[:, None] + torch.arange(RUN)).flatten()]
         self.cameras, self.names, self.pairs = list(seen.cameras.values()), list(seen.cameras), seen.pairs
-        self.centre_px, self.stretch = seen.centre_px[rows], seen.stretch[rows]
+        self.centre_px, self.stretch = seen.centre_px[rows], seen.outline_stretch.expand_as(seen.radius_px)[rows]
         self.frame = None if seen.frame is None else seen.frame[rows]
         self.diameter_mm = seen.diameter_mm
-        self.scale = torch.tensor(
-            [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2],
-            dtype=torch.float64,
-        )
+        scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2]
+        self._scale = torch.tensor(scale, dtype=torch.float64)
         views = [R_lab_view(camera, self.centre_px[:, k]) for k, camera in enumerate(self.cameras)]
         self.R_view_body = torch.stack(views, 1).mT @ seen.R_lab_body[rows]
         self._centres = [centre_lab_mm(camera) for camera in self.cameras]
-        gaps = [gaps_between([self.cameras[c] for c in two], [self.centre_px[:, c] for c in two]) for two in self.pairs]
-        self._px_mm = [gap.per_mm_px.nanmedian() for gap in gaps]
-        # Distance by the size of the picture, (N,) of each camera of a pair.
-        self._by_size = [
-            [
-                (gap.position_lab_mm - self._centres[c]).norm(dim=-1)
-                * sphere_radius_px(self.cameras[c], gap.position_lab_mm, seen.diameter_mm / 2)
-                / seen.radius_px[rows, c]
-                for c in pair
-            ]
-            for gap, pair in zip(gaps, self.pairs, strict=True)
-        ]
+        self._px_mm, self._by_size = [], []  # by size: distances (N,) of the cameras of a pair
+        for two in self.pairs:
+            gap = gaps_between([self.cameras[c] for c in two], [self.centre_px[:, c] for c in two])
+            self._px_mm.append(gap.per_mm_px.nanmedian())
+            self._by_size.append([self._far(c, gap.position_lab_mm, seen.radius_px[rows, c]) for c in two])
+
+    def _far(self, c: int, position_lab_mm: Tensor, radius_px: Tensor) -> Tensor:
+        expected_px = sphere_radius_px(self.cameras[c], position_lab_mm, self.diameter_mm / 2)
+        far: Tensor = (position_lab_mm - self._centres[c]).norm(dim=-1) * expected_px / radius_px
+        return far
 
     def sights(self, centre_px: Tensor | None = None, R_view_body: Tensor | None = None) -> list[Sight]:
         """Return what the cameras say of centres (N, C, 2), px, and attitudes (N, C, 3, 3); None: those seen."""
@@ -169,7 +161,7 @@ class Comparison:
             size = torch.stack([(a / b).log() for a, b in zip(far, by_size, strict=True)], -1) - growth[[k, m]]
             size = size if sized else size * torch.nan
             parts.append(torch.cat([(gap_mm * px_mm)[:, None], turn, size, stretch[:, [k, m]]], -1))
-        return torch.stack(parts) / self.scale
+        return torch.stack(parts) / self._scale
 
 
 def typical(found: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ EQUALLY = 2.0  # causes that leave at most this many times the least are named a
 SIMPLER = 0.5  # a cause of fewer parameters is preferred if its misfit, in units of the limits, is below this
 OUTLINES = Limits(gap_px=1.5, turn_deg=1.0, size=0.01)  # of outlines alone: they jump where paint is dark
 ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
+OWN = ("centre_px", "radius_px", "orientation", "orientation_cov")  # of each camera of a track
 CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
 
 
@@ -118,15 +119,9 @@ def said_alone(
     track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
 ) -> tuple[Seen, Limits]:
     """Return what each camera of a track alone says, and how far apart cameras that agree may be."""
-    seen = Seen(
-        cameras=cameras,
-        centre_px=_of_cameras(track, "centre_px"),
-        radius_px=_of_cameras(track, "radius_px"),
-        R_lab_body=_of_cameras(track, "orientation"),
-        diameter_mm=diameter_mm,
-        frame=torch.arange(len(track)) if consecutive else None,
-    )
-    return seen, limits_of(seen, _of_cameras(track, "orientation_cov"))
+    centre_px, radius_px, R, covariance = (_of_cameras(track, name) for name in OWN)
+    seen = Seen(cameras=cameras, centre_px=centre_px, radius_px=radius_px, R_lab_body=R, diameter_mm=diameter_mm)
+    return replace(seen, frame=torch.arange(len(track)) if consecutive else None), limits_of(seen, covariance)
 
 
 def with_contradictions(

@@ -218,8 +218,8 @@ class _Windows:
         half = int(_window(shape).max())
         steps = np.arange(-half, half + 1)
         middle = np.rint(centre_px).astype(int)
-        u = (middle[:, 0, None, None] + steps[None, None, :] + 0 * steps[None, :, None]).reshape(len(which), -1)
-        v = (middle[:, 1, None, None] + steps[None, :, None] + 0 * steps[None, None, :]).reshape(len(which), -1)
+        down, across = (step.ravel() for step in np.meshgrid(steps, steps, indexing="ij"))
+        u, v = middle[:, :1] + across, middle[:, 1:] + down
         seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
         u_in, v_in = u.clip(0, width - 1), v.clip(0, height - 1)
         x, y = u - centre_px[:, :1], v - centre_px[:, 1:]

@@ -1,5 +1,6 @@
 """The first calibration.yaml of a folder of plate pictures: dots counted, larger ones found, poses by their numbers."""
 
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -29,12 +30,12 @@ class PlateSeen:
     """The plate of dots in one picture."""
 
     size: tuple[int, int]  # W, H px
-    columns: int  # dots along x, or the longer side where x is not known; 0: no lattice of dots
-    rows: int
-    dark: bool
-    width: float  # of a usual dot, in pitches; NaN: none
-    larger: float  # of a larger dot; NaN: none
-    marks: tuple[int, int] | None  # dots from the origin's to the larger ones on x and y; None: not three of these
+    columns: int = 0  # dots along x, or the longer side where x is not known; 0: no lattice of dots
+    rows: int = 0
+    dark: bool = True
+    width: float = math.nan  # of a usual dot, in pitches; NaN: none
+    larger: float = math.nan  # of a larger dot; NaN: none
+    marks: tuple[int, int] | None = None  # dots from the origin's to the larger ones on x and y; None: not three
 
 
 def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
@@ -66,14 +67,13 @@ def look_at_plate(path: Path) -> PlateSeen:
         if best is not None and len(best.index) > CERTAIN:
             break
     if best is None:
-        nan = float("nan")
-        return PlateSeen(size=size, columns=0, rows=0, dark=dark, width=nan, larger=nan, marks=None)
+        return PlateSeen(size=size)
     usual = float(np.median(best.width))
     large = best.width > LARGER * usual
     extent = (np.ptp(best.index, axis=0) + 1).tolist()
     axis, marks = _marks(best.index, best.index[large])
     columns, rows = sorted(extent, reverse=True) if axis is None else (extent[axis], extent[1 - axis])
-    larger = float(np.median(best.width[large])) if large.any() else float("nan")
+    larger = float(np.median(best.width[large])) if large.any() else math.nan
     return PlateSeen(size=size, columns=columns, rows=rows, dark=dark, width=usual, larger=larger, marks=marks)
 
 

@@ -22,10 +22,8 @@ def parameters_table(result: Calibrated) -> Table:
     values = [_values(camera) for camera in result.cameras.values()]
     sigmas = [camera.covariance.sigmas if camera.covariance else {} for camera in result.cameras.values()]
     for name in dict.fromkeys(name for known in values for name in known):
-        cells = []
-        for known, sigma in zip(values, sigmas, strict=True):
-            cells.append(f"{known[name]:.7g} ({sigma.get(name, math.nan):.2g})" if name in known else "")
-        table.add_row(name, *cells)
+        of_name = [(known.get(name), sigma.get(name, math.nan)) for known, sigma in zip(values, sigmas, strict=True)]
+        table.add_row(name, *("" if value is None else f"{value:.7g} ({sigma:.2g})" for value, sigma in of_name))
     return table
 
 

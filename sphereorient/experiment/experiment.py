@@ -253,11 +253,10 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
     for name in experiment.movie_paths if names is None else names:
         check_known([name], experiment.movie_paths, f"{experiment.path}, movies", ExperimentError)
         movie = flipped(open_movie(experiment.movie_paths[name]), experiment.flip.get(name, "none"))
-        width, height = experiment.cameras[name].image_size
-        if movie.frame_shape != (height, width):
+        (width, height), (rows, columns) = experiment.cameras[name].image_size, movie.frame_shape
+        if (rows, columns) != (height, width):
             expected = f"{width} x {height} px as camera {name} in {experiment.cameras_path}"
-            got = f"{movie.frame_shape[1]} x {movie.frame_shape[0]}"
-            do = "calibrate the camera with this movie's picture size"
+            got, do = f"{columns} x {rows}", "calibrate the camera with this movie's picture size"
             raise MovieError(refusal(str(movie.path), expected=expected, got=got, do=do))
         movies[name] = movie
     return movies
@@ -271,7 +270,7 @@ def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> d
         single += [paths[name] for name in used if name in paths]
     for texture in (sphere.texture_path for sphere in experiment.spheres):
         if texture is not None:
-            single += [texture, *([counts] if (counts := seen_path(texture)).is_file() else [])]
+            single += [texture, *(counts for counts in [seen_path(texture)] if counts.is_file())]
     if experiment.times not in (None, MOVIES_OWN):
         single.append(Path(str(experiment.times)))
     movies = [experiment.movie_paths[name] for name in used if name in experiment.movie_paths]

@@ -99,16 +99,11 @@ def open_recording(
     names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
     frames = timeline(experiment, movies)
-    streams = [
-        CameraStream(
-            name=name,
-            camera=experiment.cameras[name],
-            movie=movie,
-            rows=frames.rows[name],
-            shown=given_mask(experiment, name, movie.frame_shape),
-        )
-        for name, movie in movies.items()
-    ]
+    streams = []
+    for name, movie in movies.items():
+        shown = given_mask(experiment, name, movie.frame_shape)
+        camera, rows = experiment.cameras[name], frames.rows[name]
+        streams.append(CameraStream(name=name, camera=camera, movie=movie, rows=rows, shown=shown))
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
     remarks += [
         f"{path}: {100 * unseen_share(one.unseen):.0f} % of the ball is unseen and no paint"

@@ -98,11 +98,9 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         for name, of_movie in there.items()
         if of_movie < wanted
     )
-    number = np.arange(count)
-    rows = {
-        name: np.where(number < of_movie, number + experiment.start.get(name, 0), NONE)
-        for name, of_movie in there.items()
-    }
+    number, rows = np.arange(count), {}
+    for name, of_movie in there.items():
+        rows[name] = np.where(number < of_movie, number + experiment.start.get(name, 0), NONE)
     if experiment.times is None:
         time_s = number / experiment.frame_rate_hz
     else:

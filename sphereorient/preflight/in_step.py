@@ -68,21 +68,17 @@ def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
         one = range(begin, min(begin + STRETCH, count))
         if all(one.start >= other.stop or one.stop <= other.start for other in stretches):
             stretches.append(one)
-        if len(stretches) == STRETCHES:
-            break
-    return stretches
+    return stretches[:STRETCHES]
 
 
 def scan_offsets(
     names: Sequence[str], cameras: Sequence[Camera], stretches: Sequence[tuple[Tensor, Tensor]]
 ) -> OffsetScan:
     """Measure the gap at each offset; stretches hold both cameras' centres (L, 2), px, NaN: no ball."""
-    moved = [torch.zeros(0, dtype=torch.float64)]
-    for centres in stretches:
-        gaps = gaps_between(cameras, centres)
+    moved = []
+    for gaps in (gaps_between(cameras, centres) for centres in stretches):
         moved.append((gaps.position_lab_mm.diff(dim=0) * gaps.across_lab[1:]).sum(-1) * gaps.per_mm_px[1:])
-    motion = torch.cat(moved)
-    motion = motion[torch.isfinite(motion)]
+    motion = _finite(moved)
     moved_px = float(motion.square().mean().sqrt()) if len(motion) else 0.0
     rows = [_gap_at(cameras, stretches, offset) for offset in range(-REACH, REACH + 1)]
     gap, varying = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
@@ -104,17 +100,21 @@ def scan_offsets(
 
 def _gap_at(cameras: Sequence[Camera], stretches: Sequence[tuple[Tensor, Tensor]], offset: int) -> tuple[float, float]:
     """Return the rms gap of frames k and k + offset, px, with and without its constant part."""
-    parts = [torch.zeros(0, dtype=torch.float64)]
+    parts = []
     for first, second in stretches:
         length = len(first) - abs(offset)
         if length > 0:
             a, b = first[max(0, -offset) :][:length], second[max(0, offset) :][:length]
             parts.append(gaps_between(cameras, [a, b]).signed_px)
-    signed = torch.cat(parts)
-    signed = signed[torch.isfinite(signed)]
+    signed = _finite(parts)
     if len(signed) < FEW:
         return math.nan, math.nan
     return _trimmed_rms(signed), _trimmed_rms(signed - signed.median())
+
+
+def _finite(parts: Sequence[Tensor]) -> Tensor:
+    whole = torch.cat([torch.zeros(0, dtype=torch.float64), *parts])
+    return whole[torch.isfinite(whole)]
 
 
 def _trimmed_rms(values: Tensor) -> float:

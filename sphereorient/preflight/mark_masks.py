@@ -82,9 +82,8 @@ class MaskMarking(Marking):
         """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
         movie = self._movie(name)
         if not 0 <= number < len(movie):
-            raise MovieError(
-                refusal(f"frame {number}", expected=f"0 .. {len(movie) - 1}", got=str(number), do="choose another")
-            )
+            expected = f"0 .. {len(movie) - 1}"
+            raise MovieError(refusal(f"frame {number}", expected=expected, got=str(number), do="choose another"))
         with self.lock:
             picture = movie.sample([number])[0]
         return png(eight_bits(picture))
@@ -183,8 +182,7 @@ def drawn_mask(
     """Return what a mask (H, W) shows after shapes are drawn, see `MaskMarking.save`; ExperimentError for others."""
     if not isinstance(shapes, list | tuple) or len(shapes) > MOST_SHAPES:
         raise _refused("shapes", f"at most {MOST_SHAPES} of them", "another thing")
-    hidden = np.zeros(size, np.uint8)
-    region = np.zeros(size, np.uint8)
+    hidden, region = np.zeros((2, *size), np.uint8)
     for shape in shapes:
         kind = shape.get("kind") if isinstance(shape, Mapping) else None
         if kind not in ("hide", "show"):
