@@ -43,7 +43,7 @@ def main() -> None:
     for case in range(arguments.cases):
         bumped = bump(exact, math.radians(arguments.turn), arguments.move, case)
         track = track_movies(replace(experiment, cameras=bumped, camera_covariance=None))
-        repaired = self_calibrate(bumped, observations_of(track, bumped)).cameras
+        repaired = self_calibrate(observations_of([track], bumped)).cameras
         before, after, own = (gap_mm(cameras, track) for cameras in (bumped, repaired, exact))
         off = [math.degrees(apart_rad(cameras, exact)) for cameras in (bumped, repaired)]
         print(

@@ -13,7 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
 from sphereorient.calibration.targets import PlateView
-from sphereorient.cameras import Camera, ParameterCovariance, PortCamera
+from sphereorient.cameras import Camera, ParameterCovariance, in_air
 from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
 
@@ -58,8 +58,7 @@ def gathered(views: Mapping[int, PlateView]) -> SeenPoints:
 
 def fitted_parameters(camera: Camera, of_port: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the names of the fitted parameters: lens, pose, and of the port those in `of_port`."""
-    inner = camera.camera if isinstance(camera, PortCamera) else camera
-    return (*(name for name in parameter_names(inner) if name not in HELD), *of_port)
+    return (*(name for name in parameter_names(in_air(camera)) if name not in HELD), *of_port)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,7 +89,7 @@ class Problem:
 
     def applied(self, change: Tensor) -> Rig:
         """Return the rig with a vector of changes (size,) applied."""
-        shares, poses = self._split(change)
+        shares, poses = self.split(change)
         R, T = self._posed(poses)
         cameras = {name: self._camera(name, share) for name, share in shares.items()}
         return Rig(cameras=cameras, R_lab_plate=R, T_lab_plate_mm=T)
@@ -106,7 +105,7 @@ class Problem:
 
     def residuals(self, change: Tensor, shifts: Mapping[str, Tensor]) -> Tensor:
         """Return measured minus expected pixels over their sigmas, (2 n,), one camera after the other."""
-        shares, poses = self._split(change)
+        shares, poses = self.split(change)
         parts = []
         for name, seen in self.seen.items():
             missed = seen.uv_px - shifts[name] - self._expected(name, shares[name], poses)
@@ -115,8 +114,8 @@ class Problem:
 
     def slopes(self, change: Tensor) -> Tensor:
         """Return the derivatives of the residuals (2 n, size)."""
-        shares, poses = self._split(change)
-        (of_share, of_pose), parts = self.unknowns, []
+        shares, poses = self.split(change)
+        (of_share, of_pose), parts = self.split(torch.arange(self.size)), []
         for name, seen in self.seen.items():
             share, block = shares[name], change.new_zeros(len(seen.pose), 2, self.size)
             units = torch.eye(len(share), dtype=torch.float64)
@@ -129,12 +128,8 @@ class Problem:
             parts.append((-block / seen.sigma_px[:, None, None]).flatten(0, 1))
         return torch.cat(parts)
 
-    @property
-    def unknowns(self) -> tuple[dict[str, Tensor], Tensor]:
-        """Places in the vector of each camera's parameters, and of each pose's parts (P, 6)."""
-        return self._split(torch.arange(self.size))
-
-    def _split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+    def split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the shares of a vector (size,) of each camera, and those of all poses, (P, 6)."""
         lengths = [len(names) for names in self.names.values()]
         *shares, poses = torch.split(change, [*lengths, POSE_PARTS * len(self.free)])
         whole = change.new_zeros(len(self.rig.R_lab_plate), POSE_PARTS)
@@ -185,7 +180,7 @@ def adjust(problem: Problem) -> Fitted:
     slopes = problem.slopes(change)[rows]
     scale = float((residuals[rows].square().sum() / max(len(slopes) - problem.size, 1)).sqrt())
     covariance = scale**2 * inverse_information(slopes.mT @ slopes)
-    cameras, (shares, _) = {}, problem.unknowns
+    cameras, (shares, _) = {}, problem.split(torch.arange(problem.size))
     for name, camera in rig.cameras.items():
         names, known = problem.names[name], cast(Any, camera)
         own = ParameterCovariance(names=names, matrix=covariance[shares[name]][:, shares[name]]) if names else None
@@ -216,15 +211,10 @@ def disk_centre_shift(
     camera: Camera, R_lab_plate: Tensor, T_lab_plate: Tensor, points_plate: Tensor, dot_diameter: Tensor
 ) -> Tensor:
     """Return centroid minus image of the centre (..., n, 2), px, for disks of a plate; differentiable in everything.
-    NaN where part of a disk is not imaged; blur does not move the centroid.
+    Centres (..., n, 3), plate frame, mm, lie in planes z = const; X_lab = R_lab_plate X_plate + T_lab_plate (mm, any
+    leading shape); diameters (..., n), mm, 0 for a corner, whose shift is 0. NaN where part of a disk is not imaged;
+    blur does not move the centroid.
     Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
-
-    Args:
-        camera: any camera, also behind a port.
-        R_lab_plate: (..., 3, 3), takes plate components to lab components.
-        T_lab_plate: (..., 3), lab, mm: X_lab = R_lab_plate X_plate + T_lab_plate.
-        points_plate: (..., n, 3), centres, plate frame, mm; the disks lie in planes z = const.
-        dot_diameter: (..., n), mm; 0 for a corner, whose shift is 0.
     """
     check_points("points_plate", points_plate, 3)
     angle = torch.arange(RIM_POINTS, dtype=torch.float64, device=points_plate.device) * (2 * math.pi / RIM_POINTS)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.calibration.document import Picture
 from sphereorient.calibration.targets import PlateView
-from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, TsaiCamera
+from sphereorient.cameras import Camera, ParameterCovariance, in_air
 
 NEIGHBOURS = 4  # of a point on the plate
 SHARED = 0.1  # share of the residuals' variance common to neighbours from which it is structure, beside 4 sigma
@@ -111,11 +110,10 @@ def _shared(pictures: Sequence[PictureReport]) -> float:
 
 
 def _lens_words(camera: Camera) -> list[str]:
-    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
-    f_px = float((lens.f_mm / lens.pixel_pitch_mm[1] if isinstance(lens, TsaiCamera) else lens.f_px).max())
+    lens = in_air(camera)
     longer, sigmas = max(camera.image_size), camera.covariance.sigmas if camera.covariance else {}
     unsure = max((sigma for name, sigma in sigmas.items() if name.startswith("c")), default=0.0)
     off = math.dist(lens.centre_px.tolist(), [(size - 1) / 2 for size in camera.image_size])
-    field = math.degrees(2 * math.atan(longer / 2 / f_px))
+    field = math.degrees(2 * math.atan(longer / 2 / float(lens.focal_px[1])))
     words = [f"the lens's centre lies {off:.0f} px off the picture's"] if off - 3 * unsure > OFF_CENTRE * longer else []
     return words if FIELD_DEG[0] < field < FIELD_DEG[1] else [*words, f"its field of view is {field:.3g} degrees"]

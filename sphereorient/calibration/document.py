@@ -1,6 +1,6 @@
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,10 +97,10 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     if bool(keys.pictures) == bool(keys.points):
         got, do = ("both" if keys.points else "neither"), "name pictures of a plate, or tables of points"
         raise camera_error(f"{path}, pictures, points", "one of them", got, do)
-    numbers = tuple(sorted({one.pose for one in keys.pictures})) or (0,)
-    pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
         raise camera_error(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
+    numbers = tuple(sorted({one.pose for one in keys.pictures})) or (0,)
+    pictures = tuple(_pictures(keys, path, numbers))
     plate = plate_from_entry(keys.plate, f"{path}, plate") if keys.pictures else None
     if not isinstance(plate, DotPlate) and any(picture.clicked_px is not None for picture in pictures):
         raise camera_error(f"{path}, clicked", "a plate with fiducials, of type dots", "another one", "remove the key")
@@ -151,68 +151,65 @@ def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[
             raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
         with named(f"{path}, ports, {name}"):
             ports[name] = entry.port()
-    check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports")
+    where = f"{path}, fit_ports"
+    check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), where)
     if keys.fit_ports and not keys.ports:
         do = "write under `ports` where the walls are, as well as you know"
-        raise camera_error(f"{path}, fit_ports", "ports to fit", "none", do)
+        raise camera_error(where, "ports to fit", "none", do)
     if len(set(keys.fit_ports)) < len(keys.fit_ports):
-        raise camera_error(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
+        raise camera_error(where, "different names", ", ".join(keys.fit_ports), "name each once")
     return ports
 
 
-def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tuple[Picture, ...]:
-    pictures, seen = [], set()
+def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> Iterator[Picture]:
+    seen = set()
     for k, entry in enumerate(keys.pictures):
-        row, files = numbers.index(entry.pose), entry.model_extra or {}
+        row, files, where = numbers.index(entry.pose), entry.model_extra or {}, f"{path}, pictures, {k}"
         if not files:
             do = "name a picture, such as cam1: cam1_00.png, or leave the entry out"
-            raise camera_error(f"{path}, pictures, {k}", "a picture", "none", do)
+            raise camera_error(where, "a picture", "none", do)
         for name, file in files.items():
             if (row, name) in seen:
                 got, do = f"a second one of pose {entry.pose}", "give every pose its own number"
-                raise camera_error(f"{path}, pictures, {k}, {name}", "one picture of a pose", got, do)
+                raise camera_error(f"{where}, {name}", "one picture of a pose", got, do)
             seen.add((row, name))
-            points, where = entry.clicked.get(name), f"{path}, pictures, {k}, clicked, {name}"
-            clicked = None if points is None else checked_clicks(points, keys.image_size, where)
-            pictures.append(Picture(camera=name, row=row, path=path.parent / file, clicked_px=clicked))
+            clicked = None
+            if name in entry.clicked:
+                clicked = checked_clicks(entry.clicked[name], keys.image_size, f"{where}, clicked, {name}")
+            yield Picture(camera=name, row=row, path=path.parent / file, clicked_px=clicked)
         for name in set(entry.clicked) - set(files):
             do = "name one of them, or remove the points"
-            raise camera_error(f"{path}, pictures, {k}, clicked", f"one of {', '.join(files)}", short(name), do)
-    return tuple(pictures)
+            raise camera_error(f"{where}, clicked", f"one of {', '.join(files)}", short(name), do)
 
 
 def checked_clicks(points: Any, image_size: tuple[int, int], where: str) -> NDArray[np.float64]:
     """Return clicked fiducials, two or three pairs u, v, px, of the origin, on +x and on +y, as an array (2 or 3, 2);
     CameraError for another number of them or places outside a picture of `image_size` (W, H).
     """
-    do = "click them again, or remove the points"
-    try:
+    do, clicked = "click them again, or remove the points", np.zeros((0, 0))
+    with suppress(TypeError, ValueError):
         clicked = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError):
-        clicked = np.zeros(0)
     if clicked.shape not in ((2, 2), (3, 2)):
-        expected = f"two or three pairs u, v: {', '.join(FIDUCIALS)}"
-        raise camera_error(where, expected, short(points), do)
+        raise camera_error(where, f"two or three pairs u, v: {', '.join(FIDUCIALS)}", short(points), do)
     for name, uv_px in zip(FIDUCIALS, clicked, strict=False):
         if not ((uv_px >= -0.5) & (uv_px <= np.array(image_size) - 0.5)).all():
-            expected, got = f"a place inside {image_size[0]} x {image_size[1]} px", f"{uv_px.tolist()}"
-            raise camera_error(f"{where}, {name}", expected, got, do)
+            expected = f"a place inside {image_size[0]} x {image_size[1]} px"
+            raise camera_error(f"{where}, {name}", expected, f"{uv_px.tolist()}", do)
     return clicked
 
 
 def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> dict[int, tuple[Tensor, Tensor]]:
-    where = f"{path}, surveyed"
-    if keys.surveyed is None:
+    where, known = f"{path}, surveyed", keys.surveyed
+    if known is None:
         do = "write the plate's pose in the lab in one picture: pose, R_lab_plate, T_lab_plate"
         raise camera_error(where, "a pose that defines the lab frame", "none", do)
-    if keys.surveyed.pose not in numbers:
-        got = f"pose {keys.surveyed.pose}, without a picture"
+    if known.pose not in numbers:
+        got = f"pose {known.pose}, without a picture"
         raise camera_error(where, "a pose with a picture", got, "name a pose that was filmed")
-    R = torch.tensor(keys.surveyed.R_lab_plate, dtype=torch.float64)
+    R, T = (torch.tensor(part, dtype=torch.float64) for part in (known.R_lab_plate, known.T_lab_plate))
     off = float((R @ R.mT - torch.eye(3, dtype=torch.float64)).abs().max())
     if off > ROTATION_TOLERANCE or float(torch.linalg.det(R)) < 0:
         got = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are {off:.2g} from it"
         do = "write the plate's x, y and z axis in the lab as its columns"
         raise camera_error(f"{where}, R_lab_plate", "a rotation", got, do)
-    T = torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64)
-    return {numbers.index(keys.surveyed.pose): (so3.nearest_rotation(R), T)}
+    return {numbers.index(known.pose): (so3.nearest_rotation(R), T)}

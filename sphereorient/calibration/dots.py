@@ -7,7 +7,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
 from scipy.special import erf
 
 from sphereorient.calibration.targets import Floats, Ints
@@ -46,23 +45,16 @@ class Dots:
         return Dots(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
 
 
-class DotSettings(BaseModel, frozen=True, extra="forbid"):
+@dataclass(frozen=True, kw_only=True)
+class DotSettings:
     """Settings of the dot detection."""
 
-    levels: int = Field(
-        32, ge=8, le=255, description="thresholds at which blobs are searched; a dot must be seen at three or more"
-    )
-    smooth_px: float = Field(0.8, ge=0, description="sigma, px, of the smoothing before the search (noise)")
-    smallest_area_px: float = Field(8.0, gt=0, description="px^2; below it a dot has too few pixels for its ellipse")
-    largest_part: float = Field(
-        0.2, gt=0, le=1, description="longest side of a dot, as part of the picture's shorter side"
-    )
-    faintest: float = Field(
-        0.4, ge=0, lt=1, description="least contrast of a dot, as part of that of the strongest ones in the picture"
-    )
-    worst_misfit: float = Field(
-        0.12, gt=0, description="rms of the picture around the fitted dot, noise included, as part of its contrast"
-    )
+    levels: int = 32  # thresholds at which blobs are searched; a dot must be seen at three or more
+    smooth_px: float = 0.8  # sigma of the smoothing before the search (noise)
+    smallest_area_px: float = 8.0  # below it a dot has too few pixels for its ellipse
+    largest_part: float = 0.2  # longest side of a dot, as part of the picture's shorter side
+    faintest: float = 0.4  # least contrast of a dot, as part of that of the strongest ones in the picture
+    worst_misfit: float = 0.12  # rms of the picture around the fitted dot, noise included, as part of its contrast
 
 
 def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotSettings = DotSettings()) -> Dots:
@@ -109,7 +101,7 @@ def _first_of_equals(uv_px: Floats, shape: Floats, good: NDArray[np.bool_]) -> N
 
 def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Floats]:
     """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses at three grey levels or more."""
-    smooth = cv2.GaussianBlur(grey, (0, 0), settings.smooth_px) if settings.smooth_px > 0 else grey
+    smooth = cv2.GaussianBlur(grey, (0, 0), settings.smooth_px)
     low, high = np.percentile(smooth, [0.1, 99.9])
     done: list[_Chain] = []
     going: list[_Chain] = []
@@ -226,8 +218,8 @@ class _Windows:
         half = int(_window(shape).max())
         steps = np.arange(-half, half + 1)
         middle = np.rint(centre_px).astype(int)
-        u = (middle[:, 0, None, None] + steps[None, None, :] + 0 * steps[None, :, None]).reshape(len(which), -1)
-        v = (middle[:, 1, None, None] + steps[None, :, None] + 0 * steps[None, None, :]).reshape(len(which), -1)
+        down, across = (step.ravel() for step in np.meshgrid(steps, steps, indexing="ij"))
+        u, v = middle[:, :1] + across, middle[:, 1:] + down
         seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
         u_in, v_in = u.clip(0, width - 1), v.clip(0, height - 1)
         x, y = u - centre_px[:, :1], v - centre_px[:, 1:]

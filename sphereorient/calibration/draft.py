@@ -1,10 +1,12 @@
 """The first calibration.yaml of a folder of plate pictures: dots counted, larger ones found, poses by their numbers."""
 
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +30,12 @@ class PlateSeen:
     """The plate of dots in one picture."""
 
     size: tuple[int, int]  # W, H px
-    columns: int  # dots along x, or the longer side where x is not known; 0: no lattice of dots
-    rows: int
-    dark: bool
-    width: float  # of a usual dot, in pitches; NaN: none
-    larger: float  # of a larger dot; NaN: none
-    marks: tuple[int, int] | None  # dots from the origin's to the larger ones on x and y; None: not three of these
+    columns: int = 0  # dots along x, or the longer side where x is not known; 0: no lattice of dots
+    rows: int = 0
+    dark: bool = True
+    width: float = math.nan  # of a usual dot, in pitches; NaN: none
+    larger: float = math.nan  # of a larger dot; NaN: none
+    marks: tuple[int, int] | None = None  # dots from the origin's to the larger ones on x and y; None: not three
 
 
 def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
@@ -65,14 +67,13 @@ def look_at_plate(path: Path) -> PlateSeen:
         if best is not None and len(best.index) > CERTAIN:
             break
     if best is None:
-        nan = float("nan")
-        return PlateSeen(size=size, columns=0, rows=0, dark=dark, width=nan, larger=nan, marks=None)
+        return PlateSeen(size=size)
     usual = float(np.median(best.width))
     large = best.width > LARGER * usual
     extent = (np.ptp(best.index, axis=0) + 1).tolist()
     axis, marks = _marks(best.index, best.index[large])
     columns, rows = sorted(extent, reverse=True) if axis is None else (extent[axis], extent[1 - axis])
-    larger = float(np.median(best.width[large])) if large.any() else float("nan")
+    larger = float(np.median(best.width[large])) if large.any() else math.nan
     return PlateSeen(size=size, columns=columns, rows=rows, dark=dark, width=usual, larger=larger, marks=marks)
 
 
@@ -95,10 +96,8 @@ def calibration_keys(
     folder: Path, pictures: Mapping[int, Mapping[str, str]], where: str, progress: Progress
 ) -> tuple[list[DraftKey], dict[str, float]]:
     """Return the keys of calibration.yaml, measured in the pictures of `folder`, and the widths of dots, in pitches,
-    by key. `where`: folder as the file names it.
-
-    Raises:
-        CameraError: a picture that cannot be read, pictures of several sizes, or no plate of dots in any.
+    by key. `where`: folder as the file names it. Raises CameraError (a picture that cannot be read, pictures of several
+    sizes, or no plate of dots in any).
     """
     paths = [folder / name for of_pose in pictures.values() for name in of_pose.values()]
     seen: list[PlateSeen] = []
@@ -114,75 +113,52 @@ def calibration_keys(
     with_dots = [one for one in seen if one.columns]
     cameras = sorted({name for of_pose in pictures.values() for name in of_pose})
     widths = _widths(with_dots)
+    entries = [{"pose": pose} | {name: f"{where}{file}" for name, file in of.items()} for pose, of in pictures.items()]
+    wall = {"normal": [0, -1, 0], "offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
+    axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    behind = "behind a flat wall: see docs/calibration.md; leave it out in air"
     keys = [
-        DraftKey(name="image_size", value=list(seen[0].size), comment="W, H px, measured"),
-        DraftKey(name="pixel_pitch", comment="mm, of the sensor, across and down", example=[0.02, 0.02], asked=True),
-        DraftKey(name="model", value="tsai", comment="or pinhole, brown"),
+        _key("image_size", "W, H px, measured", list(seen[0].size)),
+        _key("pixel_pitch", "mm, of the sensor, across and down", asked=[0.02, 0.02]),
+        _key("model", "or pinhole, brown", "tsai"),
         *_plate_keys(with_dots, widths, len(seen)),
-        DraftKey(name="surveyed.pose", value=min(pictures), comment="its plate defines the lab; any that was surveyed"),
-        DraftKey(
-            name="surveyed.R_lab_plate",
-            comment="the plate's x, y, z axes in the lab, as columns",
-            example=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-            asked=True,
-        ),
-        DraftKey(name="surveyed.T_lab_plate", comment="its origin in the lab, mm", example=[0, 0, 0], asked=True),
-        *(
-            DraftKey(
-                name=f"ports.{name}",
-                comment="behind a flat wall: see docs/calibration.md; leave it out in air",
-                example={"normal": [0, -1, 0], "offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36},
-            )
-            for name in cameras
-        ),
-        DraftKey(
-            name="pictures",
-            value=[
-                {"pose": pose} | {name: f"{where}{file}" for name, file in of.items()} for pose, of in pictures.items()
-            ],
-            comment=f"{len(seen)} of {len(pictures)} poses, paired by number",
-        ),
+        _key("surveyed.pose", "its plate defines the lab; any that was surveyed", min(pictures)),
+        _key("surveyed.R_lab_plate", "the plate's x, y, z axes in the lab, as columns", asked=axes),
+        _key("surveyed.T_lab_plate", "its origin in the lab, mm", asked=[0, 0, 0]),
+        *(DraftKey(name=f"ports.{name}", comment=behind, example=wall) for name in cameras),
+        _key("pictures", f"{len(seen)} of {len(pictures)} poses, paired by number", entries),
     ]
     return keys, widths
+
+
+def _key(name: str, comment: str, value: Any = ..., asked: Any = None) -> DraftKey:
+    """Return a key with a value, or one that is asked for, with an example."""
+    return DraftKey(name=name, value=value, comment=comment, example=asked, asked=asked is not None)
 
 
 def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: int) -> list[DraftKey]:
     """Return the keys of a plate of dots, where any picture shows one; the pitch is what pictures cannot tell."""
     if not seen:
-        example = {"type": "chessboard", "columns": 9, "rows": 6, "pitch": 10.0}
         comment = f"no dots in any of {count} pictures: type, columns, rows, pitch (docs/calibration.md)"
-        return [DraftKey(name="plate", comment=comment, example=example, asked=True)]
+        return [_key("plate", comment, asked={"type": "chessboard", "columns": 9, "rows": 6, "pitch": 10.0})]
     columns, rows = max(one.columns for one in seen), max(one.rows for one in seen)
     whole = sum((one.columns, one.rows) == (columns, rows) for one in seen)
     marks = Counter(one.marks for one in seen if one.marks).most_common(1)
     on_x, on_y = marks[0][0] if marks else (3, 2)
     fiducials = [[0, 0], [on_x, 0], [0, on_y]]
     told = f"of the largest grid seen, in {whole} of {len(seen)} pictures"
+    of_pitch = {name: f"{width:.3f} of the pitch, measured; mm" for name, width in widths.items()}
+    mm = {name: round(8.0 * widths.get(name, 0.6), 2) for name in DIAMETERS}
+    larger = "larger dots at the middle of the grid, on +x, on +y: columns and rows from the first"
+    dark = 2 * sum(one.dark for one in seen) >= len(seen)
     return [
-        DraftKey(name="plate.type", value="dots", comment="or chessboard, charuco, circles"),
-        DraftKey(name="plate.columns", value=columns, comment=told),
-        DraftKey(name="plate.rows", value=rows, comment=told),
-        DraftKey(name="plate.pitch", comment="mm, between the middles of dots", example=8.0, asked=True),
-        *(
-            DraftKey(
-                name=name,
-                comment=f"{widths[name]:.3f} of the pitch, measured; mm" if name in widths else "mm; none was seen",
-                example=round(8.0 * widths.get(name, 0.6), 2),
-            )
-            for name in DIAMETERS
-        ),
-        DraftKey(
-            name="plate.fiducials",
-            value=fiducials if marks else ...,
-            comment="larger dots at the middle of the grid, on +x, on +y: columns and rows from the first",
-            example=fiducials,
-            asked=True,
-        ),
-        DraftKey(
-            name="plate.dots",
-            value="dark" if 2 * sum(one.dark for one in seen) >= len(seen) else "bright",
-            comment="or bright, on a dark plate",
-        ),
+        _key("plate.type", "or chessboard, charuco, circles", "dots"),
+        _key("plate.columns", told, columns),
+        _key("plate.rows", told, rows),
+        _key("plate.pitch", "mm, between the middles of dots", asked=8.0),
+        *(DraftKey(name=name, comment=of_pitch.get(name, "mm; none was seen"), example=mm[name]) for name in DIAMETERS),
+        _key("plate.fiducials", larger, fiducials if marks else ..., fiducials),
+        _key("plate.dots", "or bright, on a dark plate", "dark" if dark else "bright"),
     ]
 
 

@@ -250,7 +250,11 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture", clicked
         kept = plate.is_fiducial(there) == large
         which, index, placements = which[kept], index[kept], found[None]
     if len(placements) == 0:
-        return _misplaced(index, large, plate, name)
+        if len(_placements(index * MIRROR, large, plate)):
+            return _mirrored(name)
+        expected = f"larger dots at the grid indices {[list(f) for f in plate.fiducials]}"
+        got = f"{int(large.sum())} larger dots that fit there nowhere on {plate.columns} x {plate.rows}"
+        return refused_view(name, expected, got, f"correct columns, rows and fiducials of the plate, or {CLICK}")
     got = f"{int(large.sum())}, which leave {len(placements)} places of its dots on the plate"
     do = f"show the fiducials, have the other camera see them at the same instant, or {CLICK}"
     view = targets.seen(plate, index, dots.uv_px[which], dots.sigma_px[which])
@@ -285,26 +289,12 @@ def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     found = []
     for quarters in range(4):
         at = targets.quarter_turned(index, quarters)
-        for shift in _shifts(at, large, plate):
+        shifts = targets.indices(plate.first - at.min(axis=0), plate.last - at.max(axis=0))
+        for shift in np.asarray(plate.fiducials - at[large][0]) if large.any() else shifts:
             there = at + shift
             if plate.holds(there).all() and (plate.is_fiducial(there) == large).all():
                 found.append((quarters, *shift))
     return np.array(found, dtype=np.int64).reshape(-1, 3)
-
-
-def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
-    if large.any():
-        return np.asarray(plate.fiducials - at[large][0])
-    low, high = plate.first - at.min(axis=0), plate.last - at.max(axis=0)
-    return targets.indices(low, high)
-
-
-def _misplaced(index: Ints, large: NDArray[np.bool_], plate: DotPlate, name: str) -> PlateView:
-    if len(_placements(index * MIRROR, large, plate)):
-        return _mirrored(name)
-    expected = f"larger dots at the grid indices {[list(f) for f in plate.fiducials]}"
-    got = f"{int(large.sum())} larger dots that fit there nowhere on {plate.columns} x {plate.rows}"
-    return refused_view(name, expected, got, f"correct columns, rows and fiducials of the plate, or {CLICK}")
 
 
 def _mirrored(name: str) -> PlateView:

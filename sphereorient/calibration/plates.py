@@ -1,7 +1,6 @@
 """Calibration from pictures of a plate or tables of points: points -> guess -> joint fit -> cameras."""
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +17,12 @@ from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubt
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
-from sphereorient.cameras import Camera, ParameterCovariance, Port, PortCamera, TsaiCamera, centre_lab_mm
+from sphereorient.cameras import ParameterCovariance, Port, PortCamera, TsaiCamera, centre_lab_mm, in_air
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
+from sphereorient.files.threads import side_by_side
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
@@ -33,8 +33,8 @@ CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tie
 # Sigmas from which a parameter counts as undetermined, by the begin of its name: shares of focal length, distance and
 # picture's width; mm, rad and indices. The others, of the distortion, show in these.
 LOOSE_SHARE = {"f": 0.01, "T_": 0.01, "centre": 0.02, "cx": 0.02, "cy": 0.02}
-LOOSE_PORT = {"port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05, "port_tilt": 0.05}
-LOOSE = {"rotation": 0.01} | LOOSE_PORT
+LOOSE = {"rotation": 0.01, "port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05}
+LOOSE |= {"port_tilt": 0.05}
 
 
 def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
@@ -48,7 +48,7 @@ def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: P
     document = calibration if isinstance(calibration, CalibrationDocument) else load_calibration(calibration)
     views = _read_tables(document) if document.points else see_pictures(document, progress)
     tied = {picture: view for picture, view in views.items() if view.state == "tied"}
-    _check_seen(document, views, tied)
+    _check_seen(document, views)
     progress("fit", 0, 1)
     rig = _first_rig(document, tied)
     tied = {picture: view for picture, view in tied.items() if _has_pose(rig, picture)}
@@ -66,8 +66,8 @@ def _read_tables(document: CalibrationDocument) -> dict[Picture, PlateView]:
     views = {}
     for name, path in document.points.items():
         table = read_points(path)
-        corners, index = np.zeros(len(table)), np.stack([np.arange(len(table)), np.zeros(len(table), int)], axis=1)
-        view = PlateView(table[:, :3], table[:, 3:], np.full(len(table), SIGMA_PX), corners, index)
+        zeros, index = np.zeros(len(table)), np.pad(np.arange(len(table))[:, None], ((0, 0), (0, 1)))
+        view = PlateView(table[:, :3], table[:, 3:], zeros + SIGMA_PX, zeros, index)
         views[Picture(camera=name, row=0, path=path)] = view
     return views
 
@@ -78,13 +78,15 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     plate = document.plate
     # Read all files first, to report a faulty one before the long computation.
     grey = [read_plate_picture(picture.path, document.keys.image_size) for picture in document.pictures]
-    views = {}
-    with ThreadPoolExecutor(2) as pool:
-        seen = pool.map(lambda one, it: see_plate(one, plate, it.path.name, it.clicked_px), grey, document.pictures)
-        progress("pictures", 0, len(grey))
-        for picture, view in zip(document.pictures, seen, strict=True):
-            views[picture] = view
-            progress("pictures", len(views), len(grey))
+
+    def see(k: int) -> PlateView:
+        return see_plate(grey[k], plate, document.pictures[k].path.name, document.pictures[k].clicked_px)
+
+    views: dict[Picture, PlateView] = {}
+    progress("pictures", 0, len(grey))
+    for view in side_by_side(see, range(len(grey))):
+        views[document.pictures[len(views)]] = view
+        progress("pictures", len(views), len(grey))
     return views
 
 
@@ -104,14 +106,11 @@ def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) ->
     return np.asarray(picture)
 
 
-def _check_seen(
-    document: CalibrationDocument, views: Mapping[Picture, PlateView], tied: Mapping[Picture, PlateView]
-) -> None:
+def _check_seen(document: CalibrationDocument, views: Mapping[Picture, PlateView]) -> None:
     for name in document.cameras:
-        of_camera = [picture for picture in views if picture.camera == name]
-        if not any(picture in tied for picture in of_camera):
-            do = "check plate: in the file, and the pictures"
-            got = f"none of {len(of_camera)}; the first: {views[of_camera[0]].reason}"
+        own = [view for picture, view in views.items() if picture.camera == name]
+        if all(view.state != "tied" for view in own):
+            got, do = f"none of {len(own)}; the first: {own[0].reason}", "check plate: in the file, and the pictures"
             raise camera_error(f"{document.path}, {name}", "pictures of the plate", got, do)
 
 
@@ -177,24 +176,18 @@ def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
 def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
     loose = []
     for name, camera in fitted.rig.cameras.items():
-        limits = _loose_sigmas(camera)
+        lens = in_air(camera)
+        focal = float((lens.f_mm if isinstance(lens, TsaiCamera) else lens.f_px).max())
+        scale = {"f": focal, "T_": float(camera.T_cam_lab_mm.norm())}
+        limits = {begin: share * scale.get(begin, camera.image_size[0]) for begin, share in LOOSE_SHARE.items()} | LOOSE
         for parameter, sigma in (camera.covariance.sigmas if camera.covariance else {}).items():
             share = sigma / next((limit for begin, limit in limits.items() if parameter.startswith(begin)), np.inf)
             if not share < 1:
                 loose.append((share, f"{name}.{parameter} (sigma {sigma:.3g})"))
     if loose:
-        named = ", ".join(text for _, text in sorted(loose, reverse=True)[:3])
+        got = f"loose: {', '.join(text for _, text in sorted(loose, reverse=True)[:3])}"
         do = "add pictures of the plate in other poses: tilted about both axes, nearer and farther"
-        expected = "poses that determine all parameters of the cameras"
-        raise camera_error(str(document.path), expected, f"loose: {named}", do)
-
-
-def _loose_sigmas(camera: Camera) -> dict[str, float]:
-    """Return the sigmas from which parameters are undetermined, by the begin of their names."""
-    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
-    focal, width = float((lens.f_mm if isinstance(lens, TsaiCamera) else lens.f_px).max()), camera.image_size[0]
-    scale = {"f": focal, "T_": float(camera.T_cam_lab_mm.norm())}
-    return {begin: share * scale.get(begin, width) for begin, share in LOOSE_SHARE.items()} | LOOSE
+        raise camera_error(str(document.path), "poses that determine all parameters of the cameras", got, do)
 
 
 def _collected(

@@ -1,9 +1,8 @@
 """Check and repair cameras that moved after their calibration, with the tracked sphere."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,38 +12,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, majority
+from sphereorient.calibration.comparison import GAP_PX, TURN_DEG, Limits, Seen
+from sphereorient.calibration.contradictions import majority
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
-from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras, triangulate
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras
+from sphereorient.cameras.checks import camera_error, check_known
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import TrackError
-from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.trajectory import Reason, Tracks, Trajectory
 
-OBSERVED = (Reason.OK, Reason.CONTRADICTS)
+OBSERVED = (str(Reason.OK), str(Reason.CONTRADICTS))
+PARTS = ("centre_px", "orientation")  # of a camera in a track
 MOVED = (*ROTATION, *TRANSLATION)
 PRIOR = torch.tensor([0.1] * 3 + [2.0] * 3, dtype=torch.float64)  # sigma of a camera's displacement, rad and mm
 BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alone: a dark rim shifts its centre
 SHARED = 12  # consecutive frames that share one error of the centre: they have the same light
 HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
 FRAMES_MIN = 20
-GAP_PX, TURN_DEG = 1.0, 0.2  # by which cameras that agree may differ, in any light
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
 ROUNDS = 4
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CameraObservations:
-    """What one camera alone measures of the sphere in N frames; NaN where missing."""
-
-    centre_px: Tensor  # (N, 2)
-    R_lab_body: Tensor  # (N, 3, 3), with the camera before the repair
-
-    def seen_by(self, before: Camera, camera: Camera) -> "CameraObservations":
-        """Return the same pictures as read with another camera."""
-        R_view_body = R_lab_view(before, self.centre_px).mT @ self.R_lab_body
-        return replace(self, R_lab_body=R_lab_view(camera, self.centre_px) @ R_view_body)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,31 +59,33 @@ class CameraCheck:
         return float(np.percentile(self.gap_mm, share)), float(np.percentile(self.miss_px, share))
 
 
-def observations_of(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, CameraObservations]:
-    """Return what each camera alone measures of the sphere; TrackError if the track lacks a camera."""
-    found = {}
-    for name in cameras:
-        if name not in track.cameras:
-            raise TrackError(refuse_unknown(name, track.cameras, "track, camera"))
-        camera = track.cameras[name]
-        seen = np.array([why in OBSERVED for why in camera.reason])
-        found[name] = CameraObservations(
-            centre_px=torch.from_numpy(np.where(seen[:, None], camera.centre_px, np.nan)),
-            R_lab_body=torch.from_numpy(np.where(seen[:, None, None], camera.orientation, np.nan)),
-        )
-    return found
+def observations_of(tracks: Iterable[Trajectory], cameras: Mapping[str, Camera]) -> Seen:
+    """Return what each camera alone measures of spheres, track after track; TrackError for an unknown camera."""
+    centres, attitudes = [], []
+    for track in tracks:
+        check_known(cameras, track.cameras, "track, camera", TrackError)
+        each = [track.cameras[name] for name in cameras]
+        seen = torch.from_numpy(np.stack([np.isin(one.reason, OBSERVED) for one in each], 1))
+        centre_px, R = (torch.from_numpy(np.stack([getattr(one, part) for one in each], 1)) for part in PARTS)
+        centres.append(torch.where(seen[..., None], centre_px, torch.nan))
+        attitudes.append(torch.where(seen[..., None, None], R, torch.nan))
+    centre_px = torch.cat(centres)
+    sizes = torch.full(centre_px.shape[:2], torch.nan, dtype=torch.float64)
+    return Seen(cameras=cameras, centre_px=centre_px, radius_px=sizes, R_lab_body=torch.cat(attitudes))
 
 
 def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[CameraCheck]:
     """Measure the distance between the lines of sight to the sphere's centre, for every pair of cameras."""
-    observed, checks = observations_of(track, cameras), []
-    for pair in combinations(cameras, 2):
-        both = torch.isfinite(torch.stack([observed[name].centre_px for name in pair])).all(-1).all(0)
+    seen, checks = observations_of([track], cameras), []
+    for pair in seen.pairs:
+        gaps = seen.gaps(pair)
+        both = torch.isfinite(gaps.signed_mm)
         if bool(both.any()):
-            pixels = {name: observed[name].centre_px[both] for name in pair}
-            middle, gap = triangulate(*(cameras[name].rays(pixels[name]) for name in pair))
-            missed = torch.stack([(cameras[name].project(middle) - pixels[name]).norm(dim=-1) for name in pair])
-            checks.append(CameraCheck(names=pair, gap_mm=gap.numpy(), miss_px=missed.amax(0).numpy()))
+            middle, names = gaps.position_lab_mm[both], [list(cameras)[k] for k in pair]
+            there = torch.stack([cameras[name].project(middle) for name in names], 1)
+            miss_px = (there - seen.centre_px[both][:, pair]).norm(dim=-1).amax(1)
+            gap_mm = gaps.signed_mm[both].abs()
+            checks.append(CameraCheck(names=(names[0], names[1]), gap_mm=gap_mm.numpy(), miss_px=miss_px.numpy()))
     return checks
 
 
@@ -108,47 +96,38 @@ def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repai
     """
     cameras, tracks = load_cameras(cameras_path), list(Tracks.load(track_path).values())
     used = {name: camera for name, camera in cameras.items() if name in tracks[0].cameras} or cameras
-    each = [observations_of(track, used) for track in tracks]
-    observed = {
-        name: CameraObservations(
-            centre_px=torch.cat([one[name].centre_px for one in each]),
-            R_lab_body=torch.cat([one[name].R_lab_body for one in each]),
-        )
-        for name in used
-    }
-    return self_calibrate(used, observed)
+    return self_calibrate(observations_of(tracks, used))
 
 
-def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> Repaired:
+def self_calibrate(seen: Seen) -> Repaired:
     """Rotate and shift two or more cameras until they see the sphere in one position and one orientation.
     One camera stays, since a common motion is not observable: the first, of those that agree where these are more than
     half of three or more. The others follow one by one, each against all before it. Orientations may differ by a small
     constant rotation. A prior holds motions that change only the apparent size: distance and the common plane of the
-    lines of sight.
-
-    Raises:
-        CameraError: one camera, or too few frames that both saw.
+    lines of sight. CameraError for one camera, or too few frames that both saw.
     """
-    if len(cameras) < 2:
+    names = list(seen.cameras)
+    if len(names) < 2:
         do = "give the track of both cameras"
-        raise camera_error("cameras", "two or more that saw the ball", f"{len(cameras)}", do)
-    agree, names = _agreeing(cameras, observed), list(cameras)
-    first, *others = [*(names[k] for k in agree), *(name for k, name in enumerate(names) if k not in agree)]
-    repaired, seen = dict(cameras), dict(observed)
-    moved, sigma, held = {}, {}, [f"{first}: all (the lab frame)"]
+        raise camera_error("cameras", "two or more that saw the ball", f"{len(names)}", do)
+    agree = majority(seen, Limits(gap_px=GAP_PX, turn_deg=TURN_DEG, size=1.0))
+    first, *others = [*agree, *(k for k in range(len(names)) if k not in agree)]
+    repaired, R_lab_body = dict(seen.cameras), seen.R_lab_body.clone()
+    moved, sigma, held = {}, {}, [f"{names[first]}: all (the lab frame)"]
     before, after = [], []
-    for place, name in enumerate(others):
-        still = [(repaired[one], seen[one]) for one in (first, *others[:place])]
-        pair = _Pair(still, cameras[name], observed[name])
+    for place, k in enumerate(others):
+        name, camera = names[k], seen.cameras[names[k]]
+        pair = _Pair(replace(seen, cameras=repaired, R_lab_body=R_lab_body), [first, *others[:place]], k)
         moved[name], sigma[name] = change, spread = pair.solved()
-        repaired[name] = with_parameters(cameras[name], MOVED, change)
-        seen[name] = observed[name].seen_by(cameras[name], repaired[name])
+        repaired[name] = with_parameters(camera, MOVED, change)
+        # The same picture, as read with the repaired camera.
+        R_view_body = R_lab_view(camera, seen.centre_px[:, k]).mT @ R_lab_body[:, k]
+        R_lab_body[:, k] = R_lab_view(repaired[name], seen.centre_px[:, k]) @ R_view_body
         held += [f"{name}.{part}" for part, loose in zip(MOVED, spread > HELD_SHARE * PRIOR, strict=True) if loose]
         before.append(pair.gaps(torch.zeros(6, dtype=torch.float64)))
         after.append(pair.gaps(change))
-        known = cameras[name].covariance
-        if known is not None:
-            repaired[name] = _with_spread(repaired[name], known, spread)
+        if camera.covariance is not None:
+            repaired[name] = _with_spread(repaired[name], camera.covariance, spread)
     return Repaired(
         cameras=repaired,
         moved=moved,
@@ -160,47 +139,28 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
     )
 
 
-def _agreeing(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> tuple[int, ...]:
-    """Return the cameras that agree where these are more than half of three or more; else none."""
-    if len(cameras) < 3:
-        return ()
-    R = torch.stack([observed[name].R_lab_body for name in cameras], 1)
-    seen = Seen(
-        cameras=cameras,
-        centre_px=torch.stack([observed[name].centre_px for name in cameras], 1),
-        radius_px=torch.full(R.shape[:2], torch.nan, dtype=torch.float64),
-        R_lab_body=R,
-        diameter_mm=1.0,  # nothing is known of sizes
-    )
-    return majority(seen, Limits(gap_px=GAP_PX, turn_deg=TURN_DEG, size=1.0))
-
-
 class _Pair:
     """Residuals of one camera against others; unknowns (9,): its motion (6,) and a constant rotation bias."""
 
-    def __init__(
-        self, still: Sequence[tuple[Camera, CameraObservations]], loose: Camera, seen_loose: CameraObservations
-    ) -> None:
-        known = torch.isfinite(seen_loose.centre_px).all(-1) & torch.isfinite(seen_loose.R_lab_body).all(-1).all(-1)
-        each = [
-            known & torch.isfinite(seen.centre_px).all(-1) & torch.isfinite(seen.R_lab_body).all(-1).all(-1)
-            for _, seen in still
-        ]
-        if (count := sum(int(both.sum()) for both in each)) < FRAMES_MIN:
+    def __init__(self, seen: Seen, still: Sequence[int], loose: int) -> None:
+        cameras, pixels = list(seen.cameras.values()), seen.centre_px
+        known = torch.isfinite(pixels).all(-1) & torch.isfinite(seen.R_lab_body).flatten(2).all(-1)
+        each = {k: known[:, k] & known[:, loose] for k in still}
+        if (count := sum(int(both.sum()) for both in each.values())) < FRAMES_MIN:
             expected = f"{FRAMES_MIN} frames or more in which both cameras measure the ball's orientation"
             do = "pass a longer track, made with both cameras"
             raise camera_error("track", expected, f"{count}", do)
-        self.loose = loose
-        rays = [camera.rays(seen.centre_px[both]) for (camera, seen), both in zip(still, each, strict=True)]
+        self.loose = cameras[loose]
+        rays = [cameras[k].rays(pixels[both, k]) for k, both in each.items()]
         self.ray = Rays(
             origin_lab_mm=torch.cat([ray.origin_lab_mm for ray in rays]),
             direction_lab=torch.cat([ray.direction_lab for ray in rays]),
         )
-        self.centre_px = torch.cat([seen_loose.centre_px[both] for both in each])
-        self.R_still = torch.cat([seen.R_lab_body[both] for (_, seen), both in zip(still, each, strict=True)])
+        self.centre_px = torch.cat([pixels[both, loose] for both in each.values()])
+        self.R_still = torch.cat([seen.R_lab_body[both, k] for k, both in each.items()])
         # The body's orientation relative to the camera, independent of the camera's pose in the lab.
-        R_loose = torch.cat([seen_loose.R_lab_body[both] for both in each])
-        self.R_view_body = R_lab_view(loose, self.centre_px).mT @ R_loose
+        R_loose = torch.cat([seen.R_lab_body[both, loose] for both in each.values()])
+        self.R_view_body = R_lab_view(self.loose, self.centre_px).mT @ R_loose
 
     def gaps(self, change: Tensor) -> Tensor:
         """Signed distances (N,) between the two lines of sight, mm."""

@@ -43,17 +43,11 @@ def least_squares(
     gain: float = 1e-14,
     steps: int = 100,
 ) -> Tensor:
-    """Return the unknowns (K,) that minimise the sum of squared residuals, or of their soft L1 losses.
-    scipy's least_squares needs three times as many slopes of a whole calibration.
+    """Return the unknowns (K,) that minimise the sum of squared `residuals` (n,), or of soft L1 losses, which grow
+    linearly beyond `soft`. NaN counts as FAR; a step whose residuals raise CameraError is rejected. `slopes`: (n, K).
+    Ends after `steps`, or where the cost decreases by the share `gain` only. scipy's least_squares needs three times as
+    many slopes of a whole calibration.
     Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
-
-    Args:
-        residuals: of unknowns (K,), (n,); NaN counts as FAR. A step whose residuals raise CameraError is rejected.
-        slopes: of unknowns, (n, K).
-        start: (K,).
-        soft: residual beyond which the loss grows linearly.
-        gain: relative decrease of the cost at which the iteration ends.
-        steps: maximum number.
     """
 
     def tried(at: Tensor) -> tuple[Tensor, float]:
@@ -103,11 +97,8 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
 
 def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_px: Tensor) -> AnyCamera:
     """Fit the parameters `names` of any camera, also behind a port, to lab points (n, 3), mm, and pixels (n, 2).
-    The start must be near. The covariance is from the residuals, at least 0.05 px.
-
-    Raises:
-        CameraError: too few points, numbers that are not finite, or undetermined parameters, named.
-        ShapeError: arrays of another shape.
+    The start must be near. The covariance is from the residuals, at least 0.05 px. Raises CameraError (too few points,
+    numbers that are not finite, or undetermined parameters, named), ShapeError (arrays of another shape).
     """
     x_lab_mm, uv_px = checked_points(x_lab_mm, uv_px)
     size, least = len(names), -(-len(names) // 2)

@@ -1,12 +1,15 @@
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain, combinations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sphereorient.calibration.solve import slopes_along
 from sphereorient.cameras import Camera, ParameterCovariance, R_cam_view
 from sphereorient.cameras.parameters import with_parameters
+from sphereorient.trajectory import Trajectory
 
 CAP_RINGS = (0.35, 0.75)  # of the radius: points of the visible cap
 PER_RING = 6
@@ -114,3 +117,20 @@ def _ring(share: float, count: int, turned: float = 0.0) -> Tensor:
     angle = torch.arange(count, dtype=torch.float64) * (2 * torch.pi / count) + turned
     depth = -torch.full_like(angle, (1 - share**2) ** 0.5)
     return torch.stack([share * angle.cos(), share * angle.sin(), depth], dim=-1)
+
+
+def with_systematic_errors(
+    track: Trajectory, cameras: Mapping[str, Camera], covariance: ParameterCovariance | None, radius_mm: float
+) -> Trajectory:
+    """Add the calibration's systematic errors to the poses; unchanged without a covariance of the camera parameters."""
+    if covariance is None:
+        return track
+    position = torch.from_numpy(track.position)
+    place, turn = torch.from_numpy(track.position_cov * np.nan), torch.from_numpy(track.orientation_cov * np.nan)
+    saw = dict(zip(track.cameras, track.believed.T, strict=True))
+    for some in chain.from_iterable(combinations(cameras, count) for count in range(1, len(cameras) + 1)):
+        rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
+        if bool(rows.any()):
+            left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
+            place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
+    return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())

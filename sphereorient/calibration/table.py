@@ -1,7 +1,6 @@
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import torch
 from rich.table import Column, Table
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.calibration.calibrated import Calibrated
 from sphereorient.calibration.self_calibration import MOVED, OBSERVED, CameraCheck, Repaired
-from sphereorient.cameras import Camera, PortCamera
+from sphereorient.cameras import Camera, PortCamera, in_air
 from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
 from sphereorient.trajectory import Reason, Trajectory
 
@@ -23,10 +22,8 @@ def parameters_table(result: Calibrated) -> Table:
     values = [_values(camera) for camera in result.cameras.values()]
     sigmas = [camera.covariance.sigmas if camera.covariance else {} for camera in result.cameras.values()]
     for name in dict.fromkeys(name for known in values for name in known):
-        cells = []
-        for known, sigma in zip(values, sigmas, strict=True):
-            cells.append(f"{known[name]:.7g} ({sigma.get(name, math.nan):.2g})" if name in known else "")
-        table.add_row(name, *cells)
+        of_name = [(known.get(name), sigma.get(name, math.nan)) for known, sigma in zip(values, sigmas, strict=True)]
+        table.add_row(name, *("" if value is None else f"{value:.7g} ({sigma:.2g})" for value, sigma in of_name))
     return table
 
 
@@ -96,7 +93,7 @@ def contradiction_lines(track: Trajectory) -> list[str]:
 def _values(camera: Camera) -> dict[str, float]:
     """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
     known = () if camera.covariance is None else camera.covariance.names
-    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
+    lens = in_air(camera)
     found: dict[str, Tensor] = {}
     for name, (field, place) in lens.parameter_fields().items():
         found[name] = getattr(lens, field)[... if place is None else place]

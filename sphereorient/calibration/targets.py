@@ -37,6 +37,11 @@ class CalibrationTarget:
             if one.type is bool and not isinstance(value, bool):
                 raise _refused(name, "true or false", value)
 
+    @property
+    def extent(self) -> tuple[int, int]:
+        """The largest grid indices."""
+        return self.columns - 1, self.rows - 1
+
     def points(self, index: Ints) -> Floats:
         """Return the points (n, 3), plate frame, mm, with grid indices (n, 2)."""
         flat = index.astype(np.float64) * self.pitch_mm
@@ -118,11 +123,6 @@ class Chessboard(CalibrationTarget):
         if min(self.columns, self.rows) < 3:
             got, do = f"{self.columns} x {self.rows}", "count the corners between squares, without the border"
             raise camera_error("plate", "3 x 3 inner corners or more", got, do)
-
-    @property
-    def extent(self) -> tuple[int, int]:
-        """The largest grid indices."""
-        return self.columns - 1, self.rows - 1
 
 
 @dataclass(frozen=True, kw_only=True)

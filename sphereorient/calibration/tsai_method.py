@@ -5,13 +5,14 @@ middle. Linear equations give R, T_x, T_y, then f, T_z; a search refines f, T_z,
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
-from sphereorient.cameras.checks import camera_error, check_image_size, check_positive
+from sphereorient.cameras.checks import camera_error, check_image_size, check_known, check_positive
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
 from sphereorient.cameras.tsai import TsaiCamera
@@ -33,18 +34,12 @@ def tsai_stages(
     x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
     """Calibrate a camera by Tsai's two stages: R, T_x, T_y from radial alignment, then f, T_z and kappa1.
-    The covariance takes R, T_x, T_y as exact; with noise, `calibrate_tsai` is more accurate.
+    From points (n, 3), lab, mm, right-handed, and their pixels (n, 2), for a picture of `image_size` (W, H), px, and a
+    pixel pitch along u and v; s_x is 1. Points in one plane also fit mirrored: give the seen side. The covariance takes
+    R, T_x, T_y as exact; with noise, `calibrate_tsai` is more accurate.
+    Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels),
+    ShapeError (arrays of another shape).
     Source: Tsai 1987, stages 1 and 2, which the paper uses without error.
-
-    Args:
-        x_lab_mm: (n, 3), lab, mm, right-handed; points in one plane also fit mirrored: give the seen side.
-        uv_px: (n, 2), their pixels.
-        image_size: (W, H), px.
-        pixel_pitch_mm: along u and v; s_x is 1.
-
-    Raises:
-        CameraError: points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels.
-        ShapeError: arrays of another shape.
     """
     points, pixels = checked_points(x_lab_mm, uv_px)
     _check_count(points, POINTS_OF_PLANE, "in one plane")
@@ -80,10 +75,7 @@ def calibrate_tsai(
     `also` names which of sx (needs points outside one plane), centre_u, centre_v (strong perspective) are fitted
     besides f, kappa1, R and T. Errors as in `tsai_stages`; CameraError for other names in `also`.
     """
-    for name in also:
-        if name not in ALSO:
-            do = "leave it out: the others are fitted, and the pixel pitch is held"
-            raise camera_error("also", f"some of {', '.join(ALSO)}", f"'{name}'", do)
+    check_known(also, ALSO, "also")
     camera = tsai_stages(x_lab_mm, uv_px, image_size, pixel_pitch_mm)
     points, pixels = checked_points(x_lab_mm, uv_px)
     if "sx" in also and _Frame(points).relief < FLAT:
@@ -174,14 +166,12 @@ def _with_depth(R: Tensor, T: Tensor, points: Tensor, sensor_mm: Tensor) -> tupl
 
 def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiCamera:
     """Fit f, T_z and kappa1 from each start; return the best, skipping undetermined ones."""
-    fitted, refused = [], CameraError("")
+    names, fitted = ("f", "T_z", "kappa1"), []
     for start in starts:
-        try:
-            fitted.append(fit_to_points(start, ("f", "T_z", "kappa1"), points, pixels))
-        except CameraError as error:
-            refused = error
+        with suppress(CameraError):
+            fitted.append(fit_to_points(start, names, points, pixels))
     if not fitted:
-        raise refused
+        return fit_to_points(starts[-1], names, points, pixels)  # which is refused
     return min(fitted, key=lambda camera: rms_px(camera, points, pixels))
 
 

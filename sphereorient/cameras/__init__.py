@@ -15,5 +15,5 @@ from sphereorient.cameras.camera import (
 )
 from sphereorient.cameras.ideal import PinholeCamera
 from sphereorient.cameras.io.cameras_yaml import add_model, load_cameras, load_covariance, save_cameras
-from sphereorient.cameras.port import Port, PortCamera
+from sphereorient.cameras.port import Port, PortCamera, in_air
 from sphereorient.cameras.tsai import TsaiCamera

@@ -4,7 +4,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from sphereorient.errors import CameraError, ShapeError, check_tail, refusal
+from sphereorient.errors import CameraError, ShapeError, SphereOrientError, check_tail, refusal
 from sphereorient.files.yaml_file import refuse_unknown, short
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
@@ -66,11 +66,13 @@ def named(where: str) -> Iterator[None]:
         raise CameraError(f"{where}, {error}") from None
 
 
-def check_known(names: Iterable[str], known: Collection[str], where: str) -> None:
-    """Refuse names that are not among the known ones (CameraError)."""
+def check_known(
+    names: Iterable[str], known: Collection[str], where: str, error: type[SphereOrientError] = CameraError
+) -> None:
+    """Refuse names that are not among the known ones."""
     for name in names:
         if name not in known:
-            raise CameraError(refuse_unknown(name, known, where))
+            raise error(refuse_unknown(name, known, where))
 
 
 def camera_error(name: str, expected: str, got: str, do: str = "correct the camera") -> CameraError:

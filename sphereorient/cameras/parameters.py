@@ -39,10 +39,8 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
 
 def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> AnyCamera:
     """Return the camera with small changes `delta` (P,) of the parameters `names`, in their units; differentiable.
-
-    Raises:
-        CameraError: an unknown name, a name twice, or changes that make the camera impossible.
-        ShapeError: `delta` has another shape.
+    Raises CameraError (an unknown name, a name twice, or changes that make the camera impossible), ShapeError (`delta`
+    has another shape).
     """
     check_tail("delta", delta, len(names))
     check_known(names, parameter_names(camera), "parameter")

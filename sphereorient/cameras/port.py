@@ -1,5 +1,5 @@
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -194,3 +194,8 @@ class PortCamera:
         close = 1e3 * torch.finfo(missed.dtype).eps * (1 + x_lab_mm.norm(dim=-1, keepdim=True))
         found = missed.norm(dim=-1, keepdim=True) < close
         return torch.where(inside & found, apparent, torch.full_like(apparent, torch.nan))
+
+
+def in_air(camera: Camera) -> Any:
+    """Return the camera model itself, without the wall before it."""
+    return camera.camera if isinstance(camera, PortCamera) else camera

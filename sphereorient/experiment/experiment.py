@@ -1,5 +1,5 @@
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -7,9 +7,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
+from sphereorient.cameras.checks import check_known
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.files.whole_file import relative_path
-from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated, write_document
+from sphereorient.files.yaml_file import read_document, short, validated, write_document
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
 from sphereorient.sphere import seen_path
 
@@ -67,10 +68,9 @@ class Experiment:
         if name == "":
             return replace(self, spheres=(self.sphere,))
         if self.names == ("",):
-            got, do = "one without name", "name the experiment of the track"
-            raise ExperimentError(refusal(f"{self.path}, spheres", expected=f"a ball {name}", got=got, do=do))
-        if name not in self.names:
-            raise ExperimentError(refuse_unknown(name, self.names, f"{self.path}, spheres"))
+            do = "name the experiment of the track"
+            raise refused(f"{self.path}, spheres", f"a ball {name}", "one without name", do)
+        check_known([name], self.names, f"{self.path}, spheres", ExperimentError)
         return replace(self, spheres=(self.spheres[self.names.index(name)],))
 
     def with_sphere(self, **changes: Any) -> "Experiment":
@@ -82,8 +82,7 @@ class Experiment:
         """The only sphere; ExperimentError if there are several."""
         if len(self.spheres) > 1:
             do = "name a file with one of them under `sphere`, or take experiment.of(NAME) in Python"
-            got = ", ".join(self.names)
-            raise ExperimentError(refusal(f"{self.path}, spheres", expected="one ball", got=got, do=do))
+            raise refused(f"{self.path}, spheres", "one ball", ", ".join(self.names), do)
         return self.spheres[0]
 
     @property
@@ -110,6 +109,11 @@ class Experiment:
     def radius_mm(self) -> float:
         """Radius of the only sphere; 1 if its diameter is unknown and lengths are in radii."""
         return 1.0 if self.diameter_mm is None else self.diameter_mm / 2
+
+
+def refused(name: str, expected: str, got: str, do: str) -> ExperimentError:
+    """Return an ExperimentError worded by `refusal`."""
+    return ExperimentError(refusal(name, expected=expected, got=got, do=do))
 
 
 class SphereKeys(BaseModel, frozen=True, extra="forbid"):
@@ -159,24 +163,30 @@ def load_experiment(path: Path | str) -> Experiment:
     path = Path(path)
     if is_movie(path):
         do = f"write its experiment.yaml first: `sphereorient init {path}`"
-        raise ExperimentError(refusal(str(path), expected="an experiment.yaml", got="a movie", do=do))
+        raise refused(str(path), "an experiment.yaml", "a movie", do)
     do = "write one with `sphereorient init MOVIE`, or correct the path"
     document = read_document(path, SCHEMA, ExperimentError, do)
     needed = (("frame_rate", "times"), ("sphere", "spheres"))
     missing = [" or ".join(either) for either in needed if not document.keys() & set(either)]
     keys = validated(ExperimentKeys, document, str(path), ExperimentError, missing)
     for key in ("masks", "backgrounds", "start", "flip"):
-        for name in getattr(keys, key):
-            if name not in keys.movies:
-                raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))
+        check_known(getattr(keys, key), keys.movies, f"{path}, {key}", ExperimentError)
     _check_numbers(path, keys)
     _check_spheres(path, keys)
     cameras_path = path.parent / keys.cameras
     known = load_cameras(cameras_path)
     for name in keys.movies:
-        if name not in known:
-            raise ExperimentError(refuse_unknown(name, known, f"{cameras_path}, camera of movie {name}"))
+        check_known([name], known, f"{cameras_path}, camera of movie {name}", ExperimentError)
     cameras = {name: known[name] for name in keys.movies}
+
+    def at(files: Mapping[str, str]) -> dict[str, Path]:
+        return {name: path.parent / file for name, file in files.items()}
+
+    def sphere(name: str, one: SphereKeys) -> Sphere:
+        texture = None if one.texture is None else path.parent / one.texture
+        return Sphere(name=name, diameter_mm=one.diameter, texture_path=texture, fixed=one.fixed)
+
+    spheres = keys.spheres if keys.sphere is None else {"": keys.sphere}
     return Experiment(
         name=path.stem if keys.name is None else keys.name,
         path=path,
@@ -184,19 +194,11 @@ def load_experiment(path: Path | str) -> Experiment:
         cameras_path=cameras_path,
         cameras=cameras,
         camera_covariance=load_covariance(cameras_path, cameras),
-        movie_paths={name: path.parent / movie for name, movie in keys.movies.items()},
+        movie_paths=at(keys.movies),
         exposure_s=keys.exposure,
-        spheres=tuple(
-            Sphere(
-                name=name,
-                diameter_mm=sphere.diameter,
-                texture_path=None if sphere.texture is None else path.parent / sphere.texture,
-                fixed=sphere.fixed,
-            )
-            for name, sphere in (keys.spheres if keys.sphere is None else {"": keys.sphere}).items()
-        ),
-        mask_paths={name: path.parent / mask for name, mask in keys.masks.items()},
-        background_paths={name: path.parent / picture for name, picture in keys.backgrounds.items()},
+        spheres=tuple(sphere(name, one) for name, one in spheres.items()),
+        mask_paths=at(keys.masks),
+        background_paths=at(keys.backgrounds),
         times=keys.times if keys.times in (None, MOVIES_OWN) else str(path.parent / str(keys.times)),
         start={name: keys.start.get(name, 0) for name in keys.movies},
         start_given=bool(keys.start),
@@ -208,13 +210,14 @@ def load_experiment(path: Path | str) -> Experiment:
 
 def write_experiment(experiment: Experiment, comment: str = "") -> Path:
     """Write an experiment, without its cameras, to its `path`, and return the path; `comment` stands at the top.
-
-    Raises:
-        OutputError: file not writable.
+    Raises OutputError (file not writable).
     """
 
     def relative(path: Path | str) -> str:
         return relative_path(path, experiment.folder)
+
+    def all_relative(paths: Mapping[str, Path]) -> dict[str, str]:
+        return {name: relative(path) for name, path in paths.items()}
 
     def keys_of(sphere: Sphere) -> dict[str, Any]:
         keys: dict[str, Any] = {"diameter": sphere.diameter_mm}
@@ -229,9 +232,9 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
         "exposure": None if experiment.exposure_s is None else float(experiment.exposure_s),
         **({"sphere": spheres[""]} if "" in spheres else {"spheres": spheres}),
         "cameras": relative(experiment.cameras_path),
-        "movies": {name: relative(path) for name, path in experiment.movie_paths.items()},
-        "masks": {name: relative(path) for name, path in experiment.mask_paths.items()},
-        "backgrounds": {name: relative(path) for name, path in experiment.background_paths.items()},
+        "movies": all_relative(experiment.movie_paths),
+        "masks": all_relative(experiment.mask_paths),
+        "backgrounds": all_relative(experiment.background_paths),
         "start": {name: number for name, number in experiment.start.items() if number},
         "frames": None if experiment.frames is None else list(experiment.frames),
         "flip": dict(experiment.flip),
@@ -244,21 +247,16 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
 
 def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> dict[str, Movie]:
     """Open the movies of the named cameras (None: all) and check their picture sizes.
-
-    Raises:
-        ExperimentError: unknown camera name.
-        MovieError: missing, unreadable, or of another size than the camera.
+    Raises ExperimentError (unknown camera name), MovieError (missing, unreadable, or of another size than the camera).
     """
     movies: dict[str, Movie] = {}
     for name in experiment.movie_paths if names is None else names:
-        if name not in experiment.movie_paths:
-            raise ExperimentError(refuse_unknown(name, experiment.movie_paths, f"{experiment.path}, movies"))
+        check_known([name], experiment.movie_paths, f"{experiment.path}, movies", ExperimentError)
         movie = flipped(open_movie(experiment.movie_paths[name]), experiment.flip.get(name, "none"))
-        width, height = experiment.cameras[name].image_size
-        if movie.frame_shape != (height, width):
+        (width, height), (rows, columns) = experiment.cameras[name].image_size, movie.frame_shape
+        if (rows, columns) != (height, width):
             expected = f"{width} x {height} px as camera {name} in {experiment.cameras_path}"
-            got = f"{movie.frame_shape[1]} x {movie.frame_shape[0]}"
-            do = "calibrate the camera with this movie's picture size"
+            got, do = f"{columns} x {rows}", "calibrate the camera with this movie's picture size"
             raise MovieError(refusal(str(movie.path), expected=expected, got=got, do=do))
         movies[name] = movie
     return movies
@@ -272,7 +270,7 @@ def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> d
         single += [paths[name] for name in used if name in paths]
     for texture in (sphere.texture_path for sphere in experiment.spheres):
         if texture is not None:
-            single += [texture, *([counts] if (counts := seen_path(texture)).is_file() else [])]
+            single += [texture, *(counts for counts in [seen_path(texture)] if counts.is_file())]
     if experiment.times not in (None, MOVIES_OWN):
         single.append(Path(str(experiment.times)))
     movies = [experiment.movie_paths[name] for name in used if name in experiment.movie_paths]
@@ -288,26 +286,24 @@ def outside_paths(experiment: Experiment) -> list[Path]:
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     if (keys.frame_rate is None) == (keys.times is None):
         got, do = "neither" if keys.times is None else "both", "write frame_rate: in Hz, or times: with a file"
-        raise ExperimentError(refusal(str(path), expected="either frame_rate or times", got=got, do=do))
+        raise refused(str(path), "either frame_rate or times", got, do)
     if keys.frames is not None and keys.frames[0] >= keys.frames[1]:
-        do = "write first and last + 1"
-        raise ExperimentError(refusal(f"{path}, frames", expected="first below last", got=str(keys.frames), do=do))
+        raise refused(f"{path}, frames", "first below last", str(keys.frames), "write first and last + 1")
     if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
-        expected, do = f"at most the time between frames, {1 / keys.frame_rate:.4g} s", "write it in seconds"
-        raise ExperimentError(refusal(f"{path}, exposure", expected=expected, got=f"{keys.exposure:g}", do=do))
+        expected = f"at most the time between frames, {1 / keys.frame_rate:.4g} s"
+        raise refused(f"{path}, exposure", expected, f"{keys.exposure:g}", "write it in seconds")
 
 
 def _check_spheres(path: Path, keys: ExperimentKeys) -> None:
-    def refused(where: str, expected: str, got: str, do: str) -> ExperimentError:
-        return ExperimentError(refusal(f"{path}, {where}", expected=expected, got=got, do=do))
-
+    where = f"{path}, spheres"
     if keys.sphere is None and not keys.spheres:
-        raise refused("sphere", "a value", "none", "add the key, or `spheres` with a name for each ball")
+        raise refused(f"{path}, sphere", "a value", "none", "add the key, or `spheres` with a name for each ball")
     if keys.sphere is not None and keys.spheres:
-        raise refused("sphere", "either sphere or spheres", "both", "write `sphere` for one ball, else `spheres`")
+        do = "write `sphere` for one ball, else `spheres`"
+        raise refused(f"{path}, sphere", "either sphere or spheres", "both", do)
     for name, sphere in keys.spheres.items():
         if not name.strip() or "/" in name or name == ".":
-            raise refused("spheres", "names without '/'", short(name), "give each ball a name, such as a")
+            raise refused(where, "names without '/'", short(name), "give each ball a name, such as a")
         if sphere.diameter is None and len(keys.spheres) > 1:
-            got, do = "none", "measure it: lengths of several balls are in mm"
-            raise refused(f"spheres.{name}.diameter", "a number (mm)", got, do)
+            do = "measure it: lengths of several balls are in mm"
+            raise refused(f"{where}.{name}.diameter", "a number (mm)", "none", do)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.errors import ExperimentError, refusal
+from sphereorient.errors import ExperimentError
+from sphereorient.experiment.experiment import refused
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
 from sphereorient.sphere.view import fitted_circle
 
@@ -42,24 +43,22 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
     pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith("#"))
     values = {key.strip(): value.strip() for key, _, value in pairs}
-    for name, what in (("src_fn", "the movie"), ("vfov", "the camera's field of view, degrees")):
+    needed = {"src_fn": "the movie", "vfov": "the camera's field of view, degrees"}
+    for name, what in needed.items():
         if not values.get(name):
-            raise ExperimentError(refusal(f"{path}, {name}", expected=what, got="none", do=DO))
+            raise refused(f"{path}, {name}", what, "none", DO)
     vfov = _numbers(values["vfov"])
     if len(vfov) != 1 or not 0 < vfov[0] < 180:
-        raise ExperimentError(
-            refusal(f"{path}, vfov", expected="degrees, 0 to 180", got=f"'{values['vfov'][:40]}'", do="correct it")
-        )
+        raise refused(f"{path}, vfov", "degrees, 0 to 180", f"'{values['vfov'][:40]}'", "correct it")
     for name, (usual, what, do) in NOT_READ.items():
         if values.get(name, usual[0]).lower() not in usual:
-            raise ExperimentError(refusal(f"{path}, {name}", expected=what, got=f"'{values[name][:40]}'", do=do))
+            raise refused(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
     if not values.get("c2a_r"):
         do = "run FicTrac's configGui, or write c2a_r : { 0, 0, 0 } for the camera's own frame"
-        raise ExperimentError(refusal(f"{path}, c2a_r", expected="the turn to the animal, rad", got="none", do=do))
+        raise refused(f"{path}, c2a_r", "the turn to the animal, rad", "none", do)
     rate, turn = _numbers(values.get("src_fps", "")), _numbers(values["c2a_r"])
     if len(turn) != 3:
-        got, do = f"{len(turn)}", "correct it"
-        raise ExperimentError(refusal(f"{path}, c2a_r", expected="three numbers, rad", got=got, do=do))
+        raise refused(f"{path}, c2a_r", "three numbers, rad", f"{len(turn)}", "correct it")
     limb = np.array(_numbers(values.get("roi_circ", "")))
     return FicTracConfig(
         movie=path.parent / values["src_fn"],
@@ -79,6 +78,5 @@ def _polygons(path: Path, text: str) -> list[NDArray[np.int32]]:
     """Return the innermost { ... } of a text as polygons (n, 2)."""
     polygons = [np.array(_numbers(group)) for group in re.findall(r"\{([^{}]+)\}", text)]
     if any(len(one) < 6 or len(one) % 2 for one in polygons):
-        got, do = "another count of numbers", "correct it"
-        raise ExperimentError(refusal(f"{path}, roi_ignr", expected="u, v of three points or more", got=got, do=do))
+        raise refused(f"{path}, roi_ignr", "u, v of three points or more", "another count of numbers", "correct it")
     return [np.rint(one).astype(np.int32).reshape(-1, 2) for one in polygons]

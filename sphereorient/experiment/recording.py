@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
-from sphereorient.errors import ExperimentError, refusal
-from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths
+from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths, refused
 from sphereorient.experiment.stream import CameraStream, given_mask
 from sphereorient.experiment.timeline import Rows, Timeline, timeline
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
@@ -92,9 +91,7 @@ def open_recording(
     source: Experiment | str | Path, cameras: Sequence[str] | None = None, *, textured: bool = True
 ) -> Iterator[Recording]:
     """Open an experiment, or its path, with the named cameras (None: all); without `textured`, no texture map is read.
-
-    Raises:
-        SphereOrientError: inputs missing, unreadable or inconsistent; with `textured`, no texture map.
+    Raises SphereOrientError (inputs missing, unreadable or inconsistent; with `textured`, no texture map).
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
     paths = {sphere.name: _texture_path(experiment, sphere) for sphere in experiment.spheres} if textured else {}
@@ -102,16 +99,11 @@ def open_recording(
     names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
     frames = timeline(experiment, movies)
-    streams = [
-        CameraStream(
-            name=name,
-            camera=experiment.cameras[name],
-            movie=movie,
-            rows=frames.rows[name],
-            shown=given_mask(experiment, name, movie.frame_shape),
-        )
-        for name, movie in movies.items()
-    ]
+    streams = []
+    for name, movie in movies.items():
+        shown = given_mask(experiment, name, movie.frame_shape)
+        camera, rows = experiment.cameras[name], frames.rows[name]
+        streams.append(CameraStream(name=name, camera=camera, movie=movie, rows=rows, shown=shown))
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
     remarks += [
         f"{path}: {100 * unseen_share(one.unseen):.0f} % of the ball is unseen and no paint"
@@ -133,7 +125,7 @@ def _texture_path(experiment: Experiment, sphere: Sphere) -> Path:
         return sphere.texture_path
     key, name = (f"spheres.{sphere.name}", f", ball {sphere.name}") if sphere.name else ("sphere", "")
     do = f"learn it with `sphereorient map`, then write {key}.texture: the file that this gives"
-    raise ExperimentError(refusal(f"{experiment.path}{name}", expected="a texture", got="none", do=do))
+    raise refused(f"{experiment.path}{name}", "a texture", "none", do)
 
 
 def load_map(path: Path) -> TextureMap:
@@ -147,6 +139,5 @@ def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
     wanted = known if cameras is None else list(cameras)
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
-        got, do = ", ".join(unknown) or "none", "name cameras of the experiment"
-        raise ExperimentError(refusal("cameras", expected=" or ".join(known), got=got, do=do))
+        raise refused("cameras", " or ".join(known), ", ".join(unknown) or "none", "name cameras of the experiment")
     return [name for name in known if name in wanted]

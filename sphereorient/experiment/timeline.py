@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.experiment.experiment import MOVIES_OWN, Experiment
+from sphereorient.experiment.experiment import MOVIES_OWN, Experiment, refused
 from sphereorient.files.whole_file import read_text
 from sphereorient.movies import Movie
 
@@ -43,9 +43,7 @@ class Timeline:
 
     def gridded(self) -> "tuple[Timeline, Rows]":
         """Resample onto a regular grid, inserting missing frames; return it and the frames' indices in it.
-
-        Raises:
-            ExperimentError: the times lie on no regular grid.
+        Raises ExperimentError (the times lie on no regular grid).
         """
         steps = np.rint(np.diff(self.time_s) / self.frame_s).clip(1, LONGEST_PAUSE).astype(np.int64)
         place: Rows = np.concatenate([[0], np.cumsum(steps)])
@@ -53,12 +51,11 @@ class Timeline:
         if (off[steps < LONGEST_PAUSE] > ON_GRID * self.frame_s).any():
             do = "use --method precise, which takes any times"
             got = f"steps from {np.diff(self.time_s).min():.4g} to {np.diff(self.time_s).max():.4g} s"
-            raise ExperimentError(refusal("times", expected="frames on an even grid", got=got, do=do))
-        count = int(place[-1]) + 1
-        rows = {name: np.full(count, NONE) for name in self.rows}
+            raise refused("times", "frames on an even grid", got, do)
+        frames = np.arange(int(place[-1]) + 1)
+        rows = {name: np.full(len(frames), NONE) for name in self.rows}
         for name, row in self.rows.items():
             rows[name][place] = row
-        frames = np.arange(count)
         time_s = np.interp(frames, place, self.time_s)
         return replace(self, number=self.number[0] + frames, time_s=time_s, rows=rows), place
 
@@ -74,9 +71,8 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     Times come from the frame rate, a table, or stamps of the movies; equal stamps of several cameras make one frame.
     MKV stamps are not used: they are rounded to 1 ms.
 
-    Raises:
-        ExperimentError: unreadable table of times, or one of another length.
-        MovieError: a movie lacks frames, or time stamps with `times: movies`.
+    Raises ExperimentError (unreadable table of times, or one of another length), MovieError (a movie lacks frames, or
+    time stamps with `times: movies`).
     """
     whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
     if experiment.frames is None:
@@ -102,26 +98,22 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         for name, of_movie in there.items()
         if of_movie < wanted
     )
-    number = np.arange(count)
-    rows = {
-        name: np.where(number < of_movie, number + experiment.start.get(name, 0), NONE)
-        for name, of_movie in there.items()
-    }
+    number, rows = np.arange(count), {}
+    for name, of_movie in there.items():
+        rows[name] = np.where(number < of_movie, number + experiment.start.get(name, 0), NONE)
     if experiment.times is None:
         time_s = number / experiment.frame_rate_hz
     else:
         time_s = load_times(Path(experiment.times))
         if len(time_s) != count:
-            expected, do = f"{count} times", "give one time for each frame of the experiment, counted after start:"
-            raise ExperimentError(refusal(experiment.times, expected=expected, got=f"{len(time_s)}", do=do))
+            do = "give one time for each frame of the experiment, counted after start:"
+            raise refused(experiment.times, f"{count} times", f"{len(time_s)}", do)
     return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
 
 
 def load_times(path: Path) -> Floats:
     """Read a table of times, (N,), s, one per line; a heading and # comments are skipped.
-
-    Raises:
-        ExperimentError: missing, too large, a line without a number, or times not increasing.
+    Raises ExperimentError (missing, too large, a line without a number, or times not increasing).
     """
     do = "write one time a line, in seconds, increasing"
     lines = read_text(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:").splitlines()
@@ -132,8 +124,7 @@ def load_times(path: Path) -> Floats:
             values += [float(text)] if text else []
         except ValueError:
             if number > 1:  # the first line may be a heading
-                name, got = f"{path}, line {number}", repr(text[:40])
-                raise ExperimentError(refusal(name, expected="a number", got=got, do=do)) from None
+                raise refused(f"{path}, line {number}", "a number", repr(text[:40]), do) from None
     return _increasing(str(path), np.asarray(values, np.float64), do)
 
 
@@ -141,11 +132,10 @@ def _increasing(name: str, time_s: Floats, do: str) -> Floats:
     wrong = np.flatnonzero(~(np.diff(time_s) > 0))
     if not len(time_s) or not np.isfinite(time_s).all():
         got = "none" if not len(time_s) else f"{time_s[~np.isfinite(time_s)][0]}"
-        raise ExperimentError(refusal(name, expected="finite times", got=got, do=do))
+        raise refused(name, "finite times", got, do)
     if len(wrong):
         k = int(wrong[0])
-        got = f"{time_s[k + 1]:.9g} after {time_s[k]:.9g}"
-        raise ExperimentError(refusal(name, expected="times that increase", got=got, do=do))
+        raise refused(name, "times that increase", f"{time_s[k + 1]:.9g} after {time_s[k]:.9g}", do)
     return time_s
 
 
@@ -203,9 +193,7 @@ def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
     there = best >= 0
     partner[best[there]] = np.flatnonzero(there)
     alone = np.flatnonzero(~there)
-    pairs = np.concatenate(
-        [np.stack([np.arange(len(one)), partner], 1), np.stack([np.full(len(alone), NONE), alone], 1)]
-    )
+    pairs = np.stack([np.r_[np.arange(len(one)), np.full(len(alone), NONE)], np.r_[partner, alone]], 1)
     when = np.where(pairs[:, 0] >= 0, one[pairs[:, 0]], other[pairs[:, 1]])
     when = np.where((pairs >= 0).all(1), (when + other[pairs[:, 1]]) / 2, when)
     order: Rows = pairs[np.argsort(when, kind="stable")]

@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sphereorient.calibration.systematic import with_systematic_errors
 from sphereorient.experiment import input_files
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
 from sphereorient.follow.poses import Poses, no_pose, pose_table
 from sphereorient.live.live import LiveTracker, Measured
-from sphereorient.methods.results import measured_track, with_lasting_errors, with_systematic_errors
+from sphereorient.methods.results import measured_track
 from sphereorient.methods.settings import Settings, settings_yaml
+from sphereorient.pose.lasting import with_lasting_errors
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory, journal
 
 MOST_MISSING = 100_000  # frames between two that are written as missing

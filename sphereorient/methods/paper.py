@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import assemble, locate, motion
-from sphereorient.calibration.consistency import majority_by_outlines
+from sphereorient.calibration.comparison import Seen
+from sphereorient.calibration.contradictions import majority
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
@@ -40,7 +41,7 @@ def track(job: Job, follower: Follower | None, measured: Iterable[Measured], pro
     centre_px, radius_px = (
         torch.stack([getattr(one, name) for one in sightings.values()], 1) for name in ("centre_px", "radius_px")
     )
-    agree = majority_by_outlines(cameras, centre_px, radius_px) or range(len(sightings))
+    agree = majority(Seen.of_outlines(cameras, centre_px, radius_px)) or range(len(sightings))
     counted = {name: one for k, (name, one) in enumerate(sightings.items()) if k in agree}
     positions = locate.find_positions(counted, cameras, grid.experiment.diameter_mm)
     proposer_of = cache(partial(paper_proposer, grid.texture, settings=settings))  # cameras of one scale share a bank

@@ -1,8 +1,7 @@
 """From the stages' results to the trajectory, one function for each method."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, combinations
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,17 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
-from sphereorient.calibration import systematic_errors
-from sphereorient.calibration.consistency import (
-    Consistency,
-    Gaps,
-    Limits,
-    Seen,
-    compare_cameras,
-    gaps_between,
-    limits_of,
-)
-from sphereorient.cameras import Camera, ParameterCovariance, centre_lab_mm
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
 from sphereorient.follow.appearance import LOOK_ALIKE
@@ -30,10 +18,9 @@ from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
 from sphereorient.pose.fitter import CameraView
-from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
-from sphereorient.so3 import exp, geodesic_distance, hat, log, solve_damped
+from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 TWO_BALLS = (
@@ -48,9 +35,7 @@ WORN = (
     "the paint differs from the texture map on about {share:.0f} % of the ball: it is not used; "
     "learn it anew with `sphereorient map --init`"
 )
-ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
-CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
 
 
@@ -146,11 +131,10 @@ def measured_track(
     covariance = picked["covariance"]
     margin, angle = _margin(table, choice)
     cameras = {view.name: precise_camera(k, table, picked, learnt) for k, view in enumerate(learnt.fitter.views)}
-    shown = ((view, cameras[view.name]) for view in learnt.fitter.views)
-    disks = (
-        (view, one.reason, torch.from_numpy(one.centre_px), torch.from_numpy(one.radius_px)) for view, one in shown
-    )
-    missed = [missed_by(*one) for one in disks]
+    missed = [
+        missed_by(view, one.reason, torch.from_numpy(one.centre_px), torch.from_numpy(one.radius_px))
+        for view, one in zip(learnt.fitter.views, cameras.values(), strict=True)
+    ]
     seeing = table.use & (choice >= 0)[:, None]
     flags = fit_flags(learnt, seeing, picked["score"], picked["excess"], np.sum(missed, axis=0))
     return replace(
@@ -188,16 +172,13 @@ def precise_track(
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
-    known = {
-        "position_cov": track.position_cov * smoothed.position_scale**2,
-        "orientation_cov": smoothed.cov_given_path_rad2.numpy(),
-        **datasets_of(smoothed, experiment.length_unit),
-    }
     return replace(
         track,
         position=track.position - move_mm.numpy(),
+        position_cov=track.position_cov * smoothed.position_scale**2,
         orientation=smoothed.R_given_path.numpy(),
-        **known,
+        orientation_cov=smoothed.cov_given_path_rad2.numpy(),
+        **datasets_of(smoothed, experiment.length_unit),
         segment=chosen.segment.numpy(),
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
@@ -315,166 +296,3 @@ def fit_flags(
         [where * np.uint32(flag) for flag, where in bits.items()], axis=0, dtype=np.uint32
     )
     return flags * (count > 0).astype(np.uint32)
-
-
-def with_systematic_errors(
-    track: Trajectory, cameras: Mapping[str, Camera], covariance: ParameterCovariance | None, radius_mm: float
-) -> Trajectory:
-    """Add the calibration's systematic errors to the poses; unchanged without a covariance of the camera parameters."""
-    if covariance is None:
-        return track
-    position = torch.from_numpy(track.position)
-    place, turn = torch.from_numpy(track.position_cov * np.nan), torch.from_numpy(track.orientation_cov * np.nan)
-    saw = dict(zip(track.cameras, _believed(track).T, strict=True))
-    for some in chain.from_iterable(combinations(cameras, count) for count in range(1, len(cameras) + 1)):
-        rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
-        if bool(rows.any()):
-            left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
-            place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
-    return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
-
-
-def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
-    """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
-    use = torch.from_numpy(_believed(track))
-    # Those of each camera are its own: the fewer count, the less of them is averaged away.
-    fewer = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None]
-    together = fewer * lasting.covariance[:3, :3]
-    alone = (use.to(torch.float64) @ lasting.own_rad2.flatten(1)).reshape(-1, 3, 3)
-    turn = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
-    place = (fewer * lasting.covariance[3:, 3:]).numpy()
-    return replace(
-        track,
-        position_cov=track.position_cov + place,
-        position_smooth_cov=track.position_smooth_cov + place,
-        orientation_cov=track.orientation_cov + turn,
-        orientation_smooth_cov=track.orientation_smooth_cov + turn,
-    )
-
-
-def with_contradictions(
-    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool, lasting: Lasting | None
-) -> tuple[Trajectory, Consistency]:
-    """Mark frames in which two cameras contradict each other, and make the covariances hold what they disagree by.
-    Errors that last, see `with_lasting_errors`, let them disagree without a contradiction. A camera that contradicts
-    more others than it has on its side takes no part.
-    A contradiction is added to those of its frame; all are scaled where cameras disagree more than they state in most
-    frames. Return also how well the cameras agree in the whole movie.
-    """
-    seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
-    elsewhere = np.stack([np.isin(one.reason, ELSEWHERE) for one in track.cameras.values()], 1)
-    believed = _believed(track).sum(1)
-    outvoted = torch.from_numpy(elsewhere & (believed > elsewhere.sum(1))[:, None])
-    wrong = torch.from_numpy(elsewhere.any(1)) & ~outvoted.any(1)
-    counted = replace(seen, centre_px=seen.centre_px.masked_fill(outvoted[..., None], torch.nan))
-    counted = replace(counted, R_lab_body=seen.R_lab_body.masked_fill(outvoted[..., None, None], torch.nan))
-    pairs = [_compared(track, counted, lasting, *two) for two in combinations(range(len(cameras)), 2)]
-    for pair in pairs:
-        wrong |= pair.turned | (pair.gaps.signed_px.abs() > limits.gap_px)
-    turns = torch.cat([pair.away[pair.both & ~wrong] for pair in pairs])
-    places = torch.cat([pair.apart[pair.both & ~wrong] for pair in pairs])
-    turn_scale, place_scale = _excess(turns, 3), _excess(places, 1)
-    unit = torch.eye(3, dtype=torch.float64)
-    rolls = _rolls_by_move(track, cameras, diameter_mm / 2)
-    scaled: dict[str, Tensor] = {}
-    for kind in ("_cov", "_smooth_cov"):
-        place, turn = (torch.from_numpy(getattr(track, name + kind)) for name in ("position", "orientation"))
-        rolled = (place_scale**2 - 1) * (rolls @ place[:, None] @ rolls.mT).sum(1)
-        scaled["position" + kind] = place_scale**2 * place
-        scaled["orientation" + kind] = turn_scale**2 * turn + rolled.nan_to_num()
-    place_cov, turn_cov = scaled["position_cov"], scaled["orientation_cov"]
-    share = 1 / torch.from_numpy(believed).clamp_min(2).to(torch.float64)
-    for pair in pairs:
-        # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
-        turn = torch.where(pair.both, share, 1.0)[:, None] * pair.turned[:, None] * pair.turn.nan_to_num()
-        gap_mm = torch.where(pair.both, share, 0.5) * pair.gaps.signed_mm.nan_to_num()
-        gap_mm = gap_mm * (pair.apart > CONTRADICTS_SIGMAS * place_scale)
-        shift_mm = (pair.gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
-        shift_mm = torch.where(pair.both[:, None], 0.0, shift_mm)
-        # A pose between two pictures turns the sphere to match their paint; one camera's own pose does not.
-        rolled = torch.where(pair.both, gap_mm, 0.0)[:, None] / (diameter_mm / 2)
-        for whole, off in ((turn_cov, turn), (turn_cov, rolled), (place_cov, gap_mm[:, None]), (place_cov, shift_mm)):
-            # In all directions: that of the error is not known as well as its size.
-            whole += off.square().sum(-1)[:, None, None] * unit
-    flags = track.flags | np.where(wrong.numpy() & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
-    stated: dict[str, Any] = {name: whole.numpy() for name, whole in scaled.items()}
-    return replace(track, flags=flags, **stated), compare_cameras(seen, limits)
-
-
-def _rolls_by_move(track: Trajectory, cameras: Mapping[str, Camera], radius_mm: float) -> Tensor:
-    """Return the turn (N, C, 3, 3), rad/mm, by which a sphere that is moved shows each camera the same paint, weighted
-    so that squares add up to their mean over the cameras that count. A move along the line of sight turns nothing.
-    """
-    X, count = torch.from_numpy(track.position), torch.from_numpy(_believed(track))
-    sight = torch.stack([X - centre_lab_mm(camera) for camera in cameras.values()], 1)
-    weight = (count / count.sum(1, keepdim=True).clamp_min(1)).sqrt()
-    return weight[..., None, None] * hat(torch.nn.functional.normalize(sight, dim=-1)) / radius_mm
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Compared:
-    """What two cameras alone say of each frame, compared; distances in units of what they state, NaN: unknown."""
-
-    both: Tensor  # (N,) bool, both are believed
-    turn: Tensor  # (N, 3), rad, from the second camera's rotation to the first one's
-    away: Tensor  # (N,), Mahalanobis distance of the rotations
-    gaps: Gaps
-    apart: Tensor  # (N,), the gap over its standard deviation
-
-    @property
-    def turned(self) -> Tensor:
-        return self.away > CONTRADICTS_SIGMAS
-
-
-def _compared(track: Trajectory, seen: Seen, lasting: Lasting | None, k: int, m: int) -> _Compared:
-    """Compare the cameras k and m of a track."""
-    radius_mm = seen.diameter_mm / 2
-    own_rad2 = _of_cameras(track, "orientation_cov") + (0.0 if lasting is None else lasting.own_rad2)
-    spread = own_rad2[:, [k, m]].sum(1)
-    turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT)
-    gaps = gaps_between([list(seen.cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
-    across, known = gaps.across_lab[..., None], torch.from_numpy(np.nan_to_num(track.position_systematic_cov))
-    # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
-    variance = 4 * (across.mT @ known @ across)[:, 0, 0]
-    for c in (k, m):
-        variance = variance + (_of_cameras(track, "centre_sigma_px") / seen.radius_px)[:, c].square() * radius_mm**2
-    return _Compared(
-        both=torch.from_numpy(_believed(track)[:, [k, m]].all(1)),
-        turn=turn,
-        away=(turn * solve_damped(spread, turn)).sum(-1).sqrt(),
-        gaps=gaps,
-        apart=gaps.signed_mm.abs() / variance.sqrt(),
-    )
-
-
-def _excess(distance: Tensor, dimensions: int) -> float:
-    """Return the rms of distances (n,) over the expected one, at least 1; without those of over five medians."""
-    kept = distance[distance <= CONTRADICTS_SIGMAS * distance.nanmedian()]
-    return max(1.0, float((kept.square().mean() / dimensions).sqrt().nan_to_num(1.0)))
-
-
-def said_alone(
-    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
-) -> tuple[Seen, Limits]:
-    """Return what each camera of a track alone says, and how far apart cameras that agree may be."""
-    seen = Seen(
-        cameras=cameras,
-        centre_px=_of_cameras(track, "centre_px"),
-        radius_px=_of_cameras(track, "radius_px"),
-        R_lab_body=_of_cameras(track, "orientation"),
-        diameter_mm=diameter_mm,
-        frame=torch.arange(len(track)) if consecutive else None,
-    )
-    return seen, limits_of(seen, _of_cameras(track, "orientation_cov"))
-
-
-def _believed(track: Trajectory) -> NDArray[np.bool_]:
-    """Return in which frames which cameras measured the pose, (N, C) bool."""
-    return np.stack([np.array([why == Reason.OK for why in one.reason], bool) for one in track.cameras.values()], 1)
-
-
-def _of_cameras(track: Trajectory, name: str) -> Tensor:
-    """Return a dataset of all cameras, (N, C, ...); NaN where a camera has no orientation."""
-    whole = np.stack([getattr(camera, name) for camera in track.cameras.values()], 1)
-    whole[np.isnan([camera.orientation[:, 0, 0] for camera in track.cameras.values()]).T] = np.nan
-    return torch.from_numpy(whole)

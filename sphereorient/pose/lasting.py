@@ -3,7 +3,7 @@
 The fit's covariance holds what differs from frame to frame. A path through all frames averages that away; these stay.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, by_pose
 from sphereorient.so3 import solve_damped
+from sphereorient.trajectory import Trajectory
 
 TILES = 4  # along each axis of the disk: errors of light are wide
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
@@ -72,6 +73,24 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
     together = _of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
     return Lasting(covariance=together, own_rad2=own)
+
+
+def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
+    """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
+    use = torch.from_numpy(track.believed)
+    # Those of each camera are its own: the fewer count, the less of them is averaged away.
+    fewer = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None]
+    together = fewer * lasting.covariance[:3, :3]
+    alone = (use.to(torch.float64) @ lasting.own_rad2.flatten(1)).reshape(-1, 3, 3)
+    turn = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
+    place = (fewer * lasting.covariance[3:, 3:]).numpy()
+    return replace(
+        track,
+        position_cov=track.position_cov + place,
+        position_smooth_cov=track.position_smooth_cov + place,
+        orientation_cov=track.orientation_cov + turn,
+        orientation_smooth_cov=track.orientation_smooth_cov + turn,
+    )
 
 
 def _holding(covariance: Tensor, difference: Tensor) -> Tensor:

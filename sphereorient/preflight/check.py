@@ -13,8 +13,9 @@ from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.proposers import as_near
 from sphereorient.methods.settings import Settings
-from sphereorient.preflight import agreement, cameras, movies, texture_map
-from sphereorient.preflight.finding import FAULT, OK, Finding, Severity, judged, warning, worst
+from sphereorient.preflight import cameras, movies, texture_map
+from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning, worst
+from sphereorient.preflight.in_step import OffsetScan, liveliest_stretches, scan_offsets
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
 from sphereorient.preflight.scene import SceneView, look_at_scene
 from sphereorient.search import GreySearch
@@ -29,15 +30,15 @@ class Preflight:
 
     experiment: Experiment
     timeline: Timeline
-    samples: tuple[MovieSample, ...]
-    closer: tuple[tuple[MovieSample, ...], ...]  # consecutive frames: by stretch, then by camera
-    scans: tuple[cameras.OffsetScan, ...]  # of each other camera against the first
-    texture: Tensor | None  # (H, 2 H)
-    unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
-    measures: texture_map.TextureMeasures | None
-    similar: texture_map.ViewPair | None
-    agreement: tuple[Finding, ...]  # of a short stretch tracked; none with one camera or without a map
-    matches: tuple[texture_map.TextureMatch, ...]
+    samples: tuple[MovieSample, ...] = ()
+    closer: tuple[tuple[MovieSample, ...], ...] = ()  # consecutive frames: by stretch, then by camera
+    scans: tuple[OffsetScan, ...] = ()  # of each other camera against the first
+    texture: Tensor | None = None  # (H, 2 H)
+    unseen: Tensor | None = None  # (H, 2 H) bool, texels that are no paint; None: all are
+    measures: texture_map.TextureMeasures | None = None
+    similar: texture_map.ViewPair | None = None
+    tracked: cameras.Tracked = cameras.NOT_TRACKED  # a short stretch; no findings with one camera or without a map
+    matches: tuple[texture_map.TextureMatch, ...] = ()
     scene: tuple[SceneView, ...] = ()  # of several balls: a picture of each camera
     findings: tuple[Finding, ...] = ()
 
@@ -71,7 +72,7 @@ def preflight(
         refine = settings.refine.model_copy(update=BRIEF)
         planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
         both = image is not None and len(recording.streams) > 1
-        learning = pool.submit(agreement.study, experiment, planned) if both else None
+        learning = pool.submit(cameras.study, experiment, planned) if both else None
         sampling = [
             pool.submit(sample_movie, stream, experiment, sizes[stream.name], settings.locate)
             for stream in recording.streams
@@ -84,10 +85,10 @@ def preflight(
         progress("frames", len(samples), len(samples))
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
-        tracked: tuple[Finding, ...] = ()
+        tracked = cameras.NOT_TRACKED
         if learning is not None and closer and any(sample.balls for sample in samples):
             first = int(recording.timeline.number[closer[0][0].frame[0]])
-            tracked = tuple(agreement.cameras_agree(experiment, planned, learning, closer[0], first))
+            tracked = cameras.track_stretch(experiment, planned, learning, closer[0], first)
         checked = Preflight(
             experiment=experiment,
             timeline=recording.timeline,
@@ -99,7 +100,7 @@ def preflight(
             matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
-            agreement=tracked,
+            tracked=tracked,
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
@@ -108,57 +109,27 @@ def preflight(
 def _of_scene(recording: Recording, settings: Settings, progress: Progress) -> Preflight:
     """Check an experiment of several balls."""
     scene, found = look_at_scene(recording, settings, progress)
-    experiment = recording.experiment
-    return Preflight(
-        experiment=experiment,
-        timeline=recording.timeline,
-        samples=(),
-        closer=(),
-        scans=(),
-        texture=None,
-        unseen=None,
-        matches=(),
-        measures=None,
-        similar=None,
-        agreement=(),
-        scene=scene,
-        findings=(movies.frames(experiment, recording.timeline), *movies.outside(experiment), *found),
-    )
+    checked = Preflight(experiment=recording.experiment, timeline=recording.timeline, scene=scene)
+    return replace(checked, findings=tuple(_findings(checked, found)))
 
 
-def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:
+def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield all findings; those that are told `first` are known."""
     yield movies.frames(seen.experiment, seen.timeline)
     yield from movies.outside(seen.experiment)
-    yield from wrong_sizes
+    yield from first
     for k, sample in enumerate(seen.samples):
         yield movies.movie_file(sample)
         yield movies.pictures([sample, *(stretch[k] for stretch in seen.closer)])
         yield movies.background(sample, seen.experiment)
         yield movies.ball(sample)
-    by_outlines = list(_outline_findings(seen))
-    if any(one.title == agreement.TITLE and agreement.STOPS not in one.measured for one in seen.agreement):
-        # Poses fitted to the paint tell more than outlines, which jump where a short movie has to give its background.
-        by_outlines = [replace(one, severity=OK, advice="") for one in by_outlines]
-    yield from by_outlines
-    yield from seen.agreement
-    yield from _texture_findings(seen)
+    yield from cameras.camera_findings(seen.experiment, seen.samples, seen.scans, seen.tracked)
+    if seen.samples:
+        yield from _texture_findings(seen)
     for sample in seen.samples:
         yield movies.exposure(sample)
         yield movies.sharpness(sample)
         yield movies.motion_blur(sample, seen.experiment.exposure_s, seen.timeline.frame_s)
-
-
-def _outline_findings(seen: Preflight) -> Iterator[Finding]:
-    between, diameter_mm = [], seen.experiment.diameter_mm
-    if seen.scans and all(sample.balls for sample in seen.samples):  # else the finding on the ball tells enough
-        shifted = any(scan.shift for scan in seen.scans)
-        in_step_px = max(scan.in_step_px for scan in seen.scans) if shifted else None
-        between.append(cameras.lines_of_sight(seen.samples, in_step_px))
-        between.append(cameras.in_step(seen.scans, seen.experiment.start))
-        between += [] if diameter_mm is None else [cameras.ball_size(seen.samples, diameter_mm)]
-    yield from (agreement.unsure(one, seen.experiment, len(seen.samples[0].stream)) for one in between)
-    if not seen.scans or diameter_mm is None:
-        yield from (cameras.ball_size_px(sample) for sample in seen.samples)
 
 
 def _texture_findings(seen: Preflight) -> Iterator[Finding]:
@@ -195,19 +166,19 @@ def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[st
 
 def _offsets(
     samples: Sequence[MovieSample], settings: Settings, pool: ThreadPoolExecutor
-) -> tuple[tuple[tuple[MovieSample, ...], ...], tuple[cameras.OffsetScan, ...]]:
+) -> tuple[tuple[tuple[MovieSample, ...], ...], tuple[OffsetScan, ...]]:
     """Sample the stretches with most motion, and scan the offset between the first movie and each other one."""
     if len(samples) < 2:
         return (), ()
     parts = [
         [pool.submit(sample_more, sample, frames, settings.locate) for sample in samples]
-        for frames in cameras.liveliest_stretches(samples)
+        for frames in liveliest_stretches(samples)
     ]
     closer = tuple(tuple(one.result() for one in part) for part in parts)
     first, *others = samples
 
-    def scan(k: int, other: MovieSample) -> cameras.OffsetScan:
+    def scan(k: int, other: MovieSample) -> OffsetScan:
         centres = [(stretch[0].sightings.centre_px, stretch[k].sightings.centre_px) for stretch in closer]
-        return cameras.scan_offsets((first.name, other.name), (first.camera, other.camera), centres)
+        return scan_offsets((first.name, other.name), (first.camera, other.camera), centres)
 
     return closer, tuple(scan(k, other) for k, other in enumerate(others, 1))

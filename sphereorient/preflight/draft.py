@@ -9,82 +9,58 @@ from sphereorient.files.whole_file import relative_path
 from sphereorient.preflight.first_look import FirstLook
 
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
-RATE = "Hz, of the recording"
+FLOW = {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3}
 
 
 def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str, str] | None = None) -> list[DraftKey]:
     """Return the keys of an experiment.yaml in a folder, in their order; `masks`: files by camera."""
-    sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
-    stamped = all(one.rate_hz for one in looks)
-    one_camera, stays = len(looks) == 1, all(one.stays for one in looks)
-    diameter = "mm" + ("; null where it is not known: lengths are then in radii" if one_camera and stays else "")
-    cameras = [one.name for one in looks]
-
-    def each(what: str) -> dict[str, Any]:
-        return {camera: what.format(camera) for camera in cameras}
-
+    cameras, one_camera = [one.name for one in looks], len(looks) == 1
     counts = ", ".join(f"{one.name} {len(one.movie)}" for one in looks)
-    keys = [DraftKey(name="name", value=folder.resolve().name, comment="free")]
-    if stamped:
-        rate = looks[0].rate_hz
-        keys.append(DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz"))
-    else:
-        played = next((one.movie.played_hz for one in looks if one.movie.played_hz), None)
-        told = f"{RATE}; players show it at {played:g}" if played else RATE
-        keys.append(DraftKey(name="frame_rate", comment=told, example=600.0, asked=True))
+    movies = {one.name: relative_path(one.movie.path, folder) for one in looks}
+    made = "written beside this file" if one_camera else "`sphereorient calibrate` writes it"
+
+    def each(value: Any) -> dict[str, Any]:
+        return {name: value.format(name) if isinstance(value, str) else value for name in cameras}
+
+    def key(name: str, comment: str, value: Any = ..., example: Any = None) -> DraftKey:
+        return DraftKey(name=name, value=value, comment=comment, example=example)
+
+    empty = "the scene without the ball, of the movie's size: better for short movies"
+    hidden = "black where something that does not move hides the ball: `sphereorient mark` draws them"
     return [
-        *keys,
-        DraftKey(name="exposure", comment=EXPOSURE, example=0.0004),
-        DraftKey(
-            name="sphere.diameter", comment=f"{diameter} ({sizes or 'no ball was found'})", example=18.0, asked=True
-        ),
+        key("name", "free", folder.resolve().name),
+        _rate_key(looks),
+        key("exposure", EXPOSURE, example=0.0004),
+        *_sphere_keys(looks),
+        key("cameras", made, "cameras.yaml"),
+        key("movies", f"frames: {counts}", movies),
+        key("backgrounds", empty, example=each("empty_{}.png")),
+        key("masks", hidden, masks or ..., each("mask_{}.png")),
+        key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
+        key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
+        key("flip", "mirrored movies: vertical, horizontal, both", example=each("vertical")),
+        key("flow", "SI, for reports", example=FLOW),
+    ]
+
+
+def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
+    rate = looks[0].rate_hz
+    if rate is not None and all(one.rate_hz for one in looks):
+        return DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
+    played = next((f"; players show it at {one.movie.played_hz:g}" for one in looks if one.movie.played_hz), "")
+    return DraftKey(name="frame_rate", comment=f"Hz, of the recording{played}", example=600.0, asked=True)
+
+
+def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
+    stays = all(one.stays for one in looks)
+    sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
+    unknown = "; null where it is not known: lengths are then in radii" if len(looks) == 1 and stays else ""
+    size = f"mm{unknown} ({sizes or 'no ball was found'})"
+    fixed = f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies"
+    return [
+        DraftKey(name="sphere.diameter", comment=size, example=18.0, asked=True),
         DraftKey(name="sphere.texture", value="texture.png", comment="`sphereorient map` learns it from the movies"),
-        DraftKey(
-            name="sphere.fixed",
-            value=stays,
-            comment=f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies",
-        ),
-        DraftKey(
-            name="cameras",
-            value="cameras.yaml",
-            comment="`sphereorient calibrate` writes it" if not one_camera else "written beside this file",
-        ),
-        DraftKey(
-            name="movies",
-            value={one.name: relative_path(one.movie.path, folder) for one in looks},
-            comment=f"frames: {counts}",
-        ),
-        DraftKey(
-            name="backgrounds",
-            comment="the scene without the ball, of the movie's size: better for short movies",
-            example=each("empty_{}.png"),
-        ),
-        DraftKey(
-            name="masks",
-            value=masks or ...,
-            comment="black where something that does not move hides the ball: `sphereorient mark` draws them",
-            example=each("mask_{}.png"),
-        ),
-        DraftKey(
-            name="start",
-            comment="frame of each movie that is the experiment's frame 0",
-            example=dict.fromkeys(cameras, 0),
-        ),
-        DraftKey(
-            name="frames", comment="first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]
-        ),
-        DraftKey(name="flip", comment="mirrored movies: vertical, horizontal, both", example=each("vertical")),
-        DraftKey(
-            name="flow",
-            comment="SI, for reports",
-            example={
-                "viscosity": 8.0e-6,
-                "dissipation": 1.7,
-                "u_rms": 0.61,
-                "integral_length": 0.03,
-                "integral_time": 0.3,
-            },
-        ),
+        DraftKey(name="sphere.fixed", value=stays, comment=fixed),
     ]
 
 

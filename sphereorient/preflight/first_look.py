@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras import PinholeCamera
+from sphereorient.cameras.model import middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
 from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Progress, silent
@@ -96,20 +97,12 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
 
 
 def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraStream:
-    return CameraStream(name=name, camera=_camera(movie), movie=movie, rows=np.arange(len(movie)), shown=shown)
-
-
-def _camera(movie: Movie) -> PinholeCamera:
-    """Return a camera that stands for one not known: where a ball is sought in pictures alone, none is used."""
+    """Return a movie with a camera that stands for one not known: a ball sought in pictures alone needs none."""
     height, width = movie.frame_shape
-    f64 = torch.float64
-    return PinholeCamera(
-        image_size=(width, height),
-        f_px=torch.tensor(2.0 * height, dtype=f64),
-        centre_px=torch.tensor(((width - 1) / 2, (height - 1) / 2), dtype=f64),
-        R_cam_lab=torch.eye(3, dtype=f64),
-        T_cam_lab_mm=torch.zeros(3, dtype=f64),
-    )
+    pose: dict[str, Any] = {"R_cam_lab": torch.eye(3, dtype=torch.float64), "T_cam_lab_mm": (0.0,) * 3}
+    lens: dict[str, Any] = {"f_px": 2.0 * height, "centre_px": middle_of_picture((width, height))}
+    camera = PinholeCamera(image_size=(width, height), **lens, **pose)
+    return CameraStream(name=name, camera=camera, movie=movie, rows=np.arange(len(movie)), shown=shown)
 
 
 def _unknown(movie: Movie) -> Experiment:

@@ -45,20 +45,23 @@ class Marking(ABC):
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Do what is asked for at a path, and return what was done; None: nothing is done there."""
 
+    def refused(self, name: str, expected: str, got: str, do: str) -> SphereOrientError:
+        """Return an error of the file's kind, worded by `refusal`."""
+        return self.error(refusal(name, expected=expected, got=got, do=do))
+
     def read(self) -> Any:
         """Return the values of the file as it is now."""
         try:
             return parse_yaml(self._text())
         except FAULTS as fault:
-            got = yaml_words(fault)
-            raise self.error(refusal(str(self.path), expected="YAML", got=got, do="correct the file there")) from None
+            raise self.refused(str(self.path), "YAML", yaml_words(fault), "correct the file there") from None
 
     def write(self, place: Sequence[str | int], value: Mapping[str, Any], by_hand: str) -> None:
         """Write a value in one line of the file, whose other lines stay, see `with_value`; `by_hand`: else to do."""
         text = with_value(self._text(), place, value)
         if text is None:
             expected = f"a key {place[-1]} in one line, or a place for it"
-            raise self.error(refusal(str(self.path), expected=expected, got="another form", do=by_hand))
+            raise self.refused(str(self.path), expected, "another form", by_hand)
         with writing(force=True):
             write_text(self.path, text)
 

@@ -13,7 +13,7 @@ from sphereorient.calibration.dots import Dots, find_dots
 from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.plates import read_plate_picture
 from sphereorient.calibration.targets import FIDUCIALS
-from sphereorient.errors import CameraError, refusal
+from sphereorient.errors import CameraError
 from sphereorient.files.picture import eight_bits
 from sphereorient.preflight.mark import Json, Marking, png
 
@@ -29,7 +29,7 @@ class FiducialMarking(Marking):
         self.document = load_calibration(self.path)
         if not isinstance(self.document.plate, DotPlate):
             expected, do = "pictures of a plate with fiducials, of type dots", "nothing needs to be clicked here"
-            raise CameraError(refusal(str(self.path), expected=expected, got="other points", do=do))
+            raise self.refused(str(self.path), expected, "other points", do)
         self.plate = self.document.plate
         self.clicked = {it: it.clicked_px for it in self.document.pictures}
         self.dots: dict[Picture, Dots] = {}
@@ -91,10 +91,8 @@ class FiducialMarking(Marking):
 
     def save(self, number: int, points: Any) -> Json:
         """Write clicked places into the file; return the view with them.
-
-        Raises:
-            CameraError: impossible places, places that do not tie the picture, or a file that cannot be changed safely.
-            OutputError: the file cannot be written.
+        Raises CameraError (impossible places, places that do not tie the picture, or a file that cannot be changed
+        safely), OutputError (the file cannot be written).
         """
         picture = self._picture(number)
         clicked = self._checked(picture, points).round(1)
@@ -108,7 +106,7 @@ class FiducialMarking(Marking):
             by_hand = f"write clicked: {{{camera}: {clicked.tolist()}}} into the entry of pose {pose}"
             if len(here) != 1:
                 expected = f"one entry with pose {pose} and {camera}"
-                raise CameraError(refusal(f"{self.path}, pictures", expected=expected, got=f"{len(here)}", do=by_hand))
+                raise self.refused(f"{self.path}, pictures", expected, f"{len(here)}", by_hand)
             old = entries[here[0]].get("clicked") or {}
             self.write(["pictures", here[0], "clicked"], old | {camera: clicked.tolist()}, by_hand)
             self.clicked[picture] = clicked
@@ -132,8 +130,6 @@ class FiducialMarking(Marking):
         return checked_clicks(points, self.document.keys.image_size, f"{picture.path.name}, clicked")
 
     def _picture(self, number: int) -> Picture:
-        count = len(self.document.pictures)
-        if number >= count:
-            expected = f"0 .. {count - 1}"
-            raise CameraError(refusal(f"picture {number}", expected=expected, got=str(number), do="choose another"))
+        if number >= (count := len(self.document.pictures)):
+            raise self.refused(f"picture {number}", f"0 .. {count - 1}", str(number), "choose another")
         return self.document.pictures[number]

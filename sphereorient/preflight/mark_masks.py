@@ -72,13 +72,8 @@ class MaskMarking(Marking):
         return {
             "experiment": str(self.path),
             "cameras": [
-                {
-                    "name": name,
-                    "movie": Path(movie.path).name,
-                    "frames": len(movie),
-                    "height": movie.frame_shape[0],
-                    "width": movie.frame_shape[1],
-                }
+                {"name": name, "movie": Path(movie.path).name, "frames": len(movie)}
+                | dict(zip(("height", "width"), movie.frame_shape, strict=True))
                 for name, movie in self.movies.items()
             ],
         }
@@ -87,9 +82,8 @@ class MaskMarking(Marking):
         """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
         movie = self._movie(name)
         if not 0 <= number < len(movie):
-            raise MovieError(
-                refusal(f"frame {number}", expected=f"0 .. {len(movie) - 1}", got=str(number), do="choose another")
-            )
+            expected = f"0 .. {len(movie) - 1}"
+            raise MovieError(refusal(f"frame {number}", expected=expected, got=str(number), do="choose another"))
         with self.lock:
             picture = movie.sample([number])[0]
         return png(eight_bits(picture))
@@ -115,15 +109,11 @@ class MaskMarking(Marking):
 
     def rendered(self, name: str) -> Json:
         """Return the ball of `outline` as the texture map says it looks: a picture, and how much of it is explained.
-
-        Raises:
-            ExperimentError: no map, no ball, or none that the map explains.
-            TextureError: the map cannot be read.
+        Raises ExperimentError (no map, no ball, or none that the map explains), TextureError (the map cannot be read).
         """
         ball = self.outline(name)
         if not ball["found"]:
-            do = "draw what hides it, or choose another camera"
-            raise ExperimentError(refusal(name, expected="a ball", got="none in this movie", do=do))
+            raise self.refused(name, "a ball", "none in this movie", "draw what hides it, or choose another camera")
         with self.lock:
             look, search = self.looks[name], self._search
             u, v, radius = ball["u"], ball["v"], ball["radius"]
@@ -131,7 +121,7 @@ class MaskMarking(Marking):
             found = search.propose(disk[None])
             if not len(found.score):
                 do = "another ball, or the map of another one, looks like this"
-                raise ExperimentError(refusal(name, expected="a ball that the map explains", got="none", do=do))
+                raise self.refused(name, "a ball that the map explains", "none", do)
             size = max(2, round(2 * radius))
             view = orthographic_view(size)
             grey = view.render(self._texture, found.R_view_body[0].float()).clamp(0, 1).numpy()
@@ -150,7 +140,7 @@ class MaskMarking(Marking):
         path = self.experiment.texture_path
         if path is None or not path.exists():
             do = f"learn it: `sphereorient map {self.path.name} --out texture.png`"
-            raise ExperimentError(refusal("sphere.texture", expected="a texture map", got=f"{path or 'none'}", do=do))
+            raise self.refused("sphere.texture", "a texture map", f"{path or 'none'}", do)
         return load_texture(path)
 
     @cached_property
@@ -160,11 +150,8 @@ class MaskMarking(Marking):
     def save(self, name: str, shapes: Sequence[Mapping[str, Any]], *, keep: bool) -> Json:
         """Write the mask of a camera and name it in experiment.yaml; return what was done.
         Shapes hide (`hide`) or are all that is shown (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px.
-        `keep`: what the old mask hides stays hidden.
-
-        Raises:
-            ExperimentError: impossible shapes, or nothing would be shown.
-            OutputError: a file cannot be written.
+        `keep`: what the old mask hides stays hidden. Raises ExperimentError (impossible shapes, or nothing would be
+        shown), OutputError (a file cannot be written).
         """
         height, width = self._movie(name).frame_shape
         old = self.masks[name] if keep else None
@@ -185,8 +172,7 @@ class MaskMarking(Marking):
 
     def _movie(self, name: str) -> Movie:
         if name not in self.movies:
-            expected, do = ", ".join(self.movies), "choose one of these"
-            raise ExperimentError(refusal("camera", expected=expected, got=repr(name)[:40], do=do))
+            raise self.refused("camera", ", ".join(self.movies), repr(name)[:40], "choose one of these")
         return self.movies[name]
 
 
@@ -196,8 +182,7 @@ def drawn_mask(
     """Return what a mask (H, W) shows after shapes are drawn, see `MaskMarking.save`; ExperimentError for others."""
     if not isinstance(shapes, list | tuple) or len(shapes) > MOST_SHAPES:
         raise _refused("shapes", f"at most {MOST_SHAPES} of them", "another thing")
-    hidden = np.zeros(size, np.uint8)
-    region = np.zeros(size, np.uint8)
+    hidden, region = np.zeros((2, *size), np.uint8)
     for shape in shapes:
         kind = shape.get("kind") if isinstance(shape, Mapping) else None
         if kind not in ("hide", "show"):

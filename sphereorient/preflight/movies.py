@@ -73,12 +73,10 @@ def pictures(samples: Sequence[MovieSample]) -> Finding:
     """Count the sampled frames of one camera that cannot show a ball; each sample is of consecutive frames."""
     seen: dict[int, Reason] = {}
     for sample in samples:
-        # A frame in two samples is repeated if either sample has its neighbour.
-        seen |= {
-            int(row): reason
-            for row, reason in zip(sample.row, sample.screen, strict=True)
-            if row != NONE and seen.get(int(row), Reason.OK) is Reason.OK
-        }
+        for row, reason in zip(sample.row.tolist(), sample.screen, strict=True):
+            # A frame in two samples is repeated if either sample has its neighbour.
+            if row != NONE and seen.get(row, Reason.OK) is Reason.OK:
+                seen[row] = reason
     title = f"pictures {samples[0].name}"
     bad = {row: reason for row, reason in sorted(seen.items()) if reason is not Reason.OK}
     if not bad:

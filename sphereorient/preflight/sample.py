@@ -97,10 +97,7 @@ def sample_movie(
     stream: CameraStream, experiment: Experiment, diameter_px: float | None, settings: LocateSettings
 ) -> MovieSample:
     """Sample one camera's frames, background and ball; measure its diameter if None.
-
-    Raises:
-        MovieError: no sampled frame can be decoded.
-        ExperimentError: a background picture cannot be used.
+    Raises MovieError (no sampled frame can be decoded), ExperimentError (a background picture cannot be used).
     """
     frame = np.asarray(frames_to_sample(len(stream)), np.int64)
     picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
@@ -117,15 +114,8 @@ def sample_movie(
             background = replace(_surroundings(some), shown=stream.shown)
         else:
             background = learn_background(some, size_px, settings, empty, stream.shown)
-        sample = MovieSample(
-            stream=stream,
-            frame=frame,
-            picture=picture,
-            background=background,
-            diameter_px=size_px,
-            expected_px=diameter_px,
-        )
-        return _searched(sample, settings)
+        look: dict[str, Any] = {"stream": stream, "frame": frame, "picture": picture, "background": background}
+        return _searched(MovieSample(**look, diameter_px=size_px, expected_px=diameter_px), settings)
 
     largest_px = 0.9 * min(stream.movie.frame_shape)
     first = at_size(diameter_px if diameter_px is not None and diameter_px >= SMALLEST_PX else largest_px / 4)

@@ -1,5 +1,6 @@
 """The check of several balls: how many disks each camera shows, which of the named balls are found, and their sizes."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -24,7 +25,7 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.paint import open_paints
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import texture_map
-from sphereorient.preflight.cameras import BAD, GOOD, OUTLINE_PX
+from sphereorient.preflight.cameras import BAD, OUTLINE_PX, off_size
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 
 FRAMES = 8  # spread over the movies
@@ -77,13 +78,15 @@ def look_at_scene(
         for c, (view, shot) in enumerate(zip(cameras, frames[best], strict=True))
         if shot.usable
     )
-    texts = [texture_map.contrast(texture_map.measure_texture(one.grey), _least_px(balls)) for one in loaded.values()]
-    told = [
-        replace(text, title=f"{text.title} {path.name}") if len(loaded) > 1 else text
-        for text, path in zip(texts, loaded, strict=True)
-    ]
+    contrasts = {
+        path.name: texture_map.contrast(texture_map.measure_texture(one.grey), _least_px(balls))
+        for path, one in loaded.items()
+    }
+    if len(loaded) > 1:
+        contrasts = {name: replace(one, title=f"{one.title} {name}") for name, one in contrasts.items()}
     one_paint = _one_paint({path.name: one.grey for path, one in loaded.items()}, progress)
-    return seen, [*_counts(disks, balls), *_found(found, balls), *_sizes(found, disks, balls), *told, *one_paint]
+    sizes = _sizes(found, disks, balls)
+    return seen, [*_counts(disks, balls), *_found(found, balls), *sizes, *contrasts.values(), *one_paint]
 
 
 def _no_map(name: str, path: str | None) -> Finding:
@@ -109,18 +112,12 @@ def _one_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Findi
 
 def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:
     """Return the disks in the pictures of one instant."""
-    each = list(balls.values())
-    return [
-        find_disks(
-            shot.picture,
-            each[0].fitter.views[c].background,
-            [one.fitter.views[c].diameter_px for one in each],
-            each[0].locating,
-        )
-        if shot.usable
-        else []
-        for c, shot in enumerate(shots)
-    ]
+    each, found = list(balls.values()), []
+    for c, shot in enumerate(shots):
+        views = [one.fitter.views[c] for one in each]
+        sizes = [view.diameter_px for view in views]
+        found.append(find_disks(shot.picture, views[0].background, sizes, each[0].locating) if shot.usable else [])
+    return found
 
 
 def _middle(ball: Initialiser, poses: Poses, camera: int) -> tuple[float, float]:
@@ -172,7 +169,8 @@ def _sizes(
             if len(poses[name]) and int(poses[name].use.sum()) > 1
             for c, view in enumerate(ball.fitter.views)
             for disk in frame[c]
-            if disk.coverage > WHOLE and _is_of(disk, _middle(ball, poses[name], c))
+            if disk.coverage > WHOLE
+            and math.dist((disk.u_px, disk.v_px), _middle(ball, poses[name], c)) < OWN * disk.radius_px
         ]
         if seen:
             ratios[name] = median(seen)
@@ -186,12 +184,7 @@ def _sizes(
         if other is not None:
             advice = f"the diameters, or the textures, of {name} and {other} are exchanged: correct `spheres`"
         words = f"{mm:.4g} mm in the pictures, {named[name]:g} mm named"
-        wrong = (error > BAD + tolerance, FAULT, advice), (error > GOOD + tolerance, WARNING, advice)
-        yield judged(f"size of ball {name}", words, *wrong)
-
-
-def _is_of(disk: Outline, middle_px: tuple[float, float]) -> bool:
-    return bool(np.hypot(disk.u_px - middle_px[0], disk.v_px - middle_px[1]) < OWN * disk.radius_px)
+        yield judged(f"size of ball {name}", words, *off_size(error, tolerance, advice))
 
 
 def _exchanged(one: str, other: str, measured: Mapping[str, float], named: Mapping[str, float]) -> bool:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -212,10 +213,10 @@ def _best(search: GreySearch, disks: Tensor) -> Tensor:
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
     """Judge the match of the map with one camera's pictures."""
-    score, mirrored = (float(each.quantile(0.5)) for each in (match.score, match.mirrored))
+    score, mirrored = float(np.median(match.score)), float(np.median(match.mirrored))
     measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
     flip = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
-    if len(matches) > 1 and all(float((one.mirrored - one.score).median()) > CLEARLY for one in matches):
+    if len(matches) > 1 and all(np.median(one.mirrored - one.score) > CLEARLY for one in matches):
         flip = "mirror the map left to right, or write flip: for both movies: all pictures are mirrored"
     unsure = "check light and map: reflections, worn paint and errors of the map reduce the certainty"
     return judged(

@@ -17,8 +17,9 @@ from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
-from sphereorient.preflight.cameras import REACH, expected_outline_px, sample_positions
+from sphereorient.preflight.cameras import expected_outline_px, sample_positions
 from sphereorient.preflight.first_look import FirstLook
+from sphereorient.preflight.in_step import REACH
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, write_figure
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import torch
 
+from sphereorient.calibration.contradictions import with_contradictions
+from sphereorient.calibration.systematic import with_systematic_errors
 from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, open_recording, silent
@@ -21,7 +23,7 @@ from sphereorient.methods.paper import PAPER
 from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
-from sphereorient.pose.lasting import Lasting
+from sphereorient.pose.lasting import Lasting, with_lasting_errors
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -195,17 +197,16 @@ def track_movies(
 def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | None) -> Trajectory:
     """Add the errors of calibration, of cameras that contradict each other, and of what lasts, and the provenance."""
     recording, settings = job.recording, job.settings
-    track = results.with_systematic_errors(
-        track, recording.cameras, recording.covariance, recording.experiment.radius_mm
-    )
+    track = with_systematic_errors(track, recording.cameras, recording.covariance, recording.experiment.radius_mm)
     remarks = [*recording.remarks, *track.provenance.get("remarks", ()), *results.missed_text(track)]
     if len(recording.cameras) > 1:
         diameter_mm, even = 2 * recording.experiment.radius_mm, recording.timeline.even
-        track, found = results.with_contradictions(track, recording.cameras, diameter_mm, even, lasting)
+        lasting_rad2 = 0.0 if lasting is None else lasting.own_rad2
+        track, found = with_contradictions(track, recording.cameras, diameter_mm, even, lasting_rad2)
         if found.contradicts:
             remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
     if lasting is not None:
-        track = results.with_lasting_errors(track, lasting)  # after the others: only noise is scaled
+        track = with_lasting_errors(track, lasting)  # after the others: only noise is scaled
     inputs = input_files(recording.experiment, list(recording.cameras))
     origin = dict(track.provenance) | provenance(inputs, recording.experiment.folder, request.command)
     origin["remarks"] = remarks

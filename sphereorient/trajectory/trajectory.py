@@ -160,6 +160,11 @@ class Trajectory:
         return len(self.time)
 
     @property
+    def believed(self) -> NDArray[np.bool_]:
+        """(N, C): in which frames which cameras measured the pose."""
+        return np.stack([np.array([why == Reason.OK for why in one.reason], bool) for one in self.cameras.values()], 1)
+
+    @property
     def title(self) -> str:
         """Name of the experiment, and of the sphere among several."""
         return f"{self.experiment}, ball {self.sphere}" if self.sphere else self.experiment

@@ -310,7 +310,7 @@ def test_parameters_that_cannot_be_fitted_are_refused():
     camera, plane = planted(), in_plane()
     with pytest.raises(CameraError, match="also, sx: expected points that fill space"):
         calibrate_tsai(plane, camera.project(plane), SIZE, PITCH, ("sx",))
-    with pytest.raises(CameraError, match="also: expected some of sx, centre_u, centre_v, got 'pixel_pitch_u'"):
+    with pytest.raises(CameraError, match="also: expected one of sx, centre_u, centre_v, got"):
         calibrate_tsai(plane, camera.project(plane), SIZE, PITCH, ("pixel_pitch_u",))
     square, points = planted(kappa1=0.0), in_space()  # without distortion one scale of f and both pitches is open
     names = ("f", "pixel_pitch_u", "pixel_pitch_v", *ROTATION, *TRANSLATION)

@@ -176,7 +176,7 @@ def test_a_track_of_other_cameras_or_of_one_is_refused(tmp_path):
     calibrated = exact_cameras()
     track = track_of(calibrated, calibrated)
     with pytest.raises(TrackError, match="cam3"):
-        observations_of(track, {"cam3": calibrated["cam1"]})
+        observations_of([track], {"cam3": calibrated["cam1"]})
     save_cameras(tmp_path / "cameras.yaml", calibrated)
     replace(track, cameras={"cam1": track.cameras["cam1"]}).save(tmp_path / "one.h5")
     with pytest.raises(CameraError, match="two or more"):

@@ -14,22 +14,16 @@ from conftest import assert_close
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sphereorient.calibration.consistency import gaps_between
+from sphereorient.calibration.comparison import gaps_between
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, holds_disk, triangulate
 from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.experiment.stream import pictures_of
 from sphereorient.locate import Background, sightings_of
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
-from sphereorient.preflight.cameras import (
-    REACH,
-    OffsetScan,
-    expected_outline_px,
-    in_step,
-    scan_offsets,
-    starts_in_step,
-)
+from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.preflight.finding import FAULT, OK, worst
+from sphereorient.preflight.in_step import REACH, OffsetScan, in_step, scan_offsets, starts_in_step
 from sphereorient.preflight.movies import limb_blur_px, motion_blur
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
 from sphereorient.preflight.texture_map import match_texture
@@ -251,7 +245,6 @@ def scans_of(best: dict[str, float]) -> list[OffsetScan]:
     offset = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
     return [
         OffsetScan(
-            offset=offset,
             gap_px=0.1 + (offset - best[name]).abs(),
             varying_px=offset,
             moved_px=1.0,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sphereorient.preflight.agreement import ENOUGH, unsure
+from sphereorient.preflight.cameras import ENOUGH, unsure
 from sphereorient.preflight.finding import FAULT, WARNING, judged, warning
 
 FAULTY = judged("lines of sight", "3 px", (True, FAULT, "calibrate again"))

@@ -162,10 +162,16 @@ def _build(entry: object, where: str, alone: bool) -> Camera:
         do = "write both, X_cam = R X_lab + T; a single camera whose frame is the lab's has neither"
         raise camera_error(f"{where}, {' and '.join(missing)}", "the camera's pose in the lab", "none", do)
     with named(where):
-        return _with_port_and_covariance(_in_air(MODELS[checked.model], checked), checked)
+        lens = _lens(MODELS[checked.model], checked)
+        whole = lens if checked.port is None else PortCamera(camera=lens, port=checked.port.port())
+        if checked.covariance is None:
+            return whole
+        covariance = checked.covariance.covariance()
+        check_known(covariance.names, parameter_names(whole), "covariance, parameters")
+        return replace(whole, covariance=covariance)
 
 
-def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
+def _lens(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
     values = kind.completed(dict(entry))
     R, T = entry.R or IN_ITS_OWN[0], entry.T or IN_ITS_OWN[1]
     fields: dict[str, Any] = {"image_size": entry.image_size, "R_cam_lab": R, "T_cam_lab_mm": T}
@@ -175,15 +181,6 @@ def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
         else:
             fields.setdefault(key.field, []).append(values[key.name])
     return kind(**fields)
-
-
-def _with_port_and_covariance(camera: CameraModel, entry: CameraEntry) -> Camera:
-    whole = camera if entry.port is None else PortCamera(camera=camera, port=entry.port.port())
-    if entry.covariance is None:
-        return whole
-    covariance = entry.covariance.covariance()
-    check_known(covariance.names, parameter_names(whole), "covariance, parameters")
-    return replace(whole, covariance=covariance)
 
 
 def _described(camera: Camera) -> dict[str, Any]:

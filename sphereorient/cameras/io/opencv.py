@@ -1,12 +1,12 @@
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.checks import camera_error
@@ -27,18 +27,15 @@ Array = NDArray[np.float64]
 def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera:
     """Read a camera that OpenCV's calibration has written; the first pixel's centre is (0, 0).
     The file has `camera_matrix`, `distortion_coefficients`, optional `R` or `rvec`, `T` or `tvec` (mm; without them the
-    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px).
-
-    Raises:
-        CameraError: no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3.
+    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px). Raises
+    CameraError (no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3).
     """
     storage = _opened(Path(path))
     try:
         K, coefficients = _camera_matrix(storage), _coefficients(storage)
         return BrownCamera(
             image_size=_size(storage, image_size),
-            R_cam_lab=_rotation(storage),
-            T_cam_lab_mm=_translation(storage),
+            **_pose(storage),
             centre_px=torch.from_numpy(K[:2, 2]),
             f_px=torch.from_numpy(K[[0, 1], [0, 1]]),
             k=torch.from_numpy(coefficients[[0, 1, 4]]),
@@ -52,9 +49,7 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
 
 def save_opencv(path: Path | str, camera: BrownCamera) -> None:
     """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
-
-    Raises:
-        OutputError: an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written.
+    Raises OutputError (an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written).
     """
     path = Path(path)
     check_ending(path, "OpenCV file", SUFFIXES)
@@ -155,19 +150,15 @@ def _first(storage: cv2.FileStorage, keys: tuple[str, str], usual: Array) -> tup
     return next(((key, found) for key in keys if (found := _node(storage, key)) is not None), (keys[0], usual))
 
 
-def _rotation(storage: cv2.FileStorage) -> Tensor:
-    key, found = _first(storage, ("R", "rvec"), np.eye(3))
-    if found.size != 3 and found.shape != (3, 3):
-        expected = "a matrix of 3 x 3 or a vector of 3 numbers"
-        raise camera_error(key, expected, str(found.shape), "correct the file")
-    return torch.from_numpy(cv2.Rodrigues(found.reshape(3, 1))[0] if found.size == 3 else found)
-
-
-def _translation(storage: cv2.FileStorage) -> Tensor:
-    key, found = _first(storage, ("T", "tvec"), np.zeros(3))
-    if found.size != 3:
-        raise camera_error(key, "3 numbers", str(found.shape), "correct the file")
-    return torch.from_numpy(found.reshape(3))
+def _pose(storage: cv2.FileStorage) -> dict[str, Any]:
+    key, R = _first(storage, ("R", "rvec"), np.eye(3))
+    if R.size != 3 and R.shape != (3, 3):
+        raise camera_error(key, "a matrix of 3 x 3 or a vector of 3 numbers", str(R.shape), "correct the file")
+    R = np.asarray(cv2.Rodrigues(R.reshape(3, 1))[0], np.float64) if R.size == 3 else R
+    key, T = _first(storage, ("T", "tvec"), np.zeros(3))
+    if T.size != 3:
+        raise camera_error(key, "3 numbers", str(T.shape), "correct the file")
+    return {"R_cam_lab": torch.from_numpy(R), "T_cam_lab_mm": torch.from_numpy(T.reshape(3))}
 
 
 def _size(storage: cv2.FileStorage, image_size: tuple[int, int] | None) -> tuple[int, int]:

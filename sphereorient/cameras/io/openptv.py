@@ -17,7 +17,7 @@ from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
-from sphereorient.cameras.port import Port, PortCamera
+from sphereorient.cameras.port import Port, PortCamera, in_air
 from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text
 from sphereorient.files.yaml_file import short
@@ -50,10 +50,8 @@ class PtvPar:
 def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None) -> Camera:
     """Read a camera from .ori and .addpar (None: no distortion), behind a port where the media refract.
     The lab is OpenPTV's world, mm; as in OpenPTV, the angles of the .ori file count, not its matrix.
-    Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T.
-
-    Raises:
-        CameraError: a missing, truncated or malformed file, or impossible parameters.
+    Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T. Raises CameraError
+    (a missing, truncated or malformed file, or impossible parameters).
     """
     v = _numbers(Path(ori), None, *ORI)
     centre, angles, (xh, yh, cc), glass = v[:3], v[3:6], v[15:18], v[18:21]
@@ -80,10 +78,8 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
 
 def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
     """Write an OpenPTVCamera, behind a port or not, as .ori and .addpar; `par_of` gives its part of ptv.par.
-
-    Raises:
-        CameraError: another model, or the lab's origin is not on the liquid side of the wall.
-        OutputError: a file that cannot be written.
+    Raises CameraError (another model, or the lab's origin is not on the liquid side of the wall), OutputError (a file
+    that cannot be written).
     """
     inner, glass = _openptv_of(camera), _glass_vector(camera)
     dm = inner.R_cam_lab.detach().mT @ AXES
@@ -160,7 +156,7 @@ def _glass_vector(camera: Camera) -> Tensor:
 
 
 def _openptv_of(camera: Camera) -> OpenPTVCamera:
-    inner = camera.camera if isinstance(camera, PortCamera) else camera
+    inner = in_air(camera)
     if not isinstance(inner, OpenPTVCamera):
         got, do = type(inner).__name__, "build an OpenPTVCamera; other distortions have no exact counterpart there"
         raise camera_error("camera", "a camera of model openptv", got, do)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Seen, compare_cameras, limits_of, majority
+from sphereorient.calibration.comparison import Seen, limits_of
+from sphereorient.calibration.contradictions import compare_cameras, majority
 from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.presence import nothing, proven
@@ -40,7 +41,7 @@ class ProvenPoses:
 
     def majority(self, fitter: Fitter, fit: FittedPoses) -> tuple[int, ...]:
         """Return the cameras that agree where these are more than half of more than two; `fit`: of the B poses."""
-        if self.together or self.camera is None or len(fitter.views) < 3:
+        if self.together or self.camera is None:
             return ()
         parts = []
         for part in (fit.position_lab_mm, fit.R_lab_body, fit.covariance[:, :3, :3]):
@@ -108,7 +109,7 @@ def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
     seen = _seen_alone(fitter, X, R)
     limits = limits_of(seen, covariance)
     found = compare_cameras(seen, limits)
-    if found.deadly and not (len(alone) > 2 and majority(seen, limits)):
+    if found.deadly and not majority(seen, limits):
         expected = "cameras that agree"
         raise ExperimentError(refusal("movies", expected=expected, got=str(found), do=found.advice))
 

@@ -11,16 +11,16 @@ import pytest
 import torch
 
 from sphereorient import so3
+from sphereorient.calibration.contradictions import with_contradictions
 from sphereorient.cameras import Camera, sphere_radius_px
-from sphereorient.methods.results import missed_by, with_contradictions, with_lasting_errors
+from sphereorient.methods.results import missed_by
 from sphereorient.pose.fitter import CameraView
-from sphereorient.pose.lasting import Lasting
+from sphereorient.pose.lasting import Lasting, with_lasting_errors
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 CAMERAS = default_cameras(SynthSettings())
-NOTHING = Lasting.none(len(CAMERAS))
 FRAMES, MM, SIGMA_RAD = 12, 18.0, math.radians(0.02)
 
 
@@ -59,7 +59,7 @@ def track_of(
 
 def test_cameras_that_agree_change_nothing():
     track = track_of({"cam1": 0.02}, {})
-    marked, found = with_contradictions(track, CAMERAS, MM, True, NOTHING)
+    marked, found = with_contradictions(track, CAMERAS, MM, True)
     assert not marked.flags.any()
     np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
     np.testing.assert_array_equal(marked.position_cov, track.position_cov)
@@ -67,7 +67,7 @@ def test_cameras_that_agree_change_nothing():
 
 
 def test_a_rotation_beyond_five_sigmas_is_marked_and_half_of_it_stated():
-    marked, found = with_contradictions(track_of({"cam1": 1.0}, {}), CAMERAS, MM, True, NOTHING)
+    marked, found = with_contradictions(track_of({"cam1": 1.0}, {}), CAMERAS, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     sigma = np.degrees(np.sqrt(marked.orientation_cov[:, 0, 0]))
     np.testing.assert_allclose(sigma, math.hypot(0.5, math.degrees(SIGMA_RAD) / math.sqrt(2)), rtol=1e-6)
@@ -78,14 +78,14 @@ def test_cameras_may_differ_by_what_lasts_in_each_of_them():
     """Light that a model lacks turns each camera's rotation in its own way, in all frames alike."""
     track = track_of({"cam1": 1.0}, {})
     own_rad2 = math.radians(0.5) ** 2 * torch.eye(3, dtype=torch.float64).expand(len(CAMERAS), 3, 3)
-    marked, _ = with_contradictions(track, CAMERAS, MM, True, replace(NOTHING, own_rad2=own_rad2))
+    marked, _ = with_contradictions(track, CAMERAS, MM, True, own_rad2)
     assert not marked.flags.any()
     np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
 
 
 @pytest.mark.parametrize("why", [Reason.CONTRADICTS, Reason.SECOND_BALL])
 def test_a_camera_that_was_believed_alone_may_be_off_by_all_of_it(why):
-    marked, _ = with_contradictions(track_of({"cam2": 1.0}, {}, why), CAMERAS, MM, True, NOTHING)
+    marked, _ = with_contradictions(track_of({"cam2": 1.0}, {}, why), CAMERAS, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     np.testing.assert_allclose(np.degrees(np.sqrt(marked.orientation_cov[:, 1, 1])), 1.0, rtol=1e-3)
 
@@ -93,7 +93,7 @@ def test_a_camera_that_was_believed_alone_may_be_off_by_all_of_it(why):
 def test_a_gap_between_the_lines_of_sight_is_stated_and_marked_from_a_pixel_on():
     for shift_px, flag in ((0.4, 0), (3.0, Flag.CONTRADICTION)):
         track = track_of({}, {"cam1": shift_px})
-        marked, _ = with_contradictions(track, CAMERAS, MM, True, NOTHING)
+        marked, _ = with_contradictions(track, CAMERAS, MM, True)
         assert (marked.flags == flag).all()
         half_mm = shift_px / 2 * MM / (2 * track.cameras["cam1"].radius_px)
         np.testing.assert_allclose(np.sqrt(marked.position_cov[:, 0, 0]), half_mm, rtol=0.02)
@@ -102,7 +102,7 @@ def test_a_gap_between_the_lines_of_sight_is_stated_and_marked_from_a_pixel_on()
 def test_a_gap_turns_a_pose_between_two_pictures_but_not_that_of_one_camera():
     for why, rolls in ((Reason.OK, True), (Reason.CONTRADICTS, False)):
         track = track_of({}, {"cam1": 3.0}, why)
-        marked, _ = with_contradictions(track, CAMERAS, MM, True, NOTHING)
+        marked, _ = with_contradictions(track, CAMERAS, MM, True)
         half_mm = 3.0 / 2 * MM / (2 * track.cameras["cam1"].radius_px)
         added = np.sqrt(marked.orientation_cov[:, 0, 0] - track.orientation_cov[:, 0, 0])
         np.testing.assert_allclose(added, half_mm / (MM / 2) * rolls, rtol=0.02)
@@ -127,7 +127,7 @@ def test_what_lasts_is_added_by_the_cameras_that_measured_a_frame():
 
 def test_frames_that_are_not_valid_get_no_flag():
     track = replace(track_of({"cam1": 1.0}, {}), valid=np.arange(FRAMES) % 2 == 0)
-    marked, _ = with_contradictions(track, CAMERAS, MM, True, NOTHING)
+    marked, _ = with_contradictions(track, CAMERAS, MM, True)
     np.testing.assert_array_equal(marked.flags > 0, track.valid)
 
 
@@ -140,7 +140,7 @@ def test_cameras_that_scatter_more_than_they_state_scale_all_errors_but_for_a_fr
     cam1 = track.cameras["cam1"]
     shifted = cam1.centre_px + off[:, None] * np.array([1.0, 0.0])
     cam1 = replace(cam1, orientation=(turned @ torch.from_numpy(cam1.orientation)).numpy(), centre_px=shifted)
-    marked, _ = with_contradictions(replace(track, cameras=track.cameras | {"cam1": cam1}), CAMERAS, MM, True, NOTHING)
+    marked, _ = with_contradictions(replace(track, cameras=track.cameras | {"cam1": cam1}), CAMERAS, MM, True)
     usual = np.delete(np.arange(FRAMES), 5)
     assert not marked.flags[usual].any()
     assert marked.flags[5] == Flag.CONTRADICTION
@@ -153,7 +153,7 @@ def test_cameras_that_scatter_more_than_they_state_scale_all_errors_but_for_a_fr
 def test_cameras_that_state_no_error_of_their_own_do_not_contradict_each_other():
     track = track_of({"cam1": 3.0}, {})
     silent = {name: replace(one, orientation_cov=one.orientation_cov * np.nan) for name, one in track.cameras.items()}
-    marked, _ = with_contradictions(replace(track, cameras=silent), CAMERAS, MM, True, NOTHING)
+    marked, _ = with_contradictions(replace(track, cameras=silent), CAMERAS, MM, True)
     assert not marked.flags.any()
     np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
 
@@ -161,7 +161,7 @@ def test_cameras_that_state_no_error_of_their_own_do_not_contradict_each_other()
 def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
     track = track_of({}, {"cam1": 0.1})
     lost = replace(track, position_cov=np.where(np.arange(FRAMES)[:, None, None] < 2, np.nan, track.position_cov))
-    marked, _ = with_contradictions(lost, CAMERAS, MM, True, NOTHING)
+    marked, _ = with_contradictions(lost, CAMERAS, MM, True)
     np.testing.assert_array_equal(marked.orientation_cov[:2], track.orientation_cov[:2])
     assert (marked.orientation_cov[2:, 0, 0] > track.orientation_cov[2:, 0, 0]).all()
 
@@ -195,7 +195,7 @@ THREE = default_cameras(SynthSettings(cameras=3))
 
 def test_a_camera_that_two_others_overrule_widens_nothing_and_marks_nothing():
     track = track_of({"cam2": 2.0}, {"cam2": 9.0}, Reason.CONTRADICTS, THREE)
-    marked, found = with_contradictions(track, THREE, MM, True, Lasting.none(3))
+    marked, found = with_contradictions(track, THREE, MM, True)
     assert not marked.flags.any()
     np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
     np.testing.assert_array_equal(marked.position_cov, track.position_cov)
@@ -205,7 +205,7 @@ def test_a_camera_that_two_others_overrule_widens_nothing_and_marks_nothing():
 
 
 def test_of_three_cameras_in_use_one_that_is_off_moves_the_mean_by_a_third():
-    marked, _ = with_contradictions(track_of({"cam3": 1.0}, {}, of=THREE), THREE, MM, True, Lasting.none(3))
+    marked, _ = with_contradictions(track_of({"cam3": 1.0}, {}, of=THREE), THREE, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     sigma = np.degrees(np.sqrt(marked.orientation_cov[:, 0, 0]))
     # Two pairs tell of it.

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, compare_cameras, majority
+from sphereorient.calibration.comparison import Limits, Seen
+from sphereorient.calibration.contradictions import compare_cameras, majority
 from sphereorient.cameras import Camera, R_cam_view, TsaiCamera, sphere_radius_px
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of

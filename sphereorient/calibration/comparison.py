@@ -1,0 +1,177 @@
+"""What each camera alone says of the sphere, and by how much the cameras differ."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras import Camera, R_lab_view, Rays, centre_lab_mm, sphere_radius_px, triangulate
+
+RUNS, RUN = 3, 20  # causes are tried in some runs of frames that follow each other
+STRETCH = 0.01  # by how much outlines may be wider than high, where nothing is wrong
+GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
+TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
+NAN = torch.tensor(torch.nan, dtype=torch.float64)
+Sight = tuple[Rays, Tensor]  # what one camera says of N frames: lines of sight, and R_lab_body (N, 3, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How far apart cameras that agree may be, in any light: typical values of a movie."""
+
+    gap_px: float
+    turn_deg: float
+    size: float  # relative
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """What each of C cameras alone says of N frames; NaN where it says nothing."""
+
+    cameras: Mapping[str, Camera]
+    centre_px: Tensor  # (N, C, 2)
+    radius_px: Tensor  # (N, C), of the sphere's picture, along the camera's x
+    R_lab_body: Tensor  # (N, C, 3, 3)
+    diameter_mm: float = 1.0  # without it only ratios of sizes between cameras count
+    outline_stretch: Tensor = NAN  # (N, C) or (): by how much outlines are wider than the cameras say, relative
+    frame: Tensor | None = None  # (N,) int64, increasing, at even times; None: no camera is tested for being late
+
+    @classmethod
+    def of_outlines(cls, cameras: Mapping[str, Camera], centre_px: Tensor, radius_px: Tensor) -> "Seen":
+        """Return what outlines (N, C, 2), (N, C), px, alone say."""
+        R = torch.full((*radius_px.shape, 3, 3), torch.nan, dtype=torch.float64)
+        return cls(cameras=cameras, centre_px=centre_px, radius_px=radius_px, R_lab_body=R)
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """The cameras in pairs."""
+        return list(combinations(range(len(self.cameras)), 2))
+
+    def gaps(self, pair: tuple[int, int], centre_px: Tensor | None = None) -> "Gaps":
+        """Return the gaps of two cameras, with other centres (N, C, 2), px, if these are given."""
+        pixels, cameras = self.centre_px if centre_px is None else centre_px, list(self.cameras.values())
+        return gaps_between([cameras[k] for k in pair], [pixels[:, k] for k in pair])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gaps:
+    """Distances between the lines of sight to n points; made by `gaps_between`."""
+
+    signed_mm: Tensor  # (n,), along the common perpendicular; NaN where a point is missing
+    per_mm_px: Tensor  # (n,), px of the first camera for a millimetre along it
+    position_lab_mm: Tensor  # (n, 3), the middle of the shortest segment
+    across_lab: Tensor  # (n, 3), unit, the common perpendicular
+
+    @property
+    def signed_px(self) -> Tensor:
+        """The gaps in px of the first camera, (n,): the epipolar residual."""
+        return self.signed_mm * self.per_mm_px
+
+    @property
+    def typical_px(self) -> float:
+        """Median size of the gaps, px."""
+        return float(self.signed_px.abs().nanmedian())
+
+
+def gaps_between(cameras: Sequence[Camera], centre_px: Sequence[Tensor]) -> Gaps:
+    """Return the gaps (common perpendiculars) of two cameras' lines of sight to centres (n, 2), px; NaN: no ball."""
+    a, b = (camera.rays(uv) for camera, uv in zip(cameras, centre_px, strict=True))
+    position, signed, across = _meet(a, b)
+    half = 0.5 * across
+    seen = cameras[0].project(torch.cat([position - half, position + half])).chunk(2)
+    per_mm_px = (seen[1] - seen[0]).norm(dim=-1)
+    return Gaps(signed_mm=signed, per_mm_px=per_mm_px, position_lab_mm=position, across_lab=across)
+
+
+def _meet(a: Rays, b: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    """Return where lines of sight meet (n, 3), their signed gap (n,), mm, and its unit direction (n, 3), lab."""
+    position, _ = triangulate(a, b)
+    across = torch.linalg.cross(a.direction_lab, b.direction_lab)
+    across = across / across.norm(dim=-1, keepdim=True)
+    signed = ((b.origin_lab_mm - a.origin_lab_mm) * across).sum(-1)
+    return position, torch.where(torch.isfinite(position).all(-1), signed, torch.nan), across
+
+
+def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
+    """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
+    sigma_deg = math.degrees(float(so3.trace(covariance_rad2).sqrt().nanmedian()))
+    return Limits(
+        gap_px=GAP_PX,
+        turn_deg=max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg if math.isfinite(sigma_deg) else 0.0),
+        size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())),
+    )
+
+
+class Comparison:
+    """Measures by how much the cameras would differ if they had seen something else than they say."""
+
+    def __init__(self, seen: Seen, limits: Limits) -> None:
+        rows = torch.nonzero(torch.isfinite(seen.centre_px).all(-1).sum(-1) > 1)[:, 0]
+        if len(rows) > RUNS * RUN:
+            starts = torch.linspace(0, len(rows) - RUN, RUNS).round().long()
+            rows = rows[(starts[:, None] + torch.arange(RUN)).flatten()]
+        self.cameras, self.names, self.pairs = list(seen.cameras.values()), list(seen.cameras), seen.pairs
+        self.centre_px, self.stretch = seen.centre_px[rows], seen.outline_stretch.expand_as(seen.radius_px)[rows]
+        self.frame = None if seen.frame is None else seen.frame[rows]
+        self.diameter_mm = seen.diameter_mm
+        scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2]
+        self._scale = torch.tensor(scale, dtype=torch.float64)
+        views = [R_lab_view(camera, self.centre_px[:, k]) for k, camera in enumerate(self.cameras)]
+        self.R_view_body = torch.stack(views, 1).mT @ seen.R_lab_body[rows]
+        self._centres = [centre_lab_mm(camera) for camera in self.cameras]
+        self._px_mm, self._by_size = [], []  # by size: distances (N,) of the cameras of a pair
+        for two in self.pairs:
+            gap = gaps_between([self.cameras[c] for c in two], [self.centre_px[:, c] for c in two])
+            self._px_mm.append(gap.per_mm_px.nanmedian())
+            self._by_size.append([self._far(c, gap.position_lab_mm, seen.radius_px[rows, c]) for c in two])
+
+    def _far(self, c: int, position_lab_mm: Tensor, radius_px: Tensor) -> Tensor:
+        expected_px = sphere_radius_px(self.cameras[c], position_lab_mm, self.diameter_mm / 2)
+        far: Tensor = (position_lab_mm - self._centres[c]).norm(dim=-1) * expected_px / radius_px
+        return far
+
+    def sights(self, centre_px: Tensor | None = None, R_view_body: Tensor | None = None) -> list[Sight]:
+        """Return what the cameras say of centres (N, C, 2), px, and attitudes (N, C, 3, 3); None: those seen."""
+        pixels = (self.centre_px if centre_px is None else centre_px).unbind(1)
+        attitudes = (self.R_view_body if R_view_body is None else R_view_body).unbind(1)
+        return [
+            (camera.rays(pixel), R_lab_view(camera, pixel) @ R)
+            for camera, pixel, R in zip(self.cameras, pixels, attitudes, strict=True)
+        ]
+
+    def __call__(
+        self, sights: Sequence[Sight], larger: Tensor | float = 0.0, sized: bool = True, wider: Tensor | float = 0.0
+    ) -> Tensor:
+        """Return gap, turn (3), log sizes (2) and stretches (2) of pairs and frames, (P, N, 8), in units of limits.
+        `larger`: logarithm of the factor by which pictures of the sphere are larger than the cameras say, () or (C,);
+        `wider`: by how much wider than high, relative, () or (C,).
+        """
+        stretch = self.stretch - wider
+        growth = torch.as_tensor(larger, dtype=torch.float64).expand(len(self.names))
+        parts = []
+        for (k, m), px_mm, by_size in zip(self.pairs, self._px_mm, self._by_size, strict=True):
+            (ray, R), (other_ray, other_R) = sights[k], sights[m]
+            position, gap_mm, _ = _meet(ray, other_ray)
+            turn = so3.log(R @ other_R.mT)
+            far = [(position - self._centres[c]).norm(dim=-1) for c in (k, m)]
+            size = torch.stack([(a / b).log() for a, b in zip(far, by_size, strict=True)], -1) - growth[[k, m]]
+            size = size if sized else size * torch.nan
+            parts.append(torch.cat([(gap_mm * px_mm)[:, None], turn, size, stretch[:, [k, m]]], -1))
+        return torch.stack(parts) / self._scale
+
+
+def typical(found: Tensor) -> Tensor:
+    """Return the typical gap, turn, and size that is farthest from the expected one, of each pair, (P, 3)."""
+    gap, turn, size = found[..., 0].abs(), found[..., 1:4].norm(dim=-1), found[..., 4:6]
+    middle = size.nanmedian(1).values.nan_to_num()
+    farthest = middle.gather(1, middle.abs().argmax(1, keepdim=True))
+    return torch.cat([gap.nanmedian(1, keepdim=True).values, turn.nanmedian(1, keepdim=True).values, farthest], 1)
+
+
+def misfit(found: Tensor) -> float:
+    """Return the median over frames of the mean square of what was measured (P, N, K), mean of pairs; NaN without."""
+    return float(found.square().nanmean(-1).nanmedian(1).values.nanmean())
