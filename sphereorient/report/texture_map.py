@@ -25,7 +25,7 @@ from sphereorient.mapping.grid import texel_areas
 from sphereorient.movies import Grey
 from sphereorient.pose.worn import worn_share, worn_texels
 from sphereorient.report.overlay import pictures_by_row, prepared
-from sphereorient.report.overlay_model import crop
+from sphereorient.report.overlay_model import contrast, crop, lit_picture
 from sphereorient.report.overlay_page import OverlayView, crop_side
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note
 from sphereorient.trajectory import Trajectory
@@ -107,7 +107,7 @@ def compare_pictures(learnt: LearntMap, track: Trajectory, experiment: Experimen
         rows = rows if len(rows) else np.flatnonzero(track.valid)
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(EXAMPLES, len(rows))).round().astype(int))]
         for k, pictures in pictures_by_row(streams, rows):
-            for view in page.views:
+            for view in page.balls[0].views:
                 picture = pictures[view.name]
                 if picture is not None and view.light is not None:
                     title = f"{view.name}, frame {int(page.numbers[k])}"
@@ -119,8 +119,13 @@ def _compared(view: OverlayView, k: int, picture: Grey, title: str, correlation:
     assert view.light is not None
     window = view.model.window(k, view.half_px, crop_side(view.half_px))
     seen, filmed = view.model.look(k, window), crop(picture, window)
-    model, contrast = view.light.picture(seen, filmed), view.light.contrast
-    return MapExample(title=title, filmed=filmed, model=model, contrast=contrast, correlation=correlation)
+    return MapExample(
+        title=title,
+        filmed=filmed,
+        model=lit_picture(view.light, seen, filmed),
+        contrast=contrast(view.light),
+        correlation=correlation,
+    )
 
 
 @in_style
