@@ -73,10 +73,8 @@ def gallery(
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
 
-    Raises:
-        ExperimentError: a camera that track or experiment do not have.
-        TrackError: the track is of another experiment.
-        MovieError: a movie that cannot be opened.
+    Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another
+    experiment, MovieError for a movie that cannot be opened.
     """
     why = chosen_frames(track, count)
     rows = np.array(sorted(why), dtype=np.int64)
@@ -157,14 +155,9 @@ def worst_frames(
     cameras: Sequence[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
-    """Draw at most `count` of the worst frames side by side, worst first, into a .png, .pdf or .jpg.
+    """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
 
-    Return the reasons by row of the track.
-
-    Raises:
-        ExperimentError: a camera that track or experiment do not have.
-        TrackError: the track is of another experiment.
-        OutputError: another suffix, or a file that cannot be written.
+    Raise the errors of `gallery`, and OutputError for another suffix or a file that cannot be written.
     """
     check_ending(path, "--worst", SUFFIXES)
     bad = quality.choose_worst(track, count)

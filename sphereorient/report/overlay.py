@@ -21,6 +21,7 @@ from sphereorient.movies import Grey
 from sphereorient.pose.model import Light
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
+from sphereorient.report.plots.style import spread
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -68,10 +69,8 @@ def overlay_movie(
     """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
     All spheres, by name, are drawn into the same frames.
 
-    Raises:
-        ExperimentError: a camera that track or experiment do not have.
-        TrackError: no frame of the track is in the range.
-        OutputError: a suffix that is not a movie's, or a file that cannot be written.
+    Raise ExperimentError for a camera that track or experiment do not have, TrackError if no frame of the track is in
+    the range, OutputError for a suffix that is not a movie's, or a file that cannot be written.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
@@ -163,8 +162,8 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
     readable = stream.rows != NONE
     good = np.flatnonzero(readable & track.valid & model.path.whole)
     sampled = good if len(good) else np.flatnonzero(readable)
-    sampled = np.unique(sampled[np.linspace(0, len(sampled) - 1, min(SAMPLE, len(sampled))).round().astype(int)])
-    pictures = [(k, found[stream.name]) for k, found in pictures_by_row({stream.name: stream}, sampled)]
+    chosen = sampled[spread(len(sampled), SAMPLE)]
+    pictures = [(k, found[stream.name]) for k, found in pictures_by_row({stream.name: stream}, chosen)]
     known = [(k, picture) for k, picture in pictures if picture is not None]
     greys = np.concatenate([np.zeros(0), *(picture[::3, ::3].ravel() for _, picture in known)])
     black, white = np.percentile(greys, (DARK, BRIGHT)) if len(greys) else (0.0, 1.0)
@@ -188,8 +187,7 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
 
-    Raises:
-        OutputError: a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
+    Raise OutputError for a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
     check_ending(path, "--out", FORMATS)
     rate, count = Fraction(fps).limit_denominator(1000), 0
