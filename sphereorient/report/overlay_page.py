@@ -299,9 +299,9 @@ class Panels:
         view, side = self.view, self.side
         seen = self.ball.track.cameras[view.name]
         window, panels = view.window(seen, k), []
-        for column, title in enumerate(("crop", "re-rendered", "residual")):
+        for column, title in enumerate((f"{self.ball.name} crop".strip(), "re-rendered", "residual")):
             at = (corner[0] + column * (side + GAP), corner[1] + TITLE)
-            canvas.text((at[0], at[1] - 7), f"{self.ball.name} {title}".strip(), 14, FAINT)
+            canvas.text((at[0], at[1] - 7), title, 14, FAINT)
             panels.append(crop_panel(canvas, at, side, window))
         blank = "no position"
         if window.known:
