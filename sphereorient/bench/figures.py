@@ -1,6 +1,5 @@
 """Figure and table of the robustness benchmark."""
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,9 +11,8 @@ from matplotlib.figure import Figure
 
 from sphereorient.bench.results import Results, ResultSummary, summaries
 from sphereorient.bench.scenes import CLEAN, TOGETHER
-from sphereorient.files.whole_file import put_aside
-from sphereorient.report.columns import plain_cell
 from sphereorient.report.plots.style import new_figure, plain_logarithms
+from sphereorient.report.tables import write_csv
 from sphereorient.synth.severities import DEGRADATIONS
 
 COLUMNS = 5
@@ -69,7 +67,11 @@ def _panel(part: Any, kind: str, lines: Sequence[ResultSummary], methods: Sequen
     if first:
         above.set_ylabel("error (degrees)", fontsize=8)
         below.set_ylabel("wrong or\nlost (%)", fontsize=8)
-    for axes in (above, below):
+    _plain_axes(above, below)
+
+
+def _plain_axes(*panels: Any) -> None:
+    for axes in panels:
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
 
@@ -102,8 +104,7 @@ def density_figure(runs: Sequence[Results]) -> Figure:
         above = axes.secondary_xaxis("top")
         above.set_xticks([density for density, _ in balls], [str(count) for _, count in balls], fontsize=7)
         above.set_xlabel("balls", fontsize=8)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.3)
+    _plain_axes(turn, place, shares)
     handles, names = turn.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=4, fontsize=8, frameon=False)
     handles = shares.get_legend_handles_labels()[0][:3]
@@ -125,7 +126,7 @@ def unit_of(kind: str) -> str:
 
 def write_table(runs: Sequence[Results], path: Path) -> None:
     """Write the summaries of runs as CSV, whole or not at all."""
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"cameras": run.settings.cameras, "balls": run.settings.balls, "per_litre": run.settings.per_litre}
         | asdict(line)
         for run in runs
@@ -133,7 +134,4 @@ def write_table(runs: Sequence[Results], path: Path) -> None:
     ]
     for row in rows:
         row |= {f"recall_{first}": share for first, share in row.pop("recall").items()}
-    with put_aside(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: plain_cell(value) for name, value in row.items()} for row in rows)
+    write_csv(rows, path)

@@ -2,7 +2,7 @@
 
 import base64
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -151,17 +151,14 @@ Plan = tuple[str, str, str, Callable[[], Figure]]  # name, title, caption, funct
 def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
     caption = "As measured (dots) and smooth, with bands of two standard errors."
-    together = {
-        key: one
-        for key, one in tracks.items()
-        if one is track or (track.sphere and key.removesuffix(one.sphere) == name.removesuffix(track.sphere))
-    }
-    for number, (key, one) in enumerate(together.items()):
-        of = "" if len(tracks) == 1 else f" of {key}"
-        yield f"track_{number + 1}" if number else "track", f"Track{of}", caption, partial(plots.track_figure, one)
+    recording = name.removesuffix(track.sphere)
+    together = {key: one for key, one in tracks.items() if key.removesuffix(one.sphere) == recording}
+    for number, (key, one) in enumerate(together.items(), start=1):
+        label = "track" if number == 1 else f"track_{number}"
+        yield label, f"Track{_of([key], tracks)}", caption, partial(plots.track_figure, one)
     if not track.held:
-        of = "" if len(tracks) == 1 else f" of {', '.join(together)}"
-        yield "path", f"Path{of}", "With the sphere's axes.", partial(plots.path_figure, *together.values())
+        draw = partial(plots.path_figure, *together.values())
+        yield "path", f"Path{_of(together, tracks)}", "With the sphere's axes.", draw
     if any(len(one.distance_rad) for one in distances):
         caption = "PDF of the angle between two cameras' own orientations."
         yield "camera_distance", "Distance of the cameras", caption, lambda: plots.camera_distance_figure(distances)
@@ -186,6 +183,11 @@ def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
         yield "durations", "Durations", "Of the segments.", lambda: plots.durations_figure(found)
 
 
+def _of(names: Iterable[str], tracks: Mapping[str, Trajectory]) -> str:
+    """Return the label of some of the tracks in a title; empty if there is only one."""
+    return "" if len(tracks) == 1 else f" of {', '.join(names)}"
+
+
 def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> Iterator[Plan]:
     """Yield a figure of the paint that was not used, for each ball on which there is any."""
     drawn = set()
@@ -195,10 +197,9 @@ def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment
             continue
         drawn.add(text)
         path = None if experiment is None else experiment.texture_path
-        texture, of = None if path is None else load_texture(path), "" if len(tracks) == 1 else f" of {name}"
-        draw = partial(worn_figure, worn_of_text(text), texture)
-        caption = "It differs from the map."
-        yield f"unused_paint_{len(drawn)}", f"Paint{of} that was not used", caption, draw
+        draw = partial(worn_figure, worn_of_text(text), None if path is None else load_texture(path))
+        title = f"Paint{_of([name], tracks)} that was not used"
+        yield f"unused_paint_{len(drawn)}", title, "It differs from the map.", draw
 
 
 def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:
@@ -236,13 +237,13 @@ def _strips(
 def _folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes the report at the end, or is removed after an error."""
     out = out.resolve()  # a linked folder is followed
-    _check_folder(out)
+    check_folder(out)
     aside, old = unfinished(out), unfinished(out)
     try:
         for part in KINDS:
             (aside / part).mkdir(parents=True)
         yield aside
-        _check_folder(out)  # again: it may have changed meanwhile
+        check_folder(out)  # again: it may have changed meanwhile
         if out.exists():
             out.replace(old)
         aside.replace(out)
@@ -256,7 +257,7 @@ def _folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _check_folder(out: Path) -> None:
+def check_folder(out: Path) -> None:
     """Raise OutputError if a folder has more in it than an older report, whose page carries the mark."""
     page, found = out / "index.html", set(out.rglob("*"))
     ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}")}

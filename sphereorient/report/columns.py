@@ -28,8 +28,7 @@ FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadshe
 def to_arrow(track: Trajectory) -> "pa.Table":
     """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
 
-    Raises:
-        OutputError: pyarrow is not installed.
+    Raise OutputError if pyarrow is not installed.
     """
     arrow = package("pyarrow", "table")
     parts = list(columns(track))
@@ -47,9 +46,7 @@ def to_xarray(track: Trajectory) -> "xr.Dataset":
 
     Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
     camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN.
-
-    Raises:
-        OutputError: xarray is not installed.
+    Raise OutputError if xarray is not installed.
     """
     xarray = package("xarray", "table")
     own = {dataset.name: dataset for dataset in frame_wise(track)}

@@ -12,19 +12,7 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.files.whole_file import put_aside
-from sphereorient.report.columns import (
-    FORMULA,
-    as_text,
-    columns,
-    frame_wise,
-    metadata,
-    package,
-    reasons,
-    safe_names,
-    to_arrow,
-    to_xarray,
-    with_unit,
-)
+from sphereorient.report import columns as table
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.walk import fictrac_rows
 
@@ -54,10 +42,8 @@ def export_track(
 ) -> None:
     """Write a track for other programs, whole or not at all; NaN stays NaN.
 
-    `to` is a key of `WRITERS`; None: by the suffix. `camera`: of the picture, for FicTrac's table.
-
-    Raises:
-        OutputError: an unknown format, a package that is not installed, or a file that cannot be written.
+    `to` is a key of `WRITERS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
+    for an unknown format, a package that is not installed, or a file that cannot be written.
     """
     write = WRITERS[format_of(path, to)]
     with put_aside(path) as aside:
@@ -91,17 +77,17 @@ class Export:
 
 
 def _write_csv(job: Export) -> None:
-    parts = list(columns(job.track))
-    about = metadata(job.track)
+    parts = list(table.columns(job.track))
+    about = table.metadata(job.track)
     settings = about.pop("settings")
-    lines = [f"{key}: {' '.join(as_text(value).split())}" for key, value in about.items()]
+    lines = [f"{key}: {' '.join(table.as_text(value).split())}" for key, value in about.items()]
     lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
     lines = ["made by sphereorient", *lines, *(f"  {line}" for line in settings.splitlines())]
     # Every program reads 1 and 0.
     values = [part.values.astype(np.int8) if part.values.dtype == bool else part.values for part in parts]
     with job.path.open("w", encoding="utf-8", newline="\n") as file:
         for line in lines:
-            file.write(FORMULA.sub(r"\1'\2", f"# {line}".rstrip()) + "\n")
+            file.write(table.FORMULA.sub(r"\1'\2", f"# {line}".rstrip()) + "\n")
         file.write(",".join(part.name for part in parts) + "\n")
         for first in range(0, len(job.track), ROWS):
             rows = zip(*(column[first : first + ROWS].tolist() for column in values), strict=True)
@@ -110,14 +96,14 @@ def _write_csv(job: Export) -> None:
 
 
 def _write_parquet(job: Export) -> None:
-    table = to_arrow(job.track)
+    content = table.to_arrow(job.track)
     import pyarrow.parquet as arrow_parquet
 
-    with arrow_parquet.ParquetWriter(job.path, table.schema, compression="zstd") as writer:
-        for first in range(0, max(len(table), 1), ROWS):
-            part = table.slice(first, ROWS)
+    with arrow_parquet.ParquetWriter(job.path, content.schema, compression="zstd") as writer:
+        for first in range(0, max(len(content), 1), ROWS):
+            part = content.slice(first, ROWS)
             writer.write_table(part)
-            job.progress(first + len(part), len(table))
+            job.progress(first + len(part), len(content))
 
 
 def _write_mat(job: Export) -> None:
@@ -127,13 +113,13 @@ def _write_mat(job: Export) -> None:
     track = job.track
     job.progress(0, len(track))  # SciPy writes in one step
     content = _mat_arrays(track)
-    content["cameras"] = {name: _mat_arrays(camera) for name, camera in safe_names(track).items()}
-    about = metadata(track)
+    content["cameras"] = {name: _mat_arrays(camera) for name, camera in table.safe_names(track).items()}
+    about = table.metadata(track)
     content["metadata"] = {
         **{key: about[key] for key in ("experiment", "method", "frame_rate_hz", "settings", "flags")},
         "cameras": np.array(about["cameras"], dtype=object),
-        "provenance": as_text(about["provenance"]),
-        "units": {with_unit(each.name, each.units): each.units for each in frame_wise(track)},
+        "provenance": table.as_text(about["provenance"]),
+        "units": {table.with_unit(each.name, each.units): each.units for each in table.frame_wise(track)},
     }
     savemat(job.path, content, long_field_names=True, do_compression=True, oned_as="column")
     job.progress(len(track), len(track))
@@ -142,12 +128,12 @@ def _write_mat(job: Export) -> None:
 def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
     """Return arrays by name with unit; rotations as matrices and quaternions (quat_wxyz for orientation)."""
     arrays: dict[str, Any] = {}
-    for dataset in frame_wise(record):
-        arrays[with_unit(dataset.name, dataset.units)] = dataset.values
+    for dataset in table.frame_wise(record):
+        arrays[table.with_unit(dataset.name, dataset.units)] = dataset.values
         if dataset.rotation:
             arrays[dataset.name.replace("orientation", "quat_wxyz", 1)] = quaternions_wxyz(dataset.values)
     if isinstance(record, CameraTrack):
-        arrays["reason"] = reasons(record)
+        arrays["reason"] = table.reasons(record)
     return arrays
 
 
@@ -161,6 +147,7 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
     step_s = np.diff(track.time, prepend=np.nan)
     ahead, right = walk.forward_rad_s * step_s, walk.side_rad_s * step_s
     stretch = np.where(np.isfinite(walk.heading_rad), 0.0, np.nan)
+    total = np.nancumsum(np.stack([ahead, right], axis=1), axis=0)
     return fictrac_rows(
         camera.R_cam_lab.numpy(),
         R @ R[begin].transpose(0, 2, 1),
@@ -172,17 +159,11 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
         error=np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)),
         path=walk.path,
         heading=walk.heading_rad,
-        sums=np.stack([_since(steps, begin) + stretch for steps in (ahead, right)], axis=1),
+        sums=total - total[begin] + stretch[:, None],
         time_ms=ms,
         sequence=count - begin + 1,
         step_ms=np.diff(ms, prepend=np.nan),
     )
-
-
-def _since(steps: Floats, begin: NDArray[np.int64]) -> Floats:
-    """Return the sum of steps (N,) since the frames `begin`, these not included."""
-    total = np.nancumsum(steps)
-    return np.asarray(total - total[begin])
 
 
 def _write_fictrac(job: Export) -> None:
@@ -197,9 +178,9 @@ def _write_tum(job: Export) -> None:
     """Write time, position and quaternion x y z w of each valid frame, as evo and rpg_trajectory_evaluation read it."""
     track = job.track
     w, xyz = np.split(quaternions_wxyz(track.orientation[track.valid]), [1], axis=1)
-    table = np.column_stack([track.time[track.valid], track.position[track.valid], xyz, w])
+    rows = np.column_stack([track.time[track.valid], track.position[track.valid], xyz, w])
     header = f"time_s x_{track.length_unit} y z qx qy qz qw (R_lab_body); made by sphereorient"
-    np.savetxt(job.path, table, fmt="%.17g", header=header)
+    np.savetxt(job.path, rows, fmt="%.17g", header=header)
 
 
 def _write_vtk(job: Export) -> None:
@@ -246,7 +227,7 @@ def _write_vtk(job: Export) -> None:
 
 def _write_nwb(job: Export) -> None:
     """Write Neurodata Without Borders: rotation, angular velocity, position and the walk as time series; SI units."""
-    pynwb = package("pynwb", "nwb")
+    pynwb = table.package("pynwb", "nwb")
     from datetime import UTC, datetime
 
     track, walk = job.track, job.track.walk()
@@ -275,7 +256,7 @@ def _write_nwb(job: Export) -> None:
 
 def _write_netcdf(job: Export) -> None:
     """Write netCDF 3, all arrays with named axes and units."""
-    data = to_xarray(job.track)
+    data = table.to_xarray(job.track)
     data = data.assign({name: data[name].astype("int32") for name in ("flags", "segment", "valid")})
     data.to_netcdf(job.path, engine="scipy")
 

@@ -263,16 +263,13 @@ def _cameras_apart_deg(track: Trajectory) -> Floats | None:
 def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:
     """Find runs of bad frames, joined over fewer than ten good ones, longest first; `numbers` as for `strip_of`."""
     numbers = frame_numbers(track) if numbers is None else numbers
-    group, warnings = _groups(track)
-    status = status_of(track)
+    doubts, status = _doubts(track), status_of(track)
     bad, found = np.flatnonzero(status), []
     parts = np.split(bad, np.flatnonzero(np.diff(bad) > STRETCH_FRAMES) + 1) if len(bad) else []
     for first, last in ((int(part[0]), int(part[-1])) for part in parts):
-        _, doubtful, not_valid = np.bincount(status[first : last + 1], minlength=3).tolist()
-        counted: Counter[str] = Counter()  # the frames of each warning
-        for which, frames in zip(*np.unique(group[first : last + 1], return_counts=True), strict=True):
-            counted.update(dict.fromkeys(warnings[which], int(frames)))
-        del counted["not valid"]  # counted apart
+        inside = slice(first, last + 1)
+        _, doubtful, not_valid = np.bincount(status[inside], minlength=3).tolist()
+        counted = Counter({words: int(there[inside].sum()) for words, there in doubts.items() if there[inside].any()})
         stretch = BadStretch(
             first=first,
             last=last,
@@ -290,9 +287,17 @@ def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStr
 
 def status_of(track: Trajectory) -> Ints:
     """Return the status of every frame, GOOD, DOUBTFUL or NOT_VALID, (N,)."""
-    group, warnings = _groups(track)
-    doubtful = np.array([bool(words) for words in warnings], dtype=bool)[group]
+    doubtful = np.any([np.zeros(len(track), bool), *_doubts(track).values()], axis=0)
     return np.where(track.valid, np.where(doubtful, DOUBTFUL, GOOD), NOT_VALID)
+
+
+def _doubts(track: Trajectory) -> dict[str, NDArray[np.bool_]]:
+    """Return the frames (N,) of each warning of `frame_warnings` but "not valid"."""
+    flags, (codes, words) = shown_flags(track), _reason_codes(track)
+    found = {text: flags & flag > 0 for flag, text in FLAG_WORDS.items()}
+    for name, code in codes.items():
+        found |= {f"{name}: {why}": code == number for number, why in enumerate(words) if number}
+    return found
 
 
 def frame_numbers(track: Trajectory) -> Ints:
@@ -305,17 +310,6 @@ def frame_numbers(track: Trajectory) -> Ints:
     # Times of a table or a camera's clock do not give numbers.
     even = bool((np.abs(at - number) < 0.1).all() and (np.diff(number) > 0).all())
     return number if even else rows
-
-
-def _groups(track: Trajectory) -> tuple[Ints, list[list[str]]]:
-    """Group frames with the same warnings; return each frame's group, (N,), and the warnings of each group."""
-    codes, _ = _reason_codes(track)
-    group = np.asarray(track.valid, np.int64)
-    for values in (track.flags.astype(np.int64), *codes.values()):
-        _, part = np.unique(values, return_inverse=True)
-        _, group = np.unique(group * (part.max(initial=0) + 1) + part, return_inverse=True)
-    _, first = np.unique(group, return_index=True)
-    return group, [frame_warnings(track, int(k)) for k in first]
 
 
 def _reason_codes(track: Trajectory) -> tuple[dict[str, Ints], list[str]]:

@@ -73,10 +73,8 @@ def gallery(
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
 
-    Raises:
-        ExperimentError: a camera that track or experiment do not have.
-        TrackError: the track is of another experiment.
-        MovieError: a movie that cannot be opened.
+    Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another
+    experiment, MovieError for a movie that cannot be opened.
     """
     why = chosen_frames(track, count)
     rows = np.array(sorted(why), dtype=np.int64)
@@ -101,8 +99,7 @@ def gallery(
             )
             frames.append(frame)
             progress(done, len(rows))
-    names = tuple(view.name for view in page.views)
-    return Gallery(frames=tuple(frames), numbers=page.numbers, cameras=names, size=_pairs_size(page))
+    return Gallery(frames=tuple(frames), numbers=page.numbers, cameras=page.cameras, size=_pairs_size(page))
 
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
@@ -158,14 +155,9 @@ def worst_frames(
     cameras: Sequence[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
-    """Draw at most `count` of the worst frames side by side, worst first, into a .png, .pdf or .jpg.
+    """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
 
-    Return the reasons by row of the track.
-
-    Raises:
-        ExperimentError: a camera that track or experiment do not have.
-        TrackError: the track is of another experiment.
-        OutputError: another suffix, or a file that cannot be written.
+    Raise the errors of `gallery`, and OutputError for another suffix or a file that cannot be written.
     """
     check_ending(path, "--worst", SUFFIXES)
     bad = quality.choose_worst(track, count)
@@ -173,13 +165,12 @@ def worst_frames(
         page, streams = prepared(track, experiment, cameras, opened)
         width, height = _pairs_size(page)
         across, down = width + BETWEEN, TITLE + height + LINES * LINE + 10 + BETWEEN  # from tile to tile
-        columns = max(1, PICTURES // (2 * len(page.views)))
+        columns = max(1, PICTURES // (2 * len(page.cameras)))
         canvas = Canvas(columns * across + BETWEEN, HEAD + max(1, math.ceil(len(bad) / columns)) * down)
-        names = ", ".join(view.name for view in page.views)
         title = f"{track.title}, {track.method}: the {len(bad)} worst of {len(track)} frames"
         canvas.text((BETWEEN, 24), f"{title}, worst first; {int(track.valid.sum())} are valid", 17)
-        about = f"of each camera ({names}): the crop with the outline, and the sphere re-rendered at the measured pose "
-        about += "with body axes (x orange, y green, z blue; dotted: away)"
+        about = f"of each camera ({', '.join(page.cameras)}): the crop with the outline, and the sphere re-rendered at "
+        about += "the measured pose with body axes (x orange, y green, z blue; dotted: away)"
         canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
         corner = {k: (BETWEEN + i % columns * across, HEAD + i // columns * down) for i, k in enumerate(bad)}
         for done, (k, pictures) in enumerate(pictures_by_row(streams, np.array(sorted(bad), np.int64)), start=1):
@@ -199,7 +190,7 @@ def _tile(
     corner: tuple[int, int],
 ) -> None:
     left, top = corner
-    canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {page.track.time[k]:.4f} s", 14)
+    canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {page.balls[0].track.time[k]:.4f} s", 14)
     _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
     lines = [line for words in why for line in textwrap.wrap(words, int(_pairs_size(page)[0] / LETTER_PX))]
     if len(lines) > LINES:
@@ -211,16 +202,17 @@ def _tile(
 
 def _pairs_size(page: Page) -> tuple[int, int]:
     """Return width and height of the drawing of `_draw_pairs`, px."""
-    return 2 * len(page.views) * (TILE + GAP) - GAP, TILE
+    return 2 * len(page.cameras) * (TILE + GAP) - GAP, TILE
 
 
 def _draw_pairs(
     canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Grey | None], corner: tuple[int, int]
 ) -> None:
     """Draw crop and re-rendered sphere of each camera; the whole frame if the centre is unknown."""
-    for column, view in enumerate(page.views):
+    (ball,) = page.balls
+    for column, view in enumerate(ball.views):
         left, top = corner[0] + 2 * column * (TILE + GAP), corner[1]
-        window, size = view.window(page.track.cameras[view.name], k), view.model.camera.image_size
+        window, size = view.window(ball.track.cameras[view.name], k), view.model.camera.image_size
         if not (here := window.known):
             window = replace(window, centre_px=np.asarray(size, np.float64) / 2 - 0.5, half_px=max(size) / 2)
         window = replace(window, side=max(48, min(2 * TILE, round(2 * window.half_px))))

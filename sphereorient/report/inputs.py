@@ -21,7 +21,8 @@ from sphereorient.preflight.cameras import expected_outline_px, sample_positions
 from sphereorient.preflight.first_look import FirstLook
 from sphereorient.preflight.in_step import REACH
 from sphereorient.preflight.sample import MovieSample
-from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, write_figure
+from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, say_empty, spread, write_figure
+from sphereorient.report.texture_map import draw_map
 
 EXPECTED, FOUND, USED = AXIS_COLOURS
 OUTLIER = "#CC79A7"
@@ -30,7 +31,7 @@ MARKS = {Severity.OK: ("\u25cf", FOUND), Severity.WARNING: ("\u25b2", "#E69F00")
 WIDTH = 13.0  # inches, of the figures; so are:
 COLUMNS, TITLE, HEAD = 6, 0.27, 0.8  # of a contact sheet: frames in a row; the line above a frame, the title
 PICTURE, LINE = 3.3, 0.165  # of a check: a row of pictures, a line of text
-BRIGHT_QUANTILE = 0.999  # of the pixels: shown white, so that a few glints do not darken the rest
+BRIGHT_QUANTILE = 0.999  # of the pixels of a contact sheet: shown white
 SHOWN = 3  # pictures of each camera
 NEAR = 1.4  # of the radius: half the side of a picture of the ball alone
 CHARACTERS = 145  # in a line of the list
@@ -42,8 +43,8 @@ def contact_sheet(movie: Movie, seen: Survey, path: Path) -> None:
     rows = math.ceil(len(seen.frames) / COLUMNS)
     height, width = movie.frame_shape
     figure = new_figure(WIDTH, HEAD + rows * ((WIDTH / COLUMNS) * height / width + TITLE))
-    pictures = [frame.small for frame in seen.frames if frame.small is not None and not frame.fault]
-    pictures = pictures or [frame.small for frame in seen.frames if frame.small is not None]
+    known = [(frame.small, frame.fault) for frame in seen.frames if frame.small is not None]
+    pictures = [small for small, fault in known if not fault] or [small for small, _ in known]
     values = np.concatenate([picture.ravel() for picture in pictures]) if pictures else np.array([0.0])
     black = float(values.min())
     white = max(float(np.quantile(values, BRIGHT_QUANTILE)), black + 1)
@@ -87,7 +88,7 @@ def calibration_figure(result: Calibrated, path: Path) -> None:
     axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)
     for row, name in zip(axes, names, strict=True):
         used = [one for one in result.pictures if one.picture.camera == name and not one.reason]
-        chosen = [used[int(k)] for k in np.linspace(0, len(used) - 1, min(SHOWN, len(used))).round()]
+        chosen = [used[k] for k in spread(len(used), SHOWN)]
         for ax in row:
             ax.grid(visible=False)
         for ax, one in zip(row, chosen, strict=False):
@@ -148,27 +149,33 @@ def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
     figure = new_figure(2.6 * PICTURE, PICTURE * len(looks) + 0.3)
     for look, (whole, near) in zip(looks, figure.subplots(len(looks), 2, squeeze=False), strict=True):
         for ax in (whole, near):
-            ax.set(xticks=[], yticks=[])
-            ax.imshow(look.picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(look.picture, 99.8))))
+            _show(ax, look.picture)
         if look.outline is None:
             near.set_axis_off()
             whole.set_title(f"{look.name}: no ball was found", fontsize=9)
             continue
-        outline = look.outline
-        for ax in (whole, near):
-            ax.plot(*_circle(outline), lw=1.4, color=FOUND)
-        reach = NEAR * outline.radius_px
-        near.set(xlim=(outline.u_px - reach, outline.u_px + reach), ylim=(outline.v_px + reach, outline.v_px - reach))
+        _outlined(whole, look.outline)
+        _outlined(near, look.outline, near=True)
         where = "stays in its place" if look.stays else f"moves; found in {look.found} of {look.looked} frames"
         whole.set_title(f"{look.name}, {Path(look.movie.path).name}: the ball {where}", fontsize=9)
-        near.set_title(f"outline found, {2 * outline.radius_px:.1f} px across", fontsize=9)
+        near.set_title(f"outline found, {2 * look.outline.radius_px:.1f} px across", fontsize=9)
     write_figure(figure, path, dpi=110)
 
 
-def _circle(outline: Outline) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return u and v, px, of points on an outline."""
-    angle = np.linspace(0, 2 * np.pi, 181)
-    return outline.u_px + outline.radius_px * np.cos(angle), outline.v_px + outline.radius_px * np.sin(angle)
+def _show(ax: Any, picture: NDArray[Any]) -> None:
+    """Show a whole picture: black is 0, white nearly its brightest level, so that a few glints do not darken it."""
+    height, width = picture.shape
+    ax.imshow(picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(picture, 99.8))))
+    ax.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+
+
+def _outlined(ax: Any, outline: Outline, near: bool = False, **style: Any) -> None:
+    """Draw an outline, `near`: with the ball alone in view."""
+    angle, radius = np.linspace(0, 2 * np.pi, 181), outline.radius_px
+    u, v, style = outline.u_px, outline.v_px, {"lw": 1.4, "color": FOUND} | style
+    ax.plot(u + radius * np.cos(angle), v + radius * np.sin(angle), **style)
+    if near:
+        ax.set(xlim=(u - NEAR * radius, u + NEAR * radius), ylim=(v + NEAR * radius, v - NEAR * radius))
 
 
 def preflight_figure(result: Preflight, path: Path) -> None:
@@ -199,8 +206,13 @@ def _cameras_part(part: Any, result: Preflight) -> None:
     axes = part.subplots(1, 2 * several)
     for ax in axes[2 * len(result.samples) :]:
         ax.set_axis_off()
+    diameter_mm, position = result.experiment.diameter_mm, torch.full((3,), torch.nan)
+    if result.scans:
+        position = sample_positions(result.samples)[k]
     for sample, pair in zip(result.samples, axes.reshape(several, 2), strict=False):
-        expected = _expected_px(result, sample, k)
+        expected = None  # by all cameras and the diameter, (n, 2) px
+        if diameter_mm is not None and bool(torch.isfinite(position).all()):
+            expected = expected_outline_px(sample.camera, position, diameter_mm / 2).numpy()
         for ax, near in zip(pair, (False, True), strict=True):
             _draw_ball(ax, sample, k, expected, near)
     if axes[0].lines:
@@ -210,64 +222,45 @@ def _cameras_part(part: Any, result: Preflight) -> None:
 def _scene_part(part: Any, result: Preflight) -> None:
     """Draw a picture of each camera with all disks, and the names of the balls found."""
     for ax, view in zip(part.subplots(1, max(1, len(result.scene)), squeeze=False)[0], result.scene, strict=False):
-        height, width = view.picture.shape
-        ax.imshow(view.picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(view.picture, 99.8))))
+        _show(ax, view.picture)
         for outline in view.disks:
-            ax.plot(*_circle(outline), lw=1.2, color=FOUND)
+            _outlined(ax, outline, lw=1.2)
         for name, (u, v) in view.balls.items():
             ax.text(u, v, name, color=EXPECTED, fontsize=10, ha="center", va="center", clip_on=True)
-        ax.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
         ax.set_title(f"{view.name}, frame {view.frame}: disks, and the balls found by their paint", fontsize=9)
-
-
-def _expected_px(result: Preflight, sample: MovieSample, k: int) -> NDArray[np.float64] | None:
-    """Return the outline expected from all cameras and the diameter, (n, 2) px; None if unknown."""
-    if not result.scans or result.experiment.diameter_mm is None:
-        return None
-    position = sample_positions(result.samples)[k]
-    if not bool(torch.isfinite(position).all()):
-        return None
-    return expected_outline_px(sample.camera, position, result.experiment.diameter_mm / 2).numpy()
 
 
 def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float64] | None, near: bool) -> None:
     picture, (outline, reason) = sample.picture[k], sample.found[k]
-    ax.set(xticks=[], yticks=[])
-    if picture is None:
-        picture = np.zeros(sample.stream.movie.frame_shape)
-    ax.imshow(picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(picture, 99.8))))
+    _show(ax, np.zeros(sample.stream.movie.frame_shape) if picture is None else picture)
     if outline is not None:
-        ax.plot(*_circle(outline), lw=1.4, color=FOUND, label="outline found")
+        _outlined(ax, outline, near, label="outline found")
     if expected is not None:
         closed = np.concatenate([expected, expected[:1]])
         ax.plot(*closed.T, "--", lw=1.4, color=EXPECTED, label="expected from all cameras and the diameter")
-    height, width = picture.shape
-    if not near or outline is None:
-        ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-        what = f"frame {int(sample.frame[k])}" if outline is not None else f"no ball: {reason}"
-        ax.set_title(f"{sample.name}, {what}", fontsize=9)
-        return
-    reach = 1.35 * outline.radius_px
-    ax.set(xlim=(outline.u_px - reach, outline.u_px + reach), ylim=(outline.v_px + reach, outline.v_px - reach))
-    ax.set_title(f"{sample.name}: {2 * outline.radius_px:.1f} px across", fontsize=9)
+    what = f", no ball: {reason}" if outline is None else f", frame {int(sample.frame[k])}"
+    if near and outline is not None:
+        what = f": {2 * outline.radius_px:.1f} px across"
+    ax.set_title(f"{sample.name}{what}", fontsize=9)
 
 
 def _draw_gap(ax: Any, result: Preflight) -> None:
     if not result.scans:
-        _no_data(ax, "one camera: no gap")
+        ax.set_axis_off()
+        say_empty(ax, "one camera: no gap")
         return
     ax.axvline(0, lw=0.8, color="#444444")
+    single = len(result.scans) == 1
     for k, scan in enumerate(result.scans):
-        of = f", {scan.names[1]}" if len(result.scans) > 1 else ""
-        color = USED if len(result.scans) == 1 else f"C{k}"
-        ax.plot(scan.offset, scan.gap_px, "o-", ms=4, lw=1.2, color=color, label=f"gap{of}")
-        if len(result.scans) == 1:
+        of = "" if single else f", {scan.names[1]}"
+        ax.plot(scan.offset, scan.gap_px, "o-", ms=4, lw=1.2, color=USED if single else f"C{k}", label=f"gap{of}")
+        if single:
             ax.plot(scan.offset, scan.varying_px, ".:", ms=4, lw=1, color="#777777", label="without its constant part")
         if not math.isnan(scan.best):
             ax.axvline(scan.best, ls="--", lw=1.2, color=EXPECTED, label=f"least at {scan.best:+.2f}{of}")
-    late = result.scans[0].names[1] if len(result.scans) == 1 else f"the other movie than in {result.scans[0].names[0]}"
-    ax.set(xlabel=f"frames later in {late}", ylabel="gap of the lines of sight (px)")
-    ax.set(xlim=(-REACH - 0.5, REACH + 0.5), ylim=(0, None))
+    late = result.scans[0].names[1] if single else f"the other movie than in {result.scans[0].names[0]}"
+    ax.set(xlabel=f"frames later in {late}", ylabel="gap of the lines of sight (px)", ylim=(0, None))
+    ax.set_xlim(-REACH - 0.5, REACH + 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(9, integer=True))
     ax.legend(fontsize=7, framealpha=0.8)
     ax.set_title("are the movies in step", fontsize=9)
@@ -275,22 +268,20 @@ def _draw_gap(ax: Any, result: Preflight) -> None:
 
 def _draw_texture(ax: Any, result: Preflight) -> None:
     if result.texture is None or result.measures is None:
-        _no_data(ax, "no map of the paint")
+        ax.set_axis_off()
+        say_empty(ax, "no map of the paint")
         return
-    span = (-180, 180, -90, 90)
-    ax.imshow(result.texture.numpy(), cmap="gray", vmin=0, vmax=1, extent=span, interpolation="nearest")
     seen = 100 * result.measures.view_brightness.numpy()
     longitude = (np.arange(seen.shape[1]) + 0.5) * (360 / seen.shape[1]) - 180
     latitude = 90 - (np.arange(seen.shape[0]) + 0.5) * (180 / seen.shape[0])
+    title = f"the map; lines: brightness of the view from there, {seen.min():.0f} to {seen.max():.0f} %"
+    draw_map(ax, result.texture, title, interpolation="nearest")
+    ax.title.set_fontsize(9)
+    ax.tick_params(labelsize=7)
+    ax.set_xlabel("longitude on the ball (degrees)", fontsize=8)
     if np.ptp(seen) > 1e-4:
         drawn = ax.contour(longitude, latitude, seen, levels=6, colors=EXPECTED, linewidths=1.2)
         ax.clabel(drawn, fmt="%.0f %%", fontsize=7)
-    ax.set(xticks=[-180, -90, 0, 90, 180], yticks=[-90, 0, 90])
-    ax.tick_params(labelsize=7)
-    ax.set_xlabel("longitude on the ball (degrees)", fontsize=8)
-    ax.set_ylabel("latitude", fontsize=8)
-    title = f"the map; lines: brightness of the view from there, {seen.min():.0f} to {seen.max():.0f} %"
-    ax.set_title(title, fontsize=9)
 
 
 def _draw_pair(ax: Any, result: Preflight) -> None:
@@ -303,11 +294,6 @@ def _draw_pair(ax: Any, result: Preflight) -> None:
         inset = ax.inset_axes((0.02 + 0.5 * k, 0.0, 0.46, 0.98))
         inset.imshow(view, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         inset.set_axis_off()
-
-
-def _no_data(ax: Any, text: str) -> None:
-    ax.set_axis_off()
-    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=9)
 
 
 def _lines(result: Preflight) -> list[tuple[Finding | None, str, str]]:

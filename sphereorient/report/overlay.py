@@ -18,9 +18,10 @@ from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
-from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of
-from sphereorient.report.overlay_page import OverlayView, Page, crop_side
-from sphereorient.report.overlay_scene import ScenePage
+from sphereorient.pose.model import Light
+from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
+from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
+from sphereorient.report.plots.style import spread
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -66,20 +67,15 @@ def overlay_movie(
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
-    Several spheres, by name, are drawn into the same frames.
+    All spheres, by name, are drawn into the same frames.
 
-    Raises:
-        ExperimentError: a camera that track or experiment do not have.
-        TrackError: no frame of the track is in the range.
-        OutputError: a suffix that is not a movie's, or a file that cannot be written.
+    Raise ExperimentError for a camera that track or experiment do not have, TrackError if no frame of the track is in
+    the range, OutputError for a suffix that is not a movie's, or a file that cannot be written.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
-    known = list(Tracks.of(tracks).values())
     with ExitStack() as opened:
-        first, streams = prepared(known[0], experiment, selection.cameras, opened)
-        more = [page_of(track, experiment, first.numbers, streams) for track in known[1:]]
-        page = ScenePage(pages=[first, *more]) if more else first
+        page, streams = prepared(tracks, experiment, selection.cameras, opened)
         chosen = selection.rows(page.numbers)
 
         def drawn() -> Iterator[NDArray[np.uint8]]:
@@ -91,28 +87,31 @@ def overlay_movie(
 
 
 def prepared(
-    track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None, opened: ExitStack
+    tracks: Trajectory | Mapping[str, Trajectory],
+    experiment: Experiment,
+    cameras: Sequence[str] | None,
+    opened: ExitStack,
 ) -> tuple[Page, dict[str, CameraStream]]:
     """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them."""
-    names = list(track.cameras) if cameras is None else list(cameras)
+    known = list(Tracks.of(tracks).values())
+    names = list(known[0].cameras) if cameras is None else list(cameras)
     for name in names:
-        if name not in track.cameras:
-            raise ExperimentError(refuse_unknown(name, track.cameras, "cameras of the track"))
+        if name not in known[0].cameras:
+            raise ExperimentError(refuse_unknown(name, known[0].cameras, "cameras of the track"))
     if not names:
         got, do = "none", "write --cameras cam1, or leave it out"
         raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
-    numbers, streams = streams_of(track, experiment, names, opened)
-    return page_of(track, experiment, numbers, streams), streams
+    numbers, streams = streams_of(known[0], experiment, names, opened)
+    return Page(numbers=numbers, balls=[_ball(track, experiment, streams) for track in known]), streams
 
 
-def page_of(track: Trajectory, experiment: Experiment, numbers: Rows, streams: Mapping[str, CameraStream]) -> Page:
-    """Return the page of a track, whose frames have these numbers (N,) and pictures."""
-    ball = experiment.of(track.sphere)
-    texture = None if ball.texture_path is None else load_texture(ball.texture_path)
-    where = path_of(track, ball.radius_mm)
+def _ball(track: Trajectory, experiment: Experiment, streams: Mapping[str, CameraStream]) -> Ball:
+    sphere = experiment.of(track.sphere)
+    texture = None if sphere.texture_path is None else load_texture(sphere.texture_path)
+    where = path_of(track, sphere.radius_mm)
     models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
     views = [_view(track, model, stream) for model, stream in zip(models, streams.values(), strict=True)]
-    return Page(track=track, numbers=numbers, views=views)
+    return Ball(track=track, views=views)
 
 
 def streams_of(
@@ -163,17 +162,17 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
     readable = stream.rows != NONE
     good = np.flatnonzero(readable & track.valid & model.path.whole)
     sampled = good if len(good) else np.flatnonzero(readable)
-    sampled = np.unique(sampled[np.linspace(0, len(sampled) - 1, min(SAMPLE, len(sampled))).round().astype(int)])
-    pictures = [(k, found[stream.name]) for k, found in pictures_by_row({stream.name: stream}, sampled)]
+    chosen = sampled[spread(len(sampled), SAMPLE)]
+    pictures = [(k, found[stream.name]) for k, found in pictures_by_row({stream.name: stream}, chosen)]
     known = [(k, picture) for k, picture in pictures if picture is not None]
     greys = np.concatenate([np.zeros(0), *(picture[::3, ::3].ravel() for _, picture in known)])
     black, white = np.percentile(greys, (DARK, BRIGHT)) if len(greys) else (0.0, 1.0)
-    light: LightFit | None = None
+    light: Light | None = None
     if len(good) and np.isfinite(half_px) and model.texture is not None:
         side = crop_side(half_px)
         model = replace(model, texture=reduced_texture(model.texture, side / MARGIN))
         windows = [(k, model.window(k, half_px, side), picture) for k, picture in known]
-        light = fit_light([(model.look(k, window), crop(picture, window)) for k, window, picture in windows])
+        light = fit_light((model.look(k, window), crop(picture, window)) for k, window, picture in windows)
     return OverlayView(
         name=stream.name,
         model=model,
@@ -188,8 +187,7 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
 
-    Raises:
-        OutputError: a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
+    Raise OutputError for a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
     check_ending(path, "--out", FORMATS)
     rate, count = Fraction(fps).limit_denominator(1000), 0

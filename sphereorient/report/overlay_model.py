@@ -1,7 +1,7 @@
-"""The measured sphere in a camera's picture: outline, axes, trail, and the re-rendered picture."""
+"""The measured sphere in a camera's picture: outline, axes, and the re-rendered picture under the light of `pose`."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,13 +12,15 @@ from torch import Tensor
 from sphereorient.cameras import Camera
 from sphereorient.errors import TextureError, refusal
 from sphereorient.movies import Grey
+from sphereorient.pose.fit import solved_light
+from sphereorient.pose.model import Light, light_basis
 from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.sphere import see_sphere
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 MARGIN = 1.3  # half the side of a crop, in radii of the sphere
-SLANT = 0.3  # cosine of the angle of sight below which the paint is too foreshortened for the light's fit
+LIMB = 0.95  # radii from the disk's middle beyond which the paint is too foreshortened for the light's fit
 FINE = 2  # samples along each side of a pixel
 
 
@@ -97,10 +99,14 @@ def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenDisk:
-    """Texture and basis of the light in a window, (side, side, ...); made by `Model.look`."""
+    """Paint and place on the disk in a window, (side, side, ...); made by `Model.look`."""
 
     paint: NDArray[np.float32]  # 0 black .. 1 white; NaN outside the sphere
-    basis: NDArray[np.float32]  # (side, side, 4): 1, normal's right and down, cosine of the angle of sight
+    across: NDArray[np.float32]  # (side, side, 2), place on the disk along the camera's x and y, radii
+
+    def basis(self, chosen: NDArray[np.bool_]) -> Tensor:
+        """Return the basis of light maps at chosen pixels (side, side), (K, n)."""
+        return light_basis(torch.from_numpy(self.across[chosen].T.astype(np.float64)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,21 +118,19 @@ class Model:
     path: Path3D
 
     def look(self, k: int, window: CropWindow) -> SeenDisk:
-        """Return texture and basis of the light in a window of frame k, the mean of finer samples, ports included."""
+        """Return paint and places in a window of frame k, the mean of finer samples, ports included."""
         if self.texture is None:
             do = "draw the track of an experiment with a texture"
             raise TextureError(refusal("model", expected="a map of the paint", got="none", do=do))
-        uv = torch.from_numpy(window.grid_px(FINE))
-        rays = self.camera.rays(uv)
+        rays = self.camera.rays(torch.from_numpy(window.grid_px(FINE)))
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
         seen = see_sphere(rays, centre, R, self.texture, self.path.radius_mm)
-        across = seen.normal @ self.camera.R_cam_lab.mT
-        sight = -(seen.normal * rays.direction_lab).sum(-1, keepdim=True)
-        parts = torch.cat([seen.paint[..., None], torch.ones_like(sight), across[..., :2], sight], dim=-1)
-        parts = torch.where(seen.depth2[..., None] > 0, parts, torch.full_like(parts, torch.nan))
-        side = window.side
-        mean = parts.reshape(side, FINE, side, FINE, 5).mean((1, 3)).numpy().astype(np.float32)
-        return SeenDisk(paint=mean[..., 0], basis=mean[..., 1:])
+        along = (seen.normal * rays.direction_lab).sum(-1, keepdim=True)
+        across = (seen.normal - along * rays.direction_lab) @ self.camera.R_cam_lab[:2].mT
+        parts = torch.cat([seen.paint[..., None], across], dim=-1)
+        parts = torch.where(seen.depth2[..., None] > 0, parts, torch.nan)
+        mean = parts.reshape(window.side, FINE, window.side, FINE, 3).mean((1, 3)).numpy().astype(np.float32)
+        return SeenDisk(paint=mean[..., 0], across=mean[..., 1:])
 
     def window(self, k: int, half_px: float, side: int) -> CropWindow:
         """Return the window around the sphere in frame k."""
@@ -134,42 +138,40 @@ class Model:
         return CropWindow(centre_px=centre, half_px=half_px, side=side)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LightFit:
-    """Grey levels of white and black paint over the disk, one for a whole movie; made by `fit_light`."""
-
-    gain: Floats  # (4,), coefficients of the basis: white minus black
-    offset: Floats  # (4,), black
-
-    @property
-    def contrast(self) -> float:
-        """White minus black paint in the middle of the disk, grey levels."""
-        return float(max(self.gain[0] + self.gain[3], 1e-6))
-
-    def picture(self, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Return model grey levels (side, side), NaN outside, scaled by 0.5 .. 2 to the brightness of `filmed`."""
-        grey = (seen.basis @ self.gain) * seen.paint + seen.basis @ self.offset
-        if filmed is not None:
-            good = np.isfinite(grey) & np.isfinite(filmed)
-            # Ratio of sums: least squares would darken a sphere with a wrong orientation.
-            grey = grey * np.clip(filmed[good].sum() / max(float(grey[good].sum()), 1e-9), 0.5, 2.0)
-        return np.asarray(grey, np.float32)
+def contrast(light: Light) -> float:
+    """Return white less black paint in the middle of the disk of one camera, grey levels."""
+    middle = light_basis(torch.zeros(1, 2, 1))[0, :, 0]
+    return max(float(light.difference[0] @ middle), 1e-6)
 
 
-def fit_light(pairs: Sequence[tuple[SeenDisk, NDArray[np.float32]]]) -> LightFit | None:
-    """Fit one light to all given frames (model, crop in grey levels); None if no pixel can be compared."""
+def lit_picture(light: Light, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """Return model grey levels (side, side), NaN outside, scaled by 0.5 .. 2 to the brightness of `filmed`."""
+    there = np.isfinite(seen.paint)
+    difference, black = (light_map[0].double() @ seen.basis(there) for light_map in (light.difference, light.black))
+    grey = np.full(there.shape, np.nan)
+    grey[there] = difference.numpy() * seen.paint[there] + black.numpy()
+    if filmed is not None:
+        good = there & np.isfinite(filmed)
+        # Ratio of sums: least squares would darken a sphere with a wrong orientation.
+        grey = grey * np.clip(filmed[good].sum() / max(float(grey[good].sum()), 1e-9), 0.5, 2.0)
+    return np.asarray(grey, np.float32)
+
+
+def fit_light(pairs: Iterable[tuple[SeenDisk, NDArray[np.float32]]]) -> Light | None:
+    """Fit one light to all given frames of one camera (model, crop in grey levels); None if too few pixels are known.
+
+    It has no noise, glints or stray light, which a crop is not compared with.
+    """
     # One light for all frames: a fit of each frame would hide a part of a wrong orientation.
-    rows, greys = [np.zeros((0, 8))], [np.zeros(0)]
+    light, count = Light.unknown(1, torch.zeros(1, 4)), 0
+    unknowns = 2 * light.difference.shape[1]
+    normal, right = torch.zeros(unknowns, unknowns, dtype=torch.float64), torch.zeros(unknowns, dtype=torch.float64)
     for seen, grey in pairs:
-        with np.errstate(invalid="ignore"):
-            good = np.isfinite(grey) & (seen.basis[..., 3] > SLANT)
-        basis = seen.basis[good].astype(np.float64)
-        rows.append(np.concatenate([basis * seen.paint[good][:, None], basis], axis=1))
-        greys.append(grey[good].astype(np.float64))
-    design, target = np.concatenate(rows), np.concatenate(greys)
-    if len(target) < 8:
+        good = np.isfinite(grey) & (np.hypot(*np.moveaxis(seen.across, -1, 0)) < LIMB)
+        basis, target = seen.basis(good), torch.from_numpy(grey[good].astype(np.float64))
+        columns = torch.cat([basis * torch.from_numpy(seen.paint[good].astype(np.float64)), basis])
+        normal, right, count = normal + columns @ columns.mT, right + columns @ target, count + len(target)
+    if count < unknowns:
         return None
-    # A small ridge keeps coefficients finite where the visible paint has one grey level.
-    ridge = 1e-3 * np.sqrt(len(target)) * np.eye(8)
-    solved = np.linalg.lstsq(np.concatenate([design, ridge]), np.concatenate([target, np.zeros(8)]), rcond=None)[0]
-    return LightFit(gain=solved[:4], offset=solved[4:])
+    difference, black = solved_light(normal, right)[None].chunk(2, dim=-1)
+    return replace(light, difference=difference, black=black, known=True)

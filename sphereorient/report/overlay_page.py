@@ -1,4 +1,4 @@
-"""The pictures of the overlay: each camera's frame, crop, re-rendered sphere and residual; and what draws them."""
+"""The pictures of the overlay: each camera's frame, and crop, re-rendered picture and residual of each sphere."""
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sphereorient.movies import Grey
-from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags
-from sphereorient.report.overlay_model import CropWindow, LightFit, Model, axes_px, crop, outline_px
+from sphereorient.pose.model import Light
+from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags, stated_error
+from sphereorient.report.overlay_model import CropWindow, Model, axes_px, contrast, crop, lit_picture, outline_px
 from sphereorient.trajectory import CameraTrack, Trajectory, runs_of
 
 Colour = tuple[int, int, int]
+Box = tuple[tuple[int, int], tuple[int, int]]  # corner (left, top) and size (width, height), px
 BACKGROUND: Colour = (18, 18, 22)
 INK: Colour = (235, 235, 235)
 FAINT: Colour = (165, 165, 170)
@@ -30,12 +32,19 @@ LOST: Colour = (130, 130, 135)
 GOOD: Colour = (43, 224, 168)
 SHIFT = 4  # bits of a pixel's fraction
 DOT, SPACE = 3.0, 3.5  # px, of dotted lines
-HEAD, FOOT, GAP, TITLE, SIDE = 62, 56, 10, 24, 310  # px: bands above and below, between panels, titles, square panels
+HEAD, FOOT, GAP, TITLE = 62, 40, 10, 24  # px: bands above and below, between panels, titles
+SIDE = 310  # px, of square panels, at most
+MOST_ROWS = 3  # of panels beside a frame: with more their pictures are too small
+STRIP = 16  # px, from strip to strip
+NAME = 14  # letters of a sphere's name that are shown
+ABOVE = 0.25  # of the radius: from the outline to the name
 FRAME_HEIGHT = 440  # px, of a camera's frame
 WIDEST = 1.4  # of a frame's height
+LEAST_WIDTH = 1150  # px, of a page: the line of the legend
 TRAIL_FRAMES = 40
 OWN_PX = 1.5  # a camera's own centre further off than this is drawn
 LINE, LETTER = 18, 8  # px, of text: from line to line, and a letter's usual width
+WORDS_LETTER = 9.6  # px, the width of a letter below the panels, at most
 LABEL_AT = 1.16  # of the sphere's radius: letters of the axes
 RESIDUAL_REACH = 0.5  # of the contrast of white and black: the ends of the residual's scale
 BLANK = 45  # grey of pixels without a residual
@@ -128,11 +137,11 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OverlayView:
-    """What all pictures of one camera share; made by `overlay.prepared`, read by the page."""
+    """What all pictures of one sphere by one camera share; made by `overlay.prepared`, read by the page."""
 
     name: str
     model: Model
-    light: LightFit | None  # None: no frame to fit it to
+    light: Light | None  # of this camera alone; None: no frame to fit it to
     black: float  # grey level shown black
     white: float
     half_px: float  # of the crop
@@ -148,13 +157,10 @@ class OverlayView:
         share = (np.asarray(grey, np.float32) - self.black) / (self.white - self.black)
         return np.asarray(np.clip(np.nan_to_num(share), 0, 1) * 255, np.uint8)
 
-    def centre_px(self, seen: CameraTrack, k: int) -> NDArray[np.float64]:
-        """Return the centre in frame k from the track, else from the camera alone, px; NaN if neither is known."""
-        return np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
-
     def window(self, seen: CameraTrack, k: int) -> CropWindow:
-        """Return the crop around `centre_px` of frame k, as fine as the panels of the page."""
-        return CropWindow(centre_px=self.centre_px(seen, k), half_px=self.half_px, side=crop_side(self.half_px))
+        """Return the crop of frame k, around the centre of the track, else of the camera alone; NaN without both."""
+        centre_px = np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
+        return CropWindow(centre_px=centre_px, half_px=self.half_px, side=crop_side(self.half_px))
 
     def depth_mm(self, k: int) -> float:
         """Return the depth of the sphere in frame k, mm along the camera's axis."""
@@ -167,35 +173,16 @@ class OverlayView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Page:
-    """Draws frames of a track, all in one layout; made by `overlay.prepared`."""
+class Ball:
+    """A sphere of the page: its track, and its view by each camera. Its name is empty where it is the only one."""
 
     track: Trajectory
-    numbers: NDArray[np.int64]  # (N,), the experiment's numbers of the frames
     views: Sequence[OverlayView]
 
-    def draw(self, k: int, pictures: Mapping[str, Grey | None]) -> NDArray[np.uint8]:
-        """Return row k of the track, from the pictures (h, w) by camera, as (H, W, 3) with H and W even."""
-        height = FRAME_HEIGHT
-        sizes = [view.model.camera.image_size for view in self.views]
-        widths = [round(min(width / rows, WIDEST) * height) for width, rows in sizes]
-        width = max(widths) + 3 * (SIDE + GAP) + 2 * GAP
-        canvas = Canvas(width + width % 2, HEAD + len(self.views) * (height + GAP) + FOOT)
-        self._head(canvas, k)
-        for row, view in enumerate(self.views):
-            top = HEAD + row * (height + GAP)
-            self._camera(canvas, view, k, pictures[view.name], (GAP, top), (widths[row], height))
-        self._foot(canvas, k)
-        return canvas.finished()
-
-    def _head(self, canvas: Canvas, k: int) -> None:
-        segment, width = int(self.track.segment[k]), canvas.pixels.shape[1]
-        place = f"segment {segment}" if segment >= 0 else "outside any segment"
-        words = f"frame {int(self.numbers[k])}    t = {self.track.time[k]:.4f} s    {place}"
-        canvas.text((GAP, 24), words, 18)
-        canvas.text((width - GAP, 24), f"{self.track.title}, {self.track.method}", 15, FAINT, "rs")
-        state, colour = self.state(k)
-        canvas.text((GAP, 50), textwrap.shorten(state, (width - 2 * GAP) // LETTER, placeholder=" ..."), 15, colour)
+    @property
+    def name(self) -> str:
+        """Its name, cut to what fits."""
+        return self.track.sphere[:NAME]
 
     def state(self, k: int) -> tuple[str, Colour]:
         """Return the state of a frame as text, with a mark for colour-blind readers, and its colour."""
@@ -204,95 +191,161 @@ class Page:
             return f"\u2716 not valid{': ' + flags if flags else ''}", LOST
         return (f"\u25b2 doubt: {flags}", DOUBT) if flags else ("\u25cf valid", GOOD)
 
-    def _camera(
-        self,
-        canvas: Canvas,
-        view: OverlayView,
-        k: int,
-        picture: Grey | None,
-        corner: tuple[int, int],
-        size: tuple[int, int],
-    ) -> None:
-        seen = self.track.cameras[view.name]
-        frame = Panel(canvas, corner, size, (-0.5, -0.5), size[1] / view.model.camera.image_size[1])
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Page:
+    """Draws frames of the tracks of a recording, all in one layout; made by `overlay.prepared`.
+
+    Beside the frame of each camera, every sphere has a row of panels: crop, re-rendered, residual.
+    """
+
+    numbers: NDArray[np.int64]  # (N,), the experiment's numbers of the frames
+    balls: Sequence[Ball]  # with the same times and cameras
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, from top to bottom."""
+        return tuple(view.name for view in self.balls[0].views)
+
+    def draw(self, k: int, pictures: Mapping[str, Grey | None]) -> NDArray[np.uint8]:
+        """Return row k of the tracks, from the pictures (h, w) by camera, as (H, W, 3) with H and W even."""
+        height, foot = FRAME_HEIGHT, FOOT + STRIP * len(self.balls)
+        sizes = [view.model.camera.image_size for view in self.balls[0].views]
+        widths = [round(min(width / rows, WIDEST) * height) for width, rows in sizes]
+        columns = -(-len(self.balls) // MOST_ROWS)
+        rows = -(-len(self.balls) // columns)
+        side = min(SIDE, height // rows - TITLE - LINE - 4)
+        across = 3 * (side + GAP)
+        width = max(max(widths) + columns * across + 2 * GAP, LEAST_WIDTH)
+        canvas = Canvas(width + width % 2, HEAD + len(sizes) * (height + GAP) + foot + foot % 2)
+        self._head(canvas, k)
+        for camera, name in enumerate(self.cameras):
+            left, top = GAP, HEAD + camera * (height + GAP)
+            self._frame(canvas, camera, k, pictures[name], ((left, top), (widths[camera], height)))
+            left += widths[camera] + GAP
+            for place, ball in enumerate(self.balls):
+                corner = left + place // rows * across, top + place % rows * (height // rows)
+                others = [other.views[camera] for other in self.balls if other is not ball]
+                panels = Panels(ball=ball, view=ball.views[camera], others=others, side=side)
+                panels.draw(canvas, k, pictures[name], corner, height // rows)
+        self._foot(canvas, k, canvas.pixels.shape[0] - foot)
+        return canvas.finished()
+
+    def _head(self, canvas: Canvas, k: int) -> None:
+        width, track = canvas.pixels.shape[1], self.balls[0].track
+        segments = dict.fromkeys(int(ball.track.segment[k]) for ball in self.balls)
+        places = ", ".join(f"segment {one}" if one >= 0 else "outside any segment" for one in segments)
+        canvas.text((GAP, 24), f"frame {int(self.numbers[k])}    t = {track.time[k]:.4f} s    {places}", 18)
+        canvas.text((width - GAP, 24), f"{track.experiment}, {track.method}", 15, FAINT, "rs")
+        share = (width - 2 * GAP) // len(self.balls)
+        for place, ball in enumerate(self.balls):
+            state, colour = ball.state(k)
+            words = textwrap.shorten(f"{ball.name} {state}", share // LETTER, placeholder=" ...")
+            canvas.text((GAP + place * share, 50), words, 15, colour)
+
+    def _frame(self, canvas: Canvas, camera: int, k: int, picture: Grey | None, box: Box) -> None:
+        """Draw the frame of a camera with all spheres, the farthest first."""
+        views = [ball.views[camera] for ball in self.balls]
+        corner, size = box
+        frame = Panel(canvas, corner, size, (-0.5, -0.5), size[1] / views[0].model.camera.image_size[1])
         if picture is not None:
-            frame.show(view.shown(picture))
-        missing = "no picture" if picture is None else ""
-        window, left = view.window(seen, k), corner[0] + size[0] + GAP
-        panels = []
-        for column, title in enumerate(("crop", "re-rendered", "residual")):
-            at = (left + column * (SIDE + GAP), corner[1] + TITLE)
+            frame.show(views[0].shown(picture))
+        states = [ball.state(k)[1] for ball in self.balls]
+        for place in sorted(range(len(views)), key=lambda place: -np.nan_to_num(views[place].depth_mm(k))):
+            view = views[place]
+            if view.placed(k):
+                draw_outline(frame, view, k)
+                draw_axes(frame, view, k, letters=False)
+                (u, v), top = view.trail_px[k], outline_px(view.model.camera, view.model.path, k)[:, 1].min()
+                frame.text(np.array([u, top - ABOVE * (v - top)]), self.balls[place].name, 15, states[place])
+            frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], TRAIL, 1)
+        canvas.text((corner[0] + 8, corner[1] + 20), views[0].name, 16)
+        frame.say("no picture" if picture is None else "", 16)
+        for colour in (LOST, DOUBT):
+            if colour in states:
+                frame.border(colour, 3)
+                break
+
+    def _foot(self, canvas: Canvas, k: int, top: int) -> None:
+        width, frames = canvas.pixels.shape[1], sum(len(ball.track) for ball in self.balls)
+        left = GAP
+        entries = [("outline", OUTLINE), ("body axes x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
+        for words, colour in [*entries, (f"last {TRAIL_FRAMES} frames", TRAIL)]:
+            canvas.text((left, top + 16), words, 13, colour)
+            left += 8 * len(words) + 14
+        canvas.text((left, top + 16), "axes solid: towards the camera, dotted: away", 13, FAINT)
+        valid = sum(int(ball.track.valid.sum()) for ball in self.balls)
+        words = f"whole track: green valid, orange in doubt, grey not valid ({valid} of {frames} valid)"
+        canvas.text((width - GAP, top + 16), words, 13, FAINT, "rs")
+        names = max(len(ball.name) for ball in self.balls)
+        left = GAP + (LETTER * names + GAP if names else 0)
+        for row, ball in enumerate(self.balls):
+            at = top + FOOT - 10 + STRIP * row
+            canvas.text((GAP, at + 11), ball.name, 13, FAINT)
+            state_strip(canvas, ball.track, k, (left, at), (width - GAP - left, 12))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panels:
+    """The panels of one sphere beside a camera's frame, and what is known of it in words below them."""
+
+    ball: Ball
+    view: OverlayView
+    others: Sequence[OverlayView]  # of the same camera, spheres that may hide it or stand behind it
+    side: int  # px
+
+    def draw(self, canvas: Canvas, k: int, picture: Grey | None, corner: tuple[int, int], height: int) -> None:
+        """Draw row k of the track into a band of the canvas, `height` px high."""
+        view, side = self.view, self.side
+        seen = self.ball.track.cameras[view.name]
+        window, panels = view.window(seen, k), []
+        for column, title in enumerate((f"{self.ball.name} crop".strip(), "re-rendered", "residual")):
+            at = (corner[0] + column * (side + GAP), corner[1] + TITLE)
             canvas.text((at[0], at[1] - 7), title, 14, FAINT)
-            panels.append(crop_panel(canvas, at, SIDE, window))
+            panels.append(crop_panel(canvas, at, side, window))
         blank = "no position"
         if window.known:
-            rendered = draw_pictures(panels, view, k, picture, window)
-            blank = "" if rendered else view.why_unlit if view.light is None else "no orientation"
+            drawn = draw_pictures(panels, view, k, picture, window, self.others)
+            blank = "" if drawn else view.why_unlit if view.light is None else "no orientation"
+        missing = "no picture" if picture is None else ""
         no_crop = missing or ("" if window.known else blank)
         for panel, words in zip(panels, (no_crop, blank, blank or missing), strict=True):
-            panel.say(words, 15)
-        for panel, letters in ((frame, False), (panels[0], True)):
-            if view.placed(k) and np.isfinite(panel.first_px).all():
-                draw_outline(panel, view, k)
-                draw_axes(panel, view, k, letters)
+            panel.say(words, min(15, side // 8))
+        if view.placed(k) and window.known:
+            draw_outline(panels[0], view, k)
+            draw_axes(panels[0], view, k)
         if own_distance_px(view, seen, k) > OWN_PX:
             angle = np.linspace(0, 2 * np.pi, 73)
             around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, INK, 1, dotted=True)
-        frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], TRAIL, 1)
-        canvas.text((corner[0] + 8, corner[1] + 20), view.name, 16)
-        frame.say(missing, 16)
-        mark = self.state(k)[1]
-        if mark != GOOD:
-            frame.border(mark, 3)
-        self._words(canvas, view, k, (left, corner[1] + TITLE + SIDE + 24), size[1] - SIDE - TITLE)
-
-    def _words(self, canvas: Canvas, view: OverlayView, k: int, at: tuple[int, int], room: int) -> None:
-        seen = self.track.cameras[view.name]
-        lost = lost_cameras(self.track, k).get(view.name)
-        lines = [(f"{view.name}: {lost}", DOUBT) if lost else (f"{view.name}: measured", GOOD)]
-        numbers = [f"score {seen.score[k]:.3f}" if np.isfinite(seen.score[k]) else "no score"]
-        if np.isfinite(seen.radius_px[k]):
-            numbers.append(f"radius {seen.radius_px[k]:.1f} px")
-        lines.append((", ".join(numbers), INK))
-        sigma = np.sqrt(np.trace(self.track.orientation_cov[k]) / 3)
-        if np.isfinite(sigma):
-            lines.append((f"error of the orientation, stated: {np.rad2deg(sigma):.3f}\u00b0 an axis", INK))
-        off_px = own_distance_px(view, seen, k)
-        if off_px > OWN_PX:
-            lines.append((f"white circle: what it sees by itself, {off_px:.1f} px off", DOUBT))
-        if view.model.path.smoothed[k]:
-            lines.append(("outline and axes: of the smoother", DOUBT))
-        wrapped = [(part, colour) for text, colour in lines for part in textwrap.wrap(text, 66)]
+        top, room = corner[1] + TITLE + side, height - side - TITLE
+        letters = int(2 * (side + GAP) / WORDS_LETTER)
+        wrapped = [(part, colour) for text, colour in self._words(k, seen) for part in textwrap.wrap(text, letters)]
         for row, (text, colour) in enumerate(wrapped[: max(1, room // LINE)]):
-            canvas.text((at[0], at[1] + LINE * row), text, 14, colour)
-        scale_bar(canvas, (at[0] + 2 * (SIDE + GAP), at[1] - 12), SIDE, view.light)
+            canvas.text((corner[0], top + min(24, room - 6) + LINE * row), text, 14, colour)
+        if room >= 3 * LINE:
+            scale_bar(canvas, (corner[0] + 2 * (side + GAP), top + 12), side, view.light)
 
-    def _foot(self, canvas: Canvas, k: int) -> None:
-        height, width = canvas.pixels.shape[:2]
-        top = height - FOOT
-        legend(canvas, (GAP, top + 16), "axes solid: towards the camera, dotted: away")
-        state_strip(canvas, self.track, k, (GAP, height - 26), (width - 2 * GAP, 12), 5)
-        words = f"whole track: green valid, orange in doubt, grey not valid ({int(self.track.valid.sum())} of "
-        canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, FAINT, "rs")
+    def _words(self, k: int, seen: CameraTrack) -> Iterator[tuple[str, Colour]]:
+        name, track = self.view.name, self.ball.track
+        lost = lost_cameras(track, k).get(name)
+        yield (f"{name}: {lost}", DOUBT) if lost else (f"{name}: measured", GOOD)
+        numbers = f"score {seen.score[k]:.3f}" if np.isfinite(seen.score[k]) else "no score"
+        if np.isfinite(seen.radius_px[k]):
+            numbers += f", radius {seen.radius_px[k]:.1f} px"
+        yield numbers, INK
+        sigma = float(stated_error(track.orientation_cov[k : k + 1])[0])
+        if np.isfinite(sigma):
+            yield f"error of the orientation, stated: {np.rad2deg(sigma):.3f}\u00b0 an axis", INK
+        off_px = own_distance_px(self.view, seen, k)
+        if off_px > OWN_PX:
+            yield f"white circle: what it sees by itself, {off_px:.1f} px off", DOUBT
+        if self.view.model.path.smoothed[k]:
+            yield "outline and axes: of the smoother", DOUBT
 
 
-def legend(canvas: Canvas, at: tuple[int, int], more: str) -> None:
-    """Write what the colours of the lines mean, and `more`."""
-    left, row = at
-    entries = [("outline", OUTLINE), ("body axes x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
-    for words, colour in [*entries, (f"last {TRAIL_FRAMES} frames", TRAIL)]:
-        canvas.text((left, row), words, 13, colour)
-        left += 8 * len(words) + 14
-    canvas.text((left, row), more, 13, FAINT)
-
-
-def state_strip(
-    canvas: Canvas, track: Trajectory, k: int, corner: tuple[int, int], size: tuple[int, int], beyond: int = 2
-) -> None:
-    """Draw the states of all frames side by side, and a mark at frame k that stands `beyond` px above and below; a
-    pixel shows the worst of its frames.
-    """
+def state_strip(canvas: Canvas, track: Trajectory, k: int, corner: tuple[int, int], size: tuple[int, int]) -> None:
+    """Draw the states of all frames side by side, and a mark at frame k; a pixel shows the worst of its frames."""
     (left, top), (width, height) = corner, size
     state = np.where(track.valid, np.where(shown_flags(track) != 0, 1, 0), 2)
     edges = np.linspace(0, len(state), width + 1)
@@ -301,7 +354,7 @@ def state_strip(
     worst = [int(state[a:b].max()) for a, b in zip(first, last, strict=True)]
     canvas.pixels[top : top + height, left : left + width] = np.array([GOOD, DOUBT, LOST], np.uint8)[worst]
     at = round((k + 0.5) / len(track) * width)
-    canvas.pixels[top - beyond : top + height + beyond, left + max(0, at - 1) : left + at + 1] = 255
+    canvas.pixels[top - 2 : top + height + 2, left + max(0, at - 1) : left + at + 1] = 255
 
 
 def crop_side(half_px: float) -> int:
@@ -334,7 +387,7 @@ def draw_pictures(
     panels[1].show(view.shown(model))
     if grey is not None:
         for panel in panels[2:]:
-            panel.show(residual_colours((grey - model) / view.light.contrast))
+            panel.show(residual_colours((grey - model) / contrast(view.light)))
     return True
 
 
@@ -348,7 +401,7 @@ def rendered(
         there = np.isnan(whole)
         shown = None if filmed is None else np.where(there, filmed, np.float32(np.nan))
         if view.light is not None:
-            whole = np.where(there, view.light.picture(view.model.look(k, window), shown), whole)
+            whole = np.where(there, lit_picture(view.light, view.model.look(k, window), shown), whole)
     return whole
 
 
@@ -384,7 +437,7 @@ def own_distance_px(view: OverlayView, seen: CameraTrack, k: int) -> float:
     return float(np.linalg.norm(seen.centre_px[k] - view.trail_px[k]))
 
 
-def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: LightFit | None) -> None:
+def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: Light | None) -> None:
     """Draw the residual's scale, `width` px wide."""
     bar = canvas.pixels[at[1] : at[1] + 10, at[0] : at[0] + width]
     ramp = np.linspace(-RESIDUAL_REACH, RESIDUAL_REACH, width, dtype=np.float32)
@@ -392,5 +445,5 @@ def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: LightFit |
     reach = f"{100 * RESIDUAL_REACH:.0f} %"
     for share, words, anchor in ((0, f"-{reach}", "ls"), (0.5, "filmed less model", "ms"), (1, f"+{reach}", "rs")):
         canvas.text((at[0] + share * width, at[1] + 26), words, 13, FAINT, anchor)
-    words = "of white less black paint" + ("" if light is None else f" ({light.contrast:.0f} levels)")
+    words = "of white less black paint" + ("" if light is None else f" ({contrast(light):.0f} levels)")
     canvas.text((at[0] + 0.5 * width, at[1] + 44), words, 13, FAINT, "ms")

@@ -13,17 +13,9 @@ from jinja2 import Environment, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from sphereorient.files.provenance import versions
-from sphereorient.report.frame_warnings import (
-    STATUS_WORDS,
-    BadStretch,
-    bad_stretches,
-    choose_worst,
-    frame_numbers,
-    stated_error,
-    strip_of,
-)
+from sphereorient.report import frame_warnings as quality
 from sphereorient.report.gallery import Gallery, GalleryFrame
-from sphereorient.report.plots.style import SYMBOLS, decimals
+from sphereorient.report.plots.style import SYMBOLS, decimals, superscript
 from sphereorient.report.tables import Table
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
@@ -50,6 +42,7 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
     suffixes of their files; strips, HTML of `strip_html`.
     """
     css, js = strip_assets()
+    tables = {table.name: table for table in parts["tables"]}
     names = sorted({track.experiment for track in tracks.values() if track.experiment})
     what = "Rotation of a sphere" if all(track.held for track in tracks.values()) else "Motion of a sphere"
     if len({track.sphere for track in tracks.values()}) == len(tracks) > 1:
@@ -61,8 +54,8 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
-        "each": _each(parts["tables"]) if len(tracks) > 1 else None,
-        "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid["rows"]],
+        "each": _each(tables["tracks"]) if len(tracks) > 1 else None,
+        "grids": [grid for grid in (*_moments(summary), _flow(tables)) if grid["rows"]],
         "settings": _settings(summary),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
         "footer": f"sphereorient {versions()['sphereorient']}; {command}",
@@ -94,8 +87,8 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
 
     Without JavaScript it shows a table of the bad stretches and the pictures; with it, interactive strips.
     """
-    numbers = None if gallery is None else gallery.numbers
-    strip, found = strip_of(track, numbers), bad_stretches(track, numbers)
+    numbers = quality.frame_numbers(track) if gallery is None else gallery.numbers
+    strip, found = quality.strip_of(track, numbers), quality.bad_stretches(track, numbers)
     ranked = [] if gallery is None else sorted(gallery.frames, key=lambda frame: frame.rank)
     return _template("strip.html.j2").render(
         name=name,
@@ -111,19 +104,18 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     )
 
 
-def _worst(track: Trajectory, numbers: NDArray[np.int64] | None) -> dict[str, Any] | None:
-    numbers = frame_numbers(track) if numbers is None else numbers
-    found = choose_worst(track, 1).items()
+def _worst(track: Trajectory, numbers: NDArray[np.int64]) -> dict[str, Any] | None:
+    found = quality.choose_worst(track, 1).items()
     shown = [{"k": k, "number": int(numbers[k]), "time_s": float(track.time[k]), "words": why} for k, why in found]
     return shown[0] if shown else None
 
 
-def _reasons(stretch: BadStretch) -> str:
+def _reasons(stretch: quality.BadStretch) -> str:
     return "; ".join(f"{words} ({count})" for words, count in stretch.reasons) or "no reason given"
 
 
 def _caption(frame: GalleryFrame) -> str:
-    status = STATUS_WORDS[frame.status]
+    status = quality.STATUS_WORDS[frame.status]
     words = [words for words in frame.words if words != status]
     return "; ".join(words if words and words[0].startswith(status) else [status, *words])
 
@@ -136,7 +128,7 @@ def _some(names: Sequence[str], most: int = 4) -> str:
 def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str, str]]:
     frames = sum(len(track) for track in tracks.values())
     valid = sum(int(track.valid.sum()) for track in tracks.values())
-    sigma = np.concatenate([stated_error(track.orientation_cov) for track in tracks.values()])
+    sigma = np.concatenate([quality.stated_error(track.orientation_cov) for track in tracks.values()])
     sigma = sigma[np.isfinite(sigma)]
     median = f"{np.rad2deg(np.median(sigma)):.2g}\u00b0" if len(sigma) else "unknown"
     found = [
@@ -148,12 +140,12 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
     for quantity in (name for name in ("velocity", "omega_lab") if name in summary.table):
         part = summary.table[quantity]
         rms = float(np.sqrt(np.square(part.rms.value[:3]).sum()))
-        known = f"{rms:.3g} {_unit(part.units)}" if math.isfinite(rms) else "unknown"
+        known = f"{rms:.3g} {superscript(part.units)}" if math.isfinite(rms) else "unknown"
         found.append((known, f"rms of {SYMBOLS[quantity]}, all components"))
     return found
 
 
-def _each(tables: Sequence[Table]) -> Grid:
+def _each(tracks: Table) -> Grid:
     """Return the tracks side by side, in the order of their names on the command line."""
     shown = {
         "frames": "frames",
@@ -165,8 +157,7 @@ def _each(tables: Sequence[Table]) -> Grid:
         "rms_omega_rad_s": "rms of \u03c9, rad/s",
         "duration_s": "duration, s",
     }
-    (rows,) = (table.rows for table in tables if table.name == "tracks")
-    cells = [[(row["file"], ""), *((_plain(row[name]), "") for name in shown)] for row in rows]
+    cells = [[(row["file"], ""), *((_plain(row[name]), "") for name in shown)] for row in tracks.rows]
     about = "Numbers below are of all of them together."
     return {"title": "Tracks side by side", "about": about, "head": ["", *shown.values()], "rows": cells}
 
@@ -175,10 +166,6 @@ def _plain(value: object) -> str:
     if not isinstance(value, float):
         return f"{value:,}" if isinstance(value, int) else str(value)
     return f"{value:.3g}" if math.isfinite(value) else "\u2013"
-
-
-def _unit(units: str) -> str:
-    return units.replace("^2", "\u00b2")
 
 
 def _moments(summary: Summary) -> list[Grid]:
@@ -203,7 +190,7 @@ def _moments(summary: Summary) -> list[Grid]:
         rows: list[list[Cell]] = []
         for quantity, part in summary.table.items():
             found = getattr(part, name).scaled(factor)
-            unit = f", {_unit(part.units)}" if name in ("mean", "rms", "corrected_rms") else ""
+            unit = f", {superscript(part.units)}" if name in ("mean", "rms", "corrected_rms") else ""
             cells = [_cell(found.part(i), most) for i in range(len(columns))]
             rows.append([(f"{SYMBOLS[quantity]}{unit}", ""), *cells])
         grids.append({"title": title, "about": about, "head": ["", *columns], "rows": rows})
@@ -220,16 +207,10 @@ def _cell(of: Interval, most: int) -> Cell:
     return f"{value:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}"
 
 
-def _flow(summary: Summary) -> Grid:
-    flow = summary.surroundings.flow
-    rows = [(one.name, one.formula, one.value) for one in summary.comparisons]
+def _flow(tables: Mapping[str, Table]) -> Grid:
+    rows = tables["comparisons"].rows if "comparisons" in tables else ()
+    cells = [[(row["name"], ""), (row["formula"], ""), (f"{row['value']:.4g}", "")] for row in rows]
     about = "Components' rms, corrected if the errors are known."
-    if flow is not None:
-        about += f" With the viscosity {flow.viscosity_m2_s:.4g} m\u00b2/s and the dissipation "
-        about += f"{flow.dissipation_w_kg:.4g} W/kg of the experiment."
-        rows.insert(0, ("Kolmogorov's length, m", "eta = (nu^3 / epsilon)^(1/4)", flow.eta_m))
-        rows.insert(1, ("Kolmogorov's time, s", "tau_eta = (nu / epsilon)^(1/2)", flow.tau_eta_s))
-    cells = [[(name, ""), (formula, ""), (f"{value:.4g}", "")] for name, formula, value in rows]
     return {"title": "The sphere and its flow", "about": about, "head": ["", "", "value"], "rows": cells}
 
 

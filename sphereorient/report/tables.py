@@ -1,7 +1,7 @@
 """The numbers of a report as tables, one row for each value with its interval; CSV and Parquet."""
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,17 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError
+from sphereorient.files.whole_file import put_aside
 from sphereorient.report.columns import package, plain_cell
 from sphereorient.report.frame_warnings import stated_error
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.density import Density, stretched_exponential
+from sphereorient.statistics.isotropy import Isotropy
+from sphereorient.statistics.lags import Correlation
 from sphereorient.statistics.moments import COMPONENTS, STATISTICS
+from sphereorient.statistics.noise import MultiLag, WidthCurve
 from sphereorient.statistics.summary import Distributions
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 POOLED = ("x", "y", "z", "all")
 VECTOR = ("x", "y", "z", "vector")
+LIKELIHOODS = ("log_likelihood", "log_likelihood_gaussian", "better_than_gaussian")
 WIDTH_COLUMNS = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 Row = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -55,13 +60,13 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
             ("densities", f"PDFs in standard deviations, {level}", _densities(more)),
             ("fits", f"stretched exponential, {level}", _fits(more)),
             ("increments", f"omega_lab(t + lag) - omega_lab(t), {level}", _increments(more)),
-            ("autocorrelations", f"autocorrelations, {level}", _correlations(more)),
-            ("integral_times", f"to the first zero, {level}", _integral_times(more)),
+            ("autocorrelations", f"autocorrelations, {level}", _each(more.correlations, _correlation)),
+            ("integral_times", f"to the first zero, {level}", _each(more.correlations, _integral_time)),
             ("durations", "histogram of segment durations", _durations(more)),
             ("angles", f"PDFs of the Euler angles, {level}", _angles(more)),
-            ("isotropy", f"shares of the variance, {level}", _isotropy(more)),
-            ("kernel_widths", f"rms and flatness by kernel width, {level}", _widths(more)),
-            ("multi_lag", f"rms without noise by many lags, {level}", _multi_lag(more)),
+            ("isotropy", f"shares of the variance, {level}", _each(more.isotropies, _isotropy)),
+            ("kernel_widths", f"rms and flatness by kernel width, {level}", _each(more.widths, _width)),
+            ("multi_lag", f"rms without noise by many lags, {level}", _each(more.multi_lag, _multi_lag)),
             ("lift", f"a against omega x v, {level}", _lift(more)),
         ]
     tables = [Table(name=name, about=about, rows=list(rows)) for name, about, rows in found]
@@ -71,10 +76,7 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
 def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
     """Write each table as NAME.csv and, if pyarrow is installed, as NAME.parquet; return the suffixes written."""
     for table in tables:
-        with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, table.columns, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({name: plain_cell(value) for name, value in row.items()} for row in table.rows)
+        write_csv(table.rows, folder / f"{table.name}.csv")
     try:
         arrow = package("pyarrow", "table")
     except OutputError:  # the page says so; CSV has the same numbers
@@ -85,6 +87,14 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
         columns = {name: [row[name] for row in table.rows] for name in table.columns}
         arrow_parquet.write_table(arrow.table(columns), folder / f"{table.name}.parquet", compression="zstd")
     return ["csv", "parquet"]
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """Write rows of equal keys as CSV, whole or not at all; OutputError."""
+    with put_aside(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: plain_cell(value) for name, value in row.items()} for row in rows)
 
 
 def _rows(**columns: Any) -> Iterator[Row]:
@@ -147,13 +157,11 @@ def _moments(summary: Summary) -> Iterator[Row]:
 
 
 def _comparisons(summary: Summary) -> Iterator[Row]:
-    flow = summary.surroundings.flow
-    if flow is not None:
+    if (flow := summary.surroundings.flow) is not None:
         inputs = f"nu = {flow.viscosity_m2_s:.4g} m^2/s, epsilon = {flow.dissipation_w_kg:.4g} W/kg"
         yield {"name": f"eta, m, of {inputs}", "formula": "(nu^3 / epsilon)^(1/4)", "value": flow.eta_m}
         yield {"name": f"tau_eta, s, of {inputs}", "formula": "(nu / epsilon)^(1/2)", "value": flow.tau_eta_s}
-    for one in summary.comparisons:
-        yield {"name": one.name, "formula": one.formula, "value": one.value}
+    yield from ({"name": one.name, "formula": one.formula, "value": one.value} for one in summary.comparisons)
 
 
 def _distances(distances: Sequence[CameraDistance]) -> Iterator[Row]:
@@ -192,11 +200,9 @@ def _by_component(more: Distributions) -> dict[tuple[str, str], Density]:
 
 def _fits(more: Distributions) -> Iterator[Row]:
     for (quantity, component), part in _by_component(more).items():
-        fit = part.fit
-        likely = {"log_likelihood": fit.log_likelihood, "log_likelihood_gaussian": fit.log_likelihood_gaussian}
-        better = {"better_than_gaussian": fit.better_than_gaussian}
-        found = {"a": fit.a, "flatness_of_fit": fit.flatness}
-        yield from _rows(quantity=quantity, component=component, **found, **likely, **better)
+        found = {"a": part.fit.a, "flatness_of_fit": part.fit.flatness}
+        found |= {name: getattr(part.fit, name) for name in LIKELIHOODS}
+        yield from _rows(quantity=quantity, component=component, **found)
 
 
 def _increments(more: Distributions) -> Iterator[Row]:
@@ -205,16 +211,34 @@ def _increments(more: Distributions) -> Iterator[Row]:
     return _rows(**by_lag, component=POOLED, rms=of.rms, flatness=of.flatness)
 
 
-def _correlations(more: Distributions) -> Iterator[Row]:
-    for quantity, of in more.correlations.items():
-        by_lag = {"lag_s": of.lag_s[:, None], "pairs": of.pairs[:, None]}
-        yield from _rows(quantity=quantity, **by_lag, component=VECTOR, correlation=of.value)
+def _each(records: Mapping[str, Any], columns: Callable[[Any], Row]) -> Iterator[Row]:
+    """Yield the rows of a record for each quantity, by a function that returns its columns."""
+    for quantity, of in records.items():
+        yield from _rows(quantity=quantity, **columns(of))
 
 
-def _integral_times(more: Distributions) -> Iterator[Row]:
-    for quantity, of in more.correlations.items():
-        found = {"integral_time_s": of.integral_time_s, "reached_zero": of.reached_zero}
-        yield from _rows(quantity=quantity, component=VECTOR, **found)
+def _correlation(of: Correlation) -> Row:
+    by_lag = {"lag_s": of.lag_s[:, None], "pairs": of.pairs[:, None]}
+    return {**by_lag, "component": VECTOR, "correlation": of.value}
+
+
+def _integral_time(of: Correlation) -> Row:
+    return {"component": VECTOR, "integral_time_s": of.integral_time_s, "reached_zero": of.reached_zero}
+
+
+def _isotropy(of: Isotropy) -> Row:
+    shares = {"component": list("xyz"), "variance_share": of.variance_share}
+    return {**shares, "pair": ["xy", "xz", "yz"], "cross_correlation": of.cross_correlation, "p_value": of.p_value}
+
+
+def _width(of: WidthCurve) -> Row:
+    found = {name: getattr(of, name) for name in WIDTH_COLUMNS}
+    return {"width_s": of.width_s[:, None], "component": list("xyz"), **found}
+
+
+def _multi_lag(of: MultiLag) -> Row:
+    found = {name: getattr(of, name) for name in ("rms", "variance", "noise_variance")}
+    return {"component": list("xyz"), **found}
 
 
 def _durations(more: Distributions) -> Iterator[Row]:
@@ -227,25 +251,6 @@ def _angles(more: Distributions) -> Iterator[Row]:
         edges = np.rad2deg(of.edges_rad)
         densities = {"pdf_per_rad": of.pdf, "uniform_pdf_per_rad": of.uniform}
         yield from _rows(angle=of.name, from_deg=edges[:-1], to_deg=edges[1:], **densities)
-
-
-def _isotropy(more: Distributions) -> Iterator[Row]:
-    for quantity, of in more.isotropies.items():
-        shares = {"component": list("xyz"), "variance_share": of.variance_share}
-        pairs = {"pair": ["xy", "xz", "yz"], "cross_correlation": of.cross_correlation}
-        yield from _rows(quantity=quantity, **shares, **pairs, p_value=of.p_value)
-
-
-def _widths(more: Distributions) -> Iterator[Row]:
-    for quantity, of in more.widths.items():
-        found = {name: getattr(of, name) for name in WIDTH_COLUMNS}
-        yield from _rows(quantity=quantity, width_s=of.width_s[:, None], component=list("xyz"), **found)
-
-
-def _multi_lag(more: Distributions) -> Iterator[Row]:
-    for quantity, of in more.multi_lag.items():
-        found = {"rms": of.rms, "variance": of.variance, "noise_variance": of.noise_variance}
-        yield from _rows(quantity=quantity, component=list("xyz"), **found)
 
 
 def _lift(more: Distributions) -> Iterator[Row]:

@@ -22,14 +22,14 @@ from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.compare import MapComparison
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.movies import Grey
 from sphereorient.pose.worn import worn_share, worn_texels
 from sphereorient.report.overlay import pictures_by_row, prepared
-from sphereorient.report.overlay_model import crop
-from sphereorient.report.overlay_page import OverlayView, crop_side
-from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note
+from sphereorient.report.overlay_model import contrast, crop, lit_picture
+from sphereorient.report.overlay_page import crop_side
+from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note, spread
 from sphereorient.trajectory import Trajectory
 
+EXTENT = -180, 180, -90, 90  # of the axes of a map, degrees
 UNSEEN_GREY = 128  # of texels that no picture shows, in the file
 MOST = 255  # counts beyond are written as this
 EXAMPLES = 6  # frames that are shown
@@ -37,6 +37,14 @@ UNSEEN = "#C9B48A"  # sand colour: differs from any paint
 REACH = 0.5  # of the contrast of white and black paint: the ends of the residual's scale
 LEAST_ARROW_DEG = 4.0  # length on the page of the largest arrow, in degrees of the map
 ARROW = "#D0021B"
+LEARNT = {  # tensors of a learnt map in its file, without a unit
+    "texture": "paint, 0 black .. 1 white; NaN where never seen",
+    "seen": "pictures that show the texel",
+    "sigma": "standard deviation of the paint by noise alone; inf: never seen",
+    "paint": "correlation of the paint in pictures held out of the map for it",
+    "jumps": "frames from which the ball turns unlike before and after",
+    "fitted": "frames that the map was fitted to; the others follow them",
+}
 CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scale of the change
 
 
@@ -60,12 +68,8 @@ def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
 
 
 def _write_map(learnt: LearntMap, group: h5py.Group) -> None:
-    _put(group, "texture", learnt.texture.numpy(), "1", "paint, 0 black .. 1 white; NaN where never seen")
-    _put(group, "seen", learnt.seen.numpy(), "1", "pictures that show the texel")
-    _put(group, "sigma", learnt.sigma.numpy(), "1", "standard deviation of the paint by noise alone; inf: never seen")
-    _put(group, "paint", learnt.paint.numpy(), "1", "correlation of the paint in pictures held out of the map for it")
-    _put(group, "jumps", learnt.jumps.numpy(), "1", "frames from which the ball turns unlike before and after")
-    _put(group, "fitted", learnt.fitted.numpy(), "1", "frames that the map was fitted to; the others follow them")
+    for name, description in LEARNT.items():
+        _put(group, name, getattr(learnt, name).numpy(), "1", description)
     if learnt.rounds:
         names = [field.name for field in fields(learnt.rounds[0])]
         table = np.array([[getattr(one, name) for name in names] for one in learnt.rounds], np.float64)
@@ -105,22 +109,22 @@ def compare_pictures(learnt: LearntMap, track: Trajectory, experiment: Experimen
         page, streams = prepared(track, experiment.with_sphere(texture_path=texture), None, opened)
         rows = np.flatnonzero(learnt.paint.isfinite().any(1).numpy() & track.valid)
         rows = rows if len(rows) else np.flatnonzero(track.valid)
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(EXAMPLES, len(rows))).round().astype(int))]
-        for k, pictures in pictures_by_row(streams, rows):
-            for view in page.views:
+        for k, pictures in pictures_by_row(streams, rows[spread(len(rows), EXAMPLES)]):
+            for view in page.balls[0].views:
                 picture = pictures[view.name]
-                if picture is not None and view.light is not None:
-                    title = f"{view.name}, frame {int(page.numbers[k])}"
-                    compared.append(_compared(view, k, picture, title, float(learnt.paint[k, column[view.name]])))
+                if picture is None or view.light is None:
+                    continue
+                window = view.model.window(k, view.half_px, crop_side(view.half_px))
+                filmed = crop(picture, window)
+                example = MapExample(
+                    title=f"{view.name}, frame {int(page.numbers[k])}",
+                    filmed=filmed,
+                    model=lit_picture(view.light, view.model.look(k, window), filmed),
+                    contrast=contrast(view.light),
+                    correlation=float(learnt.paint[k, column[view.name]]),
+                )
+                compared.append(example)
     return compared
-
-
-def _compared(view: OverlayView, k: int, picture: Grey, title: str, correlation: float) -> MapExample:
-    assert view.light is not None
-    window = view.model.window(k, view.half_px, crop_side(view.half_px))
-    seen, filmed = view.model.look(k, window), crop(picture, window)
-    model, contrast = view.light.picture(seen, filmed), view.light.contrast
-    return MapExample(title=title, filmed=filmed, model=model, contrast=contrast, correlation=correlation)
 
 
 @in_style
@@ -145,9 +149,8 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
     axes.semilogy(np.arange(1, len(moved) + 1), moved, color="black", marker="o")
     axes.set(xlabel="round", ylabel="degrees", title="attitudes' moves, rms")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    chosen = [compared[k] for k in np.linspace(0, len(compared) - 1, min(EXAMPLES, len(compared))).round().astype(int)]
-    for column, example in enumerate(chosen):
-        _draw_example([figure.add_subplot(grid[row, column]) for row in (1, 2, 3)], example, column == 0)
+    for column, chosen in enumerate(spread(len(compared), EXAMPLES).tolist()):
+        _draw_example([figure.add_subplot(grid[row, column]) for row in (1, 2, 3)], compared[chosen], column == 0)
     note(
         figure,
         "Map: longitude to the right, latitude upwards, as seen from outside; sand: no picture shows the place. "
@@ -173,21 +176,18 @@ def _draw_example(rows: Sequence[Axes], example: MapExample, first: bool) -> Non
     rows[2].set_xlabel(f"paint: {example.correlation:.3f}", fontsize=7)
 
 
-def equirectangular(axes: Axes) -> None:
-    """Set up the axes of a texture map, longitude to the right and latitude upwards, degrees."""
-    axes.set(xlim=(-180, 180), ylim=(-90, 90), xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])
-    axes.set(xlabel="longitude (degrees)", aspect="equal")
-    axes.grid(visible=False)
-
-
 def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
-    """Draw a texture map (H, 2 H), NaN as sand; grey from 0 to 1 unless `style` (of `imshow`) differs."""
-    equirectangular(axes)
-    axes.set_facecolor(UNSEEN)
-    axes.set_title(title)
+    """Draw a texture map (H, 2 H), longitude to the right, latitude upwards, degrees, NaN as sand; grey from 0 to 1
+    unless `style` (of `imshow`) differs.
+    """
     grey = {} if "norm" in style else {"vmin": 0, "vmax": 1}
-    shown = {"cmap": "gray", "extent": (-180, 180, -90, 90)} | grey | style
-    return axes.imshow(np.ma.masked_invalid(values.numpy()), **shown)
+    shown = {"cmap": "gray", "extent": EXTENT} | grey | style
+    drawn = axes.imshow(np.ma.masked_invalid(values.numpy()), **shown)
+    axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:], xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])
+    axes.set(xlabel="longitude (degrees)", aspect="equal", title=title)
+    axes.grid(visible=False)
+    axes.set_facecolor(UNSEEN)
+    return drawn
 
 
 @in_style

@@ -15,9 +15,21 @@ from scipy.spatial.transform import Rotation
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, OutputError, TrackError
 from sphereorient.files.whole_file import writing
+from sphereorient.pose.model import light_basis
 from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, flag_words, frame_warnings
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
-from sphereorient.report.overlay_model import LightFit, Model, SeenDisk, axes_px, crop, fit_light, outline_px, path_of
+from sphereorient.report.overlay_model import (
+    LIMB,
+    Model,
+    SeenDisk,
+    axes_px,
+    contrast,
+    crop,
+    fit_light,
+    lit_picture,
+    outline_px,
+    path_of,
+)
 from sphereorient.report.overlay_page import (
     AXES,
     BLANK,
@@ -87,7 +99,7 @@ def test_frames_without_a_measurement_are_the_smoothers():
 
 def relative_residual(ready, name: str, R_lab_body=None) -> float:
     page, pictures = ready
-    [view] = [view for view in page.views if view.name == name]
+    [view] = [view for view in page.balls[0].views if view.name == name]
     path = view.model.path
     if R_lab_body is not None:
         turned = path.R_lab_body.copy()
@@ -96,8 +108,8 @@ def relative_residual(ready, name: str, R_lab_body=None) -> float:
     model = Model(camera=view.model.camera, texture=view.model.texture, path=path)
     window = model.window(K, view.half_px, 100)
     filmed = crop(pictures[name], window)
-    left = filmed - view.light.picture(model.look(K, window), filmed)
-    return float(np.sqrt(np.nanmean(left**2))) / view.light.contrast
+    left = filmed - lit_picture(view.light, model.look(K, window), filmed)
+    return float(np.sqrt(np.nanmean(left**2))) / contrast(view.light)
 
 
 @pytest.mark.parametrize("name", ["cam1", "cam2"])
@@ -112,31 +124,41 @@ def test_the_residual_is_small_for_the_true_orientation_only(ready, name):
     assert relative_residual(ready, name, track.orientation[K].T) > 3 * at_truth  # the other reading of R_lab_body
 
 
-def planted(rng, gain, offset):
+def planted(rng, difference, black):
+    """A ball of random paint, black and white, under planted light maps (K,), and its picture."""
     at = np.linspace(-1, 1, 40)
-    x, y = np.meshgrid(at, at)
-    with np.errstate(invalid="ignore"):
-        depth = np.sqrt(1 - x**2 - y**2)
-    basis = np.stack([np.where(np.isnan(depth), np.nan, 1.0), x, y, depth], axis=-1)
-    seen = SeenDisk(paint=rng.random(x.shape).round().astype(np.float32), basis=basis.astype(np.float32))
-    return seen, (seen.paint * (basis @ gain) + basis @ offset).astype(np.float32)
+    across = np.stack(np.meshgrid(at, at), axis=-1)
+    across[np.hypot(*np.moveaxis(across, -1, 0)) > 1] = np.nan
+    basis = light_basis(torch.from_numpy(across).movedim(-1, 0).flatten(1)).numpy()
+    paint = np.where(np.isnan(across[..., 0]), np.nan, rng.random((40, 40)).round())
+    grey = paint * (difference @ basis).reshape(40, 40) + (black @ basis).reshape(40, 40)
+    return SeenDisk(paint=paint.astype(np.float32), across=across.astype(np.float32)), grey.astype(np.float32)
+
+
+def sloping() -> tuple[np.ndarray, np.ndarray]:
+    """Light maps that grow to the right and towards the middle."""
+    difference, black = np.zeros((2, light_basis(torch.zeros(2, 1)).shape[0]))
+    difference[:3], difference[15], black[:3], black[15] = (120.0, 8.0, -5.0), 40.0, (12.0, 0.0, 3.0), 4.0
+    return difference, black
 
 
 def test_planted_light_is_found_again():
     rng = np.random.default_rng(3)
-    gain, offset = np.array([120.0, 8.0, -5.0, 40.0]), np.array([12.0, 0.0, 3.0, 4.0])
-    found = fit_light([planted(rng, gain, offset) for _ in range(4)])
-    np.testing.assert_allclose(found.gain, gain, atol=0.2)
-    np.testing.assert_allclose(found.offset, offset, atol=0.2)
-    assert found.contrast == pytest.approx(160, abs=0.3)
+    pairs = [planted(rng, *sloping()) for _ in range(4)]
+    found = fit_light(pairs)
+    for seen, grey in pairs:
+        inside = np.hypot(*np.moveaxis(seen.across, -1, 0)) < LIMB
+        np.testing.assert_allclose(lit_picture(found, seen)[inside], grey[inside], atol=0.5)
+    assert contrast(found) == pytest.approx(160, abs=0.5)
 
 
 def test_brightness_follows_the_frame_within_a_factor_of_two():
-    gain = np.array([100.0, 0, 0, 0])
-    seen, grey = planted(np.random.default_rng(4), gain, np.zeros(4))
-    light = LightFit(gain=gain, offset=np.zeros(4))
-    np.testing.assert_allclose(light.picture(seen, 0.7 * grey), 0.7 * grey, rtol=1e-5)
-    np.testing.assert_allclose(light.picture(seen, 9.0 * grey), 2.0 * grey, rtol=1e-5)
+    rng = np.random.default_rng(4)
+    seen, grey = planted(rng, *sloping())
+    light = fit_light([planted(rng, *sloping()) for _ in range(4)])
+    np.testing.assert_allclose(lit_picture(light, seen, 0.7 * grey), 0.7 * lit_picture(light, seen, grey), rtol=1e-5)
+    bright = lit_picture(light, seen, 9.0 * grey)
+    np.testing.assert_allclose(bright, 2.0 * lit_picture(light, seen), rtol=1e-5)
 
 
 def test_without_pixels_there_is_no_light():
@@ -201,42 +223,49 @@ def test_one_camera_is_no_news_where_there_is_no_other():
     assert flag_words(track, 0) == []
 
 
+def with_track(page, track, **parts):
+    """The page of one ball with another track, and with views `parts`."""
+    return replace(page, balls=[replace(page.balls[0], track=track, **parts)])
+
+
 def test_frames_of_doubt_are_marked(ready):
     page, pictures = ready
-    plain = page.draw(K, pictures)
+    plain, (ball,) = page.draw(K, pictures), page.balls
     assert plain.shape[0] % 2 == plain.shape[1] % 2 == 0
-    doubtful = replace(page, track=changed(page.track, K, flags=Flag.DOUBTFUL_FIT))
-    lost = replace(page, track=changed(page.track, K, valid=False))
+    doubtful = with_track(page, changed(ball.track, K, flags=Flag.DOUBTFUL_FIT))
+    lost = with_track(page, changed(ball.track, K, valid=False))
     corner = (slice(62, 65), slice(10, 13))  # of the first camera's frame
     assert (doubtful.draw(K, pictures)[corner] == DOUBT).all()
     assert (lost.draw(K, pictures)[corner] == LOST).all()
     assert not (plain[corner] == DOUBT).all()
-    assert "doubt: picture explained less well" in doubtful.state(K)[0]
-    assert "not valid" in lost.state(K)[0]
+    assert "doubt: picture explained less well" in doubtful.balls[0].state(K)[0]
+    assert "not valid" in lost.balls[0].state(K)[0]
 
 
 def test_a_camera_that_by_itself_sees_the_ball_elsewhere_is_shown(ready):
     page, pictures = ready
-    centre = page.track.cameras["cam1"].centre_px[K]
-    off = camera_changed(page.track, "cam1", K, centre_px=centre + np.array([6.0, 8.0]), reason=Reason.CONTRADICTS)
-    [view, _] = page.views
-    assert own_distance_px(view, page.track.cameras["cam1"], K) < 1e-3
+    whole = page.balls[0].track
+    centre = whole.cameras["cam1"].centre_px[K]
+    off = camera_changed(whole, "cam1", K, centre_px=centre + np.array([6.0, 8.0]), reason=Reason.CONTRADICTS)
+    [view, _] = page.balls[0].views
+    assert own_distance_px(view, whole.cameras["cam1"], K) < 1e-3
     assert own_distance_px(view, off.cameras["cam1"], K) == pytest.approx(10, abs=1e-3)
     crop_of = (slice(86, 396), slice(460, 770))
-    before, after = (replace(page, track=track).draw(K, pictures)[crop_of] for track in (page.track, off))
+    before, after = (with_track(page, track).draw(K, pictures)[crop_of] for track in (whole, off))
     assert (before != after).any(-1).sum() > 200
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_frame_without_pictures_or_measurement_is_drawn(ready):
     page, _ = ready
+    (ball,) = page.balls
     nothing = {"position": np.nan, "orientation": np.nan, "position_smooth": np.nan, "orientation_smooth": np.nan}
-    track = changed(page.track, K, valid=False, **nothing)
+    track = changed(ball.track, K, valid=False, **nothing)
     for name in track.cameras:
         track = camera_changed(track, name, K, reason=Reason.MISSING, centre_px=np.nan, radius_px=np.nan)
-    view = [replace(v, model=replace(v.model, path=path_of(track, 9.0))) for v in page.views]
+    view = [replace(v, model=replace(v.model, path=path_of(track, 9.0))) for v in ball.views]
     trails = [replace(v, trail_px=np.where(np.arange(40)[:, None] == K, np.nan, v.trail_px)) for v in view]
-    drawn = replace(page, track=track, views=trails).draw(K, {"cam1": None, "cam2": None})
+    drawn = with_track(page, track, views=trails).draw(K, {"cam1": None, "cam2": None})
     assert drawn.std() > 5
 
 
@@ -344,10 +373,10 @@ def test_without_a_map_outline_and_axes_are_shown(tmp_path):
     with ExitStack() as opened:
         page, streams = prepared(true_track(("cam1",)), excerpt().with_sphere(texture_path=None), None, opened)
         _, pictures = next(pictures_by_row(streams, np.array([K])))
-    assert page.views[0].light is None
+    assert page.balls[0].views[0].light is None
     drawn = page.draw(K, pictures)
     assert (np.abs(drawn.astype(int) - OUTLINE) < 40).all(-1).sum() > 300
-    assert page.views[0].why_unlit == "no map of the paint"
+    assert page.balls[0].views[0].why_unlit == "no map of the paint"
 
 
 @pytest.mark.slow

@@ -14,10 +14,9 @@ from overlay_examples import RADIUS_MM, command, excerpt, true_track
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import Experiment, write_experiment
 from sphereorient.report.build import match_experiments, surroundings_of
-from sphereorient.report.overlay import page_of, pictures_by_row, prepared
+from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import outline_px
 from sphereorient.report.overlay_page import OUTLINE, rendered
-from sphereorient.report.overlay_scene import ScenePage
 from sphereorient.trajectory import Tracks, Trajectory
 
 K = 20  # a frame
@@ -50,9 +49,7 @@ def tracks() -> Tracks:
 @pytest.fixture(scope="module")
 def scene(tracks):
     with ExitStack() as opened:
-        experiment = several(a=18.0, b=18.0)
-        first, streams = prepared(tracks["a"], experiment, None, opened)
-        page = ScenePage(pages=[first, page_of(tracks["b"], experiment, first.numbers, streams)])
+        page, streams = prepared(tracks, several(a=18.0, b=18.0), None, opened)
         _, pictures = next(pictures_by_row(streams, np.array([K])))
         yield page, pictures
 
@@ -62,7 +59,7 @@ def test_every_ball_is_outlined_in_the_frame_of_a_camera(scene):
     drawn = page.draw(K, pictures)
     assert [side % 2 for side in drawn.shape[:2]] == [0, 0]
     scale = 440 / excerpt().cameras["cam1"].image_size[1]
-    for one in page.pages:
+    for one in page.balls:
         view = one.views[0]
         around = outline_px(view.model.camera, view.model.path, K)
         at = np.round((around + 0.5) * scale - 0.5 + [10, 62]).astype(int)  # the frame's corner on the page
@@ -73,9 +70,9 @@ def test_every_ball_is_outlined_in_the_frame_of_a_camera(scene):
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_nearer_ball_hides_a_farther_one_in_whatever_order_they_are_given(scene, order):
     page, _ = scene
-    near, far = (one.views[0] for one in page.pages)
+    near, far = (one.views[0] for one in page.balls)
     assert near.depth_mm(K) < far.depth_mm(K)
-    window = far.window(page.pages[1].track.cameras["cam1"], K)
+    window = far.window(page.balls[1].track.cameras["cam1"], K)
     both = rendered([(near, far)[k] for k in order], K, None, window)
     front, back = rendered([near], K, None, window), rendered([far], K, None, window)
     inside = np.isfinite(front)

@@ -30,9 +30,7 @@ BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "
 def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS)) -> Figure:
     """Draw the PDFs of the components of some quantities, in standard deviations, with the fit and the Gaussian.
 
-    Raises:
-        TrackError: a single segment has no densities.
-
+    Raise TrackError if there is a single segment, which has no densities.
     Source: the paper, section IV; Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245.
     """
     if summary.distributions is None:

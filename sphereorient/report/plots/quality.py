@@ -135,7 +135,7 @@ def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
 
 def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     rms, flatness, share = panels
-    symbol, unit = look.SYMBOLS[curve.quantity], in_length(UNITS[curve.quantity], curve.length_unit).replace("^2", "²")
+    symbol, unit = look.SYMBOLS[curve.quantity], look.superscript(in_length(UNITS[curve.quantity], curve.length_unit))
     width_ms = 1e3 * curve.width_s
     nudge = 0.04 * float(np.min(np.diff(width_ms))) if len(width_ms) > 1 else 0.0
     open_ = {"markerfacecolor": "white", "linestyle": "none"}

@@ -5,7 +5,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import matplotlib.style
 import numpy as np
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
-TEXT_PT = 8.0  # of all text
+TEXT_PT = 8.0  # of all text, as in report.mplstyle
 # Okabe and Ito's colours: distinct for colour-blind readers, and in grey print.
 AXIS_COLOURS = COLOURS["x"], COLOURS["y"], COLOURS["z"]
 BLACK = "#000000"
@@ -33,24 +33,6 @@ GREY = "#666666"
 SHADE = "#BBBBBB"  # of what does not count
 BAND = 0.2  # opacity
 LETTERS_PER_INCH = 15  # of a note; narrow enough for wide letters
-SETTINGS: Final[dict[str, Any]] = {
-    "font.family": ["sans-serif"],
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same letters everywhere
-    **dict.fromkeys(("font.size", "axes.labelsize", "xtick.labelsize", "ytick.labelsize"), TEXT_PT),
-    **dict.fromkeys(("legend.fontsize", "legend.title_fontsize"), TEXT_PT),
-    "axes.linewidth": 0.6,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "grid.linewidth": 0.5,
-    "grid.alpha": 0.4,
-    "hatch.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.handlelength": 2.6,  # long enough to distinguish the dashes
-    "lines.linewidth": 1.1,
-    "lines.markersize": 3.2,
-    "pdf.fonttype": 42,  # embeds whole fonts: text can be searched and edited
-}
 SYMBOLS = {
     "velocity": "v",
     "acceleration": "a",
@@ -93,7 +75,7 @@ COMPONENTS = (X, Y, Z)
 
 
 # Decorates functions that draw: in the style of the reports, independent of the user's matplotlibrc.
-in_style = matplotlib.style.context(["default", SETTINGS])
+in_style = matplotlib.style.context(["default", Path(__file__).with_name("report.mplstyle")])
 
 
 def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.0) -> Figure:
@@ -118,10 +100,7 @@ def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) 
 def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ...]:
     """Write a figure, the same bytes for the same figure, and return the files.
 
-    Without a suffix `path` gets PNG and PDF; its folder must exist.
-
-    Raises:
-        OutputError: a file cannot be written.
+    Without a suffix `path` gets PNG and PDF; its folder must exist. Raise OutputError if a file cannot be written.
     """
     undated: dict[str, dict[str, Any]] = {".png": {"Software": None}, ".pdf": {"CreationDate": None}}
     known = path.suffix[1:].lower() in figure.canvas.get_supported_filetypes()
@@ -207,6 +186,16 @@ def interval_text(of: Interval, unit: str = "", factor: float = 1.0) -> str:
         return f"{value:.3g}{behind}"
     places = decimals(high - low)
     return f"{value:.{places}f}{behind} ({low:.{places}f} to {high:.{places}f})"
+
+
+def spread(count: int, most: int) -> NDArray[np.int64]:
+    """Return indices of at most `most` of `count` things, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.int64))
+
+
+def superscript(units: str) -> str:
+    """Return units with a square as people write it."""
+    return units.replace("^2", "\u00b2")
 
 
 def decimals(width: float) -> int:

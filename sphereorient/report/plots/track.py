@@ -223,7 +223,7 @@ def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
     if not len(known):
         return
-    chosen = known[np.unique(np.linspace(0, len(known) - 1, TRIPODS).round().astype(int))]
+    chosen = known[look.spread(len(known), TRIPODS)]
     start = track.position_smooth[chosen]
     for i, style in enumerate(look.COMPONENTS):
         tip = start + size * track.orientation_smooth[chosen, :, i]

@@ -39,10 +39,8 @@ class Gores:
     diameter_mm: float
 
     def __post_init__(self) -> None:
-        for name, value, (low, high), unit in (
-            ("gores", self.count, GORES, ""),
-            ("diameter", self.diameter_mm, DIAMETERS_MM, " mm"),
-        ):
+        checked = ("gores", self.count, GORES, ""), ("diameter", self.diameter_mm, DIAMETERS_MM, " mm")
+        for name, value, (low, high), unit in checked:
             if not low <= value <= high:
                 do = "choose strips that can be printed and cut"
                 raise PaintError(refusal(name, expected=f"{low:g} .. {high:g}{unit}", got=f"{value:g}{unit}", do=do))
@@ -82,9 +80,8 @@ def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Te
     latitude = (y / radius)[:, None]
     level = latitude.cos()
     longitude = middle_rad + x / radius / level.clamp_min(1e-3)
-    direction = torch.stack(
-        [level * longitude.cos(), level * longitude.sin(), latitude.sin().expand_as(longitude)], dim=-1
-    )
+    up = latitude.sin().expand_as(longitude)
+    direction = torch.stack([level * longitude.cos(), level * longitude.sin(), up], dim=-1)
     return radius * middle_rad + x, y, sample_texture(texture.double(), direction)
 
 
@@ -133,31 +130,10 @@ def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
 
 
 def instructions(gores: Gores) -> str:
-    """Return the text page for the strips."""
+    """Return the text page for the strips, from the template gores.txt."""
     (width, height), sheet = gores.size_mm, gores.sheet_mm
     slope = math.pi / gores.count * math.sin(math.pi / 4)  # of a strip's edge against its middle, at latitude 45
-    return f"""\
-{gores.count} strips for a ball of {gores.diameter_mm:g} mm
-
-gores.pdf, gores.svg      the texture: paint black what is black
-stencil.pdf, stencil.svg  the borders only, to be traced or cut out
-
-1. Print at 100 % ("actual size"; no "fit to page"). The sheet is {sheet[0]:.0f} x {sheet[1]:.0f} mm; if it is larger
-   than your paper, let the printer spread it over several pages ("poster").
-2. Measure the line at the bottom. If its length is wrong, the scale is wrong, and so are all measured angles.
-   The equator (the dashed line across) must be {width:.1f} mm long and a strip {height:.1f} mm high: around the ball
-   once, and from pole to pole.
-3. Cut along the solid coloured lines. Leave the strips joined at the equator, where they touch: the chain goes around
-   the ball. Its two ends meet at longitude 180 degrees.
-4. Draw an equator on the ball (a ring that the ball just passes through helps) and two poles. Lay the chain's dashed
-   line on the equator, printed side out, and bring the tips to the poles. The dashed lines down the strips are
-   meridians: fold the strips slightly along them, so that they follow the ball.
-5. As a stencil: print stencil.pdf on adhesive foil, cut out the black areas, lay it on the white ball as above, and
-   paint through it. To trace: put carbon paper below and draw along the borders.
-6. Each strip has true lengths along its middle and along all parallels. At its edges, at latitude 45 degrees, lengths
-   are wrong by up to {100 * (math.hypot(1, slope) - 1):.1f} % and directions by up to {
-        math.degrees(math.atan(slope)):.1f} degrees.
-
-The measurement needs the map that is on the ball, not the one that was planned: compare both, or learn the map from a
-movie.
-"""
+    sizes = {"width": width, "height": height, "sheet_width": sheet[0], "sheet_height": sheet[1]}
+    errors = {"stretch": 100 * (math.hypot(1, slope) - 1), "turn": math.degrees(math.atan(slope))}
+    text = Path(__file__).with_name("gores.txt").read_text(encoding="utf-8")
+    return text.format(count=gores.count, diameter_mm=gores.diameter_mm, **sizes, **errors)

@@ -5,30 +5,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from pydantic import BaseModel, Field
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.report.plots.style import GREY, SHADE, WIDTH_IN, in_style, new_figure
+from sphereorient.report.texture_map import draw_map
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import Sampling, orthographic_view, reduced_texture
 from sphereorient.sphere.texture import texture_coordinates
+from sphereorient.tools.design import patterns
 from sphereorient.tools.design.bound import cramer_rao_bound
-from sphereorient.tools.design.patterns import (
-    SIZES_DEG,
-    border_length,
-    facing,
-    patterned_texture,
-    stroke_deg,
-    view_directions,
-)
+from sphereorient.tools.design.patterns import facing, patterned_texture, stroke_deg, view_directions
 
 SEARCH = GreySearchSettings()  # normalisation and size of the views, as in the search on grey values
 ALIKE_STEP_DEG = 12.0  # of the first comparison: every view is within 14.5 degrees of the grid
@@ -68,16 +63,6 @@ class Judgement:
         """1 less the similarity of the most similar views."""
         return 1.0 - self.alike
 
-    @property
-    def worst(self) -> int:
-        """The view with the greatest bound."""
-        return int(self.bound_rad.argmax())
-
-    @property
-    def best(self) -> int:
-        """The view with the least bound."""
-        return int(self.bound_rad.argmin())
-
     def as_dict(self) -> dict[str, Any]:
         """Return all figures for JSON, angles in degrees; None: infinite."""
         places = lon_lat_deg(self.direction_body)
@@ -87,8 +72,8 @@ class Judgement:
             "views": len(places),
             "white_share": _spread(self.white),
             "bound_deg": _spread(torch.rad2deg(self.bound_rad)),
-            "worst_view_lon_lat_deg": places[self.worst].tolist(),
-            "best_view_lon_lat_deg": places[self.best].tolist(),
+            "worst_view_lon_lat_deg": places[self.bound_rad.argmax()].tolist(),
+            "best_view_lon_lat_deg": places[self.bound_rad.argmin()].tolist(),
             "greatest_similarity": self.alike,
             "margin": self.margin,
             "most_alike_lon_lat_deg": lon_lat_deg(-self.alike_views[:, 2]).tolist(),
@@ -122,7 +107,7 @@ def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Ju
         alike=alike,
         alike_views=two,
         stroke_deg=stroke_deg(texture),
-        border=border_length(texture),
+        border=patterns.border_length(texture),
     )
 
 
@@ -169,22 +154,13 @@ def design_texture(
     *,
     tries: int = 24,
     seed: int = 0,
-    advance: Callable[[int, int], None] | None = None,
+    advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Tensor, Judgement, str]:
     """Return the paintable map (512, 1024) with the best worst view, its judgement and its description.
 
-    Sizes are 1.5 to 5 times the brush; of the best few, the least bound / margin wins: precise, hard to confuse.
-
-    Args:
-        kinds: of `PATTERNS`.
-        stroke: least width of the brush, degrees.
-        settings: expected pictures.
-        tries: maps of each kind.
-        seed: of the search.
-        advance: called with the number of maps tried, and of all.
-
-    Raises:
-        PaintError: no map can be painted with such a brush.
+    Of each of the `kinds` (of `PATTERNS`) so many `tries` are drawn, with sizes of 1.5 to 5 times the brush, whose
+    width is at least `stroke` degrees; of the best few, the least bound / margin wins: precise, hard to confuse.
+    Raise PaintError if no map can be painted with such a brush.
     """
     settings = DesignSettings() if settings is None else settings
     # The ratio of bounds hardly depends on the diameter: the first judgement is for a small one.
@@ -194,13 +170,12 @@ def design_texture(
     for number in range(tries * len(kinds)):
         kind, k = kinds[number // tries], number % tries
         size = 1.5 * stroke * (5.0 / 1.5) ** (k / max(tries - 1, 1))
-        size = min(max(size, SIZES_DEG[0]), SIZES_DEG[1])
+        size = min(max(size, patterns.SIZES_DEG[0]), patterns.SIZES_DEG[1])
         texture = patterned_texture(kind, size, seed + k, 256)
         white = _white(texture, R)
         if stroke_deg(texture) >= stroke and low <= float(white.min()) <= float(white.max()) <= high:
             found.append((float(_bounds(texture, R, small).amax()), kind, size, seed + k))
-        if advance is not None:
-            advance(number + 1, tries * len(kinds))
+        advance(number + 1, tries * len(kinds))
     if not found:
         expected, do = f"one that a brush of {stroke:g} degrees can paint", "take a finer brush or more tries"
         raise PaintError(refusal("texture map", expected=expected, got=f"none of {tries * len(kinds)}", do=do))
@@ -221,13 +196,9 @@ def _white(texture: Tensor, R_view_body: Tensor) -> Tensor:
 
 
 def _bounds(texture: Tensor, R_view_body: Tensor, settings: DesignSettings) -> Tensor:
-    bound = cramer_rao_bound(
-        texture.float(),
-        R_view_body.float(),
-        diameter_px=settings.diameter_px,
-        noise_share=settings.noise_share,
-        sampling=Sampling(supersampling=6 if settings.diameter_px < 40 else 4),
-    )
+    pictures = {"diameter_px": settings.diameter_px, "noise_share": settings.noise_share}
+    sampling = Sampling(supersampling=6 if settings.diameter_px < 40 else 4)
+    bound = cramer_rao_bound(texture.float(), R_view_body.float(), **pictures, sampling=sampling)
     return bound.orientation_rms_rad.double()
 
 
@@ -249,24 +220,22 @@ def design_figure(texture: Tensor, judgement: Judgement, title: str) -> Figure:
 
 
 def _map_part(axes: Axes, texture: Tensor, judgement: Judgement, title: str) -> None:
-    axes.imshow(texture.numpy(), cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90), interpolation="nearest")
-    axes.grid(visible=False)
+    brush = f"brush up to {judgement.stroke_deg:.0f} degrees, borders {judgement.border:.0f} radii long"
+    draw_map(axes, texture, f"{title}: {brush}", interpolation="nearest")
+    axes.title.set_fontsize(8)
+    axes.set_ylabel("latitude (degrees)")
     at, (first, second) = judgement.direction_body, judgement.alike_views
-    named = {"W": (at[judgement.worst], WORST), "B": (at[judgement.best], BEST)}
+    named = {"W": (at[judgement.bound_rad.argmax()], WORST), "B": (at[judgement.bound_rad.argmin()], BEST)}
     for label, (direction, colour) in (named | {"1": (-first[2], ALIKE), "2": (-second[2], ALIKE)}).items():
         lon, lat = lon_lat_deg(direction).tolist()
         axes.plot(lon, lat, "o", markersize=9, markerfacecolor="white", markeredgecolor=colour, markeredgewidth=1.4)
         axes.text(lon, lat, label, color=colour, fontsize=7, fontweight="bold", ha="center", va="center")
-    axes.set(xticks=range(-180, 181, 60), yticks=range(-90, 91, 30), ylabel="latitude (degrees)")
-    axes.set_xlabel("longitude (degrees)", labelpad=1)
-    brush = f"brush up to {judgement.stroke_deg:.0f} degrees, borders {judgement.border:.0f} radii long"
-    axes.set_title(f"{title}: {brush}", fontsize=8)
 
 
 def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
     size = SIDE_PX
     texture, view = reduced_texture(texture, size), orthographic_view(size)
-    shown = [*judgement.bound_rad.argsort(descending=True)[:3].tolist(), judgement.best]
+    shown = [*judgement.bound_rad.argsort(descending=True)[:3].tolist(), int(judgement.bound_rad.argmin())]
     drawn = []
     for k, name, colour in zip(shown, ("W: ", "", "", "B: "), (WORST, WORST, WORST, BEST), strict=True):
         angle = math.degrees(float(judgement.bound_rad[k]))
@@ -274,13 +243,9 @@ def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
         drawn.append((name + text, facing(judgement.direction_body[k]), colour))
     drawn += [(f"{n + 1}: alike {judgement.alike:.2f}", R, ALIKE) for n, R in enumerate(judgement.alike_views)]
     for axes, (text, R, colour) in zip(part.subplots(1, len(drawn)), drawn, strict=True):
-        axes.imshow(
-            view.render(texture, R.float(), math.nan).numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest"
-        )
-        circle = matplotlib.patches.Circle(
-            (size / 2 - 0.5, size / 2 - 0.5), size / 2, fill=False, color=SHADE, lw=0.6, clip_on=False
-        )
-        axes.add_patch(circle)
+        seen, middle = view.render(texture, R.float(), math.nan).numpy(), (size / 2 - 0.5,) * 2
+        axes.imshow(seen, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.add_patch(Circle(middle, size / 2, fill=False, color=SHADE, lw=0.6, clip_on=False))
         axes.set_axis_off()
         axes.set_title(text, fontsize=7, color=colour)
 
@@ -293,10 +258,6 @@ def _information_part(axes: Axes, judgement: Judgement) -> None:
     axes.plot(place[~fine, 0], place[~fine, 1], "x", color=WORST)
     axes.set(xlim=(-180, 180), ylim=(-90, 90), xticks=range(-180, 181, 90), yticks=(-90, 0, 90))
     axes.set(xlabel="longitude of the view's middle (degrees)", ylabel="latitude")
-    settings = judgement.settings
-    text = (
-        f"best possible error of one view, ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} %"
-    )
-    axes.set_title(text, fontsize=7.5)
-    bar = axes.figure.colorbar(dots, ax=axes, pad=0.02)
-    bar.set_label("degrees", fontsize=7)
+    ball = f"ball of {judgement.settings.diameter_px:g} px, noise {100 * judgement.settings.noise_share:g} %"
+    axes.set_title(f"best possible error of one view, {ball}", fontsize=7.5)
+    axes.figure.colorbar(dots, ax=axes, pad=0.02).set_label("degrees", fontsize=7)

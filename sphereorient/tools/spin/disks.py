@@ -158,9 +158,7 @@ def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
     """Read photographs: files in order of time, or one folder by name.
 
     `times`: a table .csv with the columns file and t_s, s, or pictures per second at equal intervals.
-
-    Raises:
-        PaintError: missing or unreadable files, too many of them, or times that do not match.
+    Raise PaintError for missing or unreadable files, too many of them, or times that do not match.
     """
     files = list(paths)
     if len(files) == 1 and files[0].is_dir():
@@ -176,9 +174,7 @@ def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
 def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
     """Read a texture map, or a table .csv of dots: x, y, z of a direction in each line, no header.
 
-    Raises:
-        PaintError: the table is missing, or its lines are no directions.
-        TextureError: the map is missing or unreadable.
+    Raise PaintError for a missing table or lines that are no directions, TextureError for a missing or unreadable map.
     """
     if path.suffix.lower() not in (".csv", ".txt"):
         return load_texture(path)

@@ -17,16 +17,10 @@ from sphereorient.search import Candidates, GreySearch, GreySearchSettings, Prop
 from sphereorient.search.refine_rotation import DetailLevel, detail_level, level_reference, refine_rotation
 from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import texture_table
+from sphereorient.tools.spin import fit
 from sphereorient.tools.spin.disks import BallOutline, Photographs
 from sphereorient.tools.spin.dots import DOT_SEARCH, DotSearch, DotTable
-from sphereorient.tools.spin.fit import (
-    PictureCandidates,
-    Spins,
-    evidence_of,
-    fit_spins,
-    picture_candidates,
-    refine_spins,
-)
+from sphereorient.tools.spin.fit import PictureCandidates, Spins, fit_spins, picture_candidates
 
 FINEST = 0.05  # detail of the last fit, radii: a pixel of a disk of 40
 REFINEMENT_STEPS = 6
@@ -71,15 +65,8 @@ def spin_of(
     """Find the uniform spin of a ball of known texture from photographs of a far, uncalibrated camera.
 
     Times at multiples of one step allow several spins, whole turns per step apart: all below the limit are returned.
-
-    Args:
-        photographs: with their times.
-        texture: the map (H, 2 H), 0 black .. 1 white, or a table of dots.
-        settings: limits and search.
-        progress: called with stage, photographs done, and all photographs.
-
-    Raises:
-        PaintError: no ball, no spin better than chance, or a mirrored texture that fits better.
+    `texture` is the map (H, 2 H), 0 black .. 1 white, or a table of dots. Raise PaintError for no ball, no spin better
+    than chance, or a mirrored texture that fits better.
     """
     settings = SpinSettings() if settings is None else settings
     time_s = photographs.time_s.double()
@@ -89,22 +76,15 @@ def spin_of(
     _, reflected = _searched(disks, time_s, mirrored, settings, progress, "mirror image")
     spins = fit_spins(seen, settings.omega_max_rad_s)
     mirrored_evidence = _greatest(fit_spins(reflected, settings.omega_max_rad_s))
-    best = _greatest(spins)
-    got = f"evidence {best:.0f}, and {mirrored_evidence:.0f} for its mirror image"
-    if mirrored_evidence > best + AS_EVIDENT:
-        do = "flip the map left to right, or change the sign of one column of the table"
-        raise PaintError(refusal("texture", expected="that of the ball, not of its mirror image", got=got, do=do))
-    if mirrored_evidence > best - AS_EVIDENT:
-        do = "check that texture, times and pictures belong together and that the ball spins uniformly, or add pictures"
-        raise PaintError(refusal("spin", expected="one that explains more than chance", got=got, do=do))
+    _check_evidence(_greatest(spins), mirrored_evidence)
     drawn = texture.texture() if isinstance(texture, DotTable) else texture
     view = orthographic_view(settings.search.size_px)
     level = detail_level(view, texture_table(drawn.float(), FINEST), FINEST, every=1)
     own, _ = _refined(level, disks, spins.R_view_body(time_s)[0], REFINEMENT_STEPS)
     # Refit the spins to one orientation per picture; keep the evidence of all candidates.
     single = picture_candidates(time_s, torch.arange(len(own) + 1), own, torch.ones(len(own)))
-    fitted = refine_spins(single, spins, iterations=LAST_ITERATIONS)
-    total = evidence_of(seen, spins).sum(1)
+    fitted = fit.refine_spins(single, spins, iterations=LAST_ITERATIONS)
+    total = fit.evidence_of(seen, spins).sum(1)
     close = total > total.max() - AS_EVIDENT
     rate = fitted.omega_view_rad_s.norm(dim=-1)
     order = torch.where(close, rate - rate.max() - 1.0, total.max() - total).argsort(stable=True)
@@ -115,7 +95,7 @@ def spin_of(
     return SpinFound(
         spins=spins,
         ambiguous=int(close.sum()),
-        evidence=evidence_of(seen, spins),
+        evidence=fit.evidence_of(seen, spins),
         mirrored_evidence=mirrored_evidence,
         alone=alone,
         R_view_body=torch.where(followed[:, None, None], own, predicted),
@@ -142,6 +122,17 @@ def _searched(
     return alone, picture_candidates(time_s, alone.offset, alone.R_view_body, alone.score.square())
 
 
+def _check_evidence(best: float, mirrored: float) -> None:
+    """Raise PaintError unless the texture explains the pictures better than its mirror image does."""
+    got = f"evidence {best:.0f}, and {mirrored:.0f} for its mirror image"
+    if mirrored > best + AS_EVIDENT:
+        do = "flip the map left to right, or change the sign of one column of the table"
+        raise PaintError(refusal("texture", expected="that of the ball, not of its mirror image", got=got, do=do))
+    if mirrored > best - AS_EVIDENT:
+        do = "check that texture, times and pictures belong together and that the ball spins uniformly, or add pictures"
+        raise PaintError(refusal("spin", expected="one that explains more than chance", got=got, do=do))
+
+
 def _greatest(spins: Spins) -> float:
     return float(spins.evidence.max()) if len(spins) else 0.0
 
@@ -165,8 +156,8 @@ def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequen
     predicted = orthographic_view(size).render(texture, found.spins.R_view_body(time_s)[0].float(), math.nan)
     figure = new_figure(WIDTH_IN, 2.4 * rows + 0.4)
     axes = figure.subplots(2 * rows, COLUMNS, squeeze=False)
-    for one in axes.flat:
-        one.set_axis_off()
+    for each in axes.flat:
+        each.set_axis_off()
     inside = torch.isfinite(predicted[0])
     for place, k in enumerate(chosen):
         row, column = 2 * (place // COLUMNS), place % COLUMNS

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,8 +26,8 @@ from sphereorient.mapping.compare import (
     without_changed,
 )
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
-from sphereorient.report.texture_map import CHANGE_REACH, draw_map
+from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note, spread
+from sphereorient.report.texture_map import CHANGE_REACH, EXTENT, draw_map
 from sphereorient.sphere.texture import map_directions
 
 BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
@@ -36,7 +35,7 @@ LEAST_DEG = 1.5  # radius of the smallest place that is reported
 HALF = 0.5  # share of a place that a map must know to give its worn share
 SHOWN = 6  # maps that are drawn at most, spread over the series
 NAMED = 6  # places that have their number in the maps, and their own curve
-EXTENT = (-180, 180, -90, 90)
+NUMBER = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5}
 LEAST_PERCENT = 0.1  # height of the smallest scale of the curve
 
 
@@ -98,7 +97,7 @@ def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
         do = "give the maps in the order of their movies"
         raise PaintError(refusal("maps", expected="two or more", got=str(len(maps)), do=do))
     wear = tuple(_wear(texture, maps[0], turned) for texture in maps[1:])
-    number = _places(torch.stack([one.worn for one in wear]).any(0))
+    number = connected_places(torch.stack([one.worn for one in wear]).any(0))
     sizes = _sizes(number)
     rank = torch.zeros(len(sizes), dtype=torch.int64)
     rank[sizes[1:].argsort(descending=True, stable=True) + 1] = torch.arange(1, len(sizes))
@@ -123,7 +122,7 @@ def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
     known = torch.isfinite(off)
     # The median ignores worn places and borders of displaced ones.
     scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
-    number = _places(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is in no place
+    number = connected_places(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is in no place
     large = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
     large[0] = False
     comparison = without_changed(comparison, change, CHANGED)
@@ -161,7 +160,7 @@ def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
     )
 
 
-def _places(worn: Tensor) -> Tensor:
+def connected_places(worn: Tensor) -> Tensor:
     """Number the connected places of a mask (H, 2 H) from 1 on, also across the map's edge and its poles."""
     mask = worn.numpy()
     node = np.arange(mask.size).reshape(mask.shape)
@@ -180,17 +179,20 @@ def _places(worn: Tensor) -> Tensor:
 def wear_figure(first: Tensor, series: WearSeries, names: Sequence[str]) -> Figure:
     """Draw the wear of a series of maps against the first (H, 2 H), NaN where unknown; `names` are of all maps."""
     count = len(series.wear)
-    drawn = np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int)).tolist()
+    drawn = spread(count, SHOWN).tolist()
     rows = math.ceil((len(drawn) + 1) / 2)
     figure = new_figure(WIDTH_IN, 1.75 * rows + 2.7)
     grid = figure.add_gridspec(rows + 1, 2, height_ratios=[1.0] * rows + [1.15])
     maps = [figure.add_subplot(grid[k // 2, k % 2]) for k in range(len(drawn) + 1)]
-    _drawn(maps[0], first, f"{names[0]}: the first map")
+    draw_map(maps[0], first, f"{names[0]}: the first map")
     style = {"cmap": "RdBu_r", "vmin": -CHANGE_REACH, "vmax": CHANGE_REACH}
     for axes, k in zip(maps[1:], drawn, strict=True):
         worn = f"{names[k + 1]}: {100 * series.growth[k].worn:.1f} % worn"
-        shown = _drawn(axes, series.wear[k].change, worn, **style)
+        shown = draw_map(axes, series.wear[k].change, worn, **style)
         _mark(axes, series, k)
+    for axes in maps:
+        axes.set_xlabel("")
+        axes.title.set_fontsize(8)
     figure.colorbar(shown, ax=maps, shrink=0.6, extend="both", label="change, red where brighter")
     _draw_growth(figure.add_subplot(grid[rows, :]), series, names)
     note(
@@ -201,27 +203,14 @@ def wear_figure(first: Tensor, series: WearSeries, names: Sequence[str]) -> Figu
     return figure
 
 
-def _drawn(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
-    shown = draw_map(axes, values, title, **style)
-    axes.set_xlabel("")
-    axes.title.set_fontsize(8)
-    return shown
-
-
 def _mark(axes: Axes, series: WearSeries, k: int) -> None:
     worn = series.wear[k].worn.numpy()
     if worn.any():
         axes.contour(worn.astype(float), [0.5], colors=BLACK, linewidths=0.6, extent=EXTENT, origin="upper")
     for number, place in enumerate(series.places[:NAMED], start=1):
         if place.share[k] > 0:
-            axes.annotate(
-                str(number),
-                (place.longitude_deg, place.latitude_deg),
-                xytext=(7, 7),
-                textcoords="offset points",
-                fontsize=7,
-                bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5},
-            )
+            at, beside = (place.longitude_deg, place.latitude_deg), (7, 7)
+            axes.annotate(str(number), at, beside, textcoords="offset points", fontsize=7, bbox=NUMBER)
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:

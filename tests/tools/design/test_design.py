@@ -134,7 +134,8 @@ def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
         texture, facing(judged.direction_body).float(), diameter_px=24, sampling=Sampling(supersampling=6)
     )
     assert_close(judged.bound_rad, expected.orientation_rms_rad.double(), atol=1e-9)
-    assert float(judged.direction_body[judged.worst, 0]) < -0.5 < 0.2 < float(judged.direction_body[judged.best, 0])
+    x = judged.direction_body[:, 0]
+    assert float(x[judged.bound_rad.argmax()]) < -0.5 < 0.2 < float(x[judged.bound_rad.argmin()])
     assert float(judged.white.max()) > 0.97
     assert json.loads(json.dumps(judged.as_dict(), allow_nan=False))["views"] == 12
 

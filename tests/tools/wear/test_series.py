@@ -22,7 +22,7 @@ from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_seen
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth.textures import random_texture
-from sphereorient.tools.wear.series import WearSeries, _places, wear_series
+from sphereorient.tools.wear.series import WearSeries, connected_places, wear_series
 
 HEIGHT = 128
 NOISE = 0.02
@@ -139,16 +139,16 @@ def test_what_a_map_does_not_know_is_neither_worn_nor_healed():
 
 
 def test_places_are_one_across_the_maps_edge_and_over_its_poles():
-    assert_close(_places(torch.zeros(4, 8, dtype=torch.bool)), torch.zeros(4, 8, dtype=torch.int64))
+    assert_close(connected_places(torch.zeros(4, 8, dtype=torch.bool)), torch.zeros(4, 8, dtype=torch.int64))
     edge = torch.zeros(4, 8, dtype=torch.bool)
     edge[1, [0, 7]] = True
     edge[2, 4] = True
-    number = _places(edge)
+    number = connected_places(edge)
     assert number[1, 0] == number[1, 7] != number[2, 4]
     pole = torch.zeros(4, 8, dtype=torch.bool)
     pole[0, [1, 5]] = True
     pole[3, [0, 3]] = True
-    number = _places(pole)
+    number = connected_places(pole)
     assert number[0, 1] == number[0, 5] != number[3, 0] == number[3, 3]
     assert int(number.max()) == 2
 
