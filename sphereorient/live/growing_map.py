@@ -28,9 +28,11 @@ from sphereorient.mapping.iterations import (
 )
 from sphereorient.mapping.learn import final_map, interpolated
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fitter import Fitter, Optics
+from sphereorient.pose.camera_view import Optics
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.pixels import Pixels, stacked
+from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch
 from sphereorient.sphere.texture_table import texture_table
 
@@ -191,7 +193,7 @@ class GrowingMap:
             fitter, level = self._found.appearance.fitter, self._found.appearance.fitter.optics.fine
             new = self._of(rows, self._R_aligned(rows), self._state)
             held = self._found.centre.precision.expand(len(rows), 3, 3)
-            fit = fitter.fit(new.pixels, new.position_lab_mm, new.R_lab_body, new.use, level, FITTED, held)
+            fit = fitter.fit(new.pixels, PoseStart(new.position_lab_mm, new.R_lab_body, new.use, held), level, FITTED)
             good = ((fit.score > self._found.appearance.score_min) | ~new.use).all(1)
             self._rows = torch.cat([self._rows, rows[good]])
             self._R_lab_map = torch.cat([self._R_lab_map, fit.R_lab_body[good]])
@@ -315,8 +317,8 @@ def _judged(state: State, optics: Optics) -> LiveMap:
     """Return what following needs of a map whose pictures are fitted anew."""
     fitter = replace(state.fitter, optics=optics)
     X, use = state.position_lab_mm, state.use
-    fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, 3)
-    fitter = replace(fitter, widest_px=WIDER * float(fitter.largest_px(X).max()))
+    fit = fitter.fit(state.pixels, PoseStart(X, state.R_lab_body, use), optics.fine, 3)
+    fitter = replace(fitter, widest_px=WIDER * float(fitter.disks_px(X).largest_px.max()))
     right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
     appearance = Appearance(
         fitter=fitter,
@@ -348,5 +350,6 @@ def _wrong_score(fitter: Fitter, state: State) -> float:
     rows = evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES)
     turns = so3.random_rotations(len(rows), generator=torch.Generator().manual_seed(0))
     fine = fitter.optics.fine
-    fit = fitter.fit(state.disks(rows), state.position_lab_mm[rows], turns, state.use[rows], fine, WRONG_ITERATIONS)
+    begin = PoseStart(state.position_lab_mm[rows], turns, state.use[rows])
+    fit = fitter.fit(state.disks(rows), begin, fine, WRONG_ITERATIONS)
     return float(fit.score[state.use[rows]].quantile(0.9))

@@ -78,8 +78,8 @@ def linearise(
     `TextureTable`; pixels of such paint have no weight.
     """
     table = SplineTable(texture, 0.0, unseen)
-    model = replace(fitter.model(fitter.optics.fine), paint=table, blur_px=blur_px)
-    at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
+    model = replace(fitter.model(), paint=table, blur_px=blur_px)
+    at = residuals(pixels, position_lab_mm, R_lab_body, None, model)
     return Linearisation(**vars(at), reads=table.reads, inner=pixels.inner)
 
 

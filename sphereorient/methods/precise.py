@@ -19,7 +19,8 @@ from sphereorient.methods import results
 from sphereorient.methods.method import Job, Joined, Learnt, Measured
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views, sizes_of
 from sphereorient.pose.blur import estimate_blur_px
-from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, defocus_radii
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.trajectory import Trajectory
 
 

@@ -19,7 +19,7 @@ from sphereorient.files.cache import cached
 from sphereorient.locate import CameraScene, find_scene, find_scenes, known_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
-from sphereorient.pose.fitter import defocus_radii
+from sphereorient.pose.camera_view import defocus_radii
 from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateBank
 from sphereorient.search.settings import GreySearchSettings, ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable

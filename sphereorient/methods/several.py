@@ -24,7 +24,8 @@ from sphereorient.methods import precise
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, finest_table, open_scene, sizes_of
 from sphereorient.pose import CameraView
-from sphereorient.pose.fitter import FIRST_BLUR_PX, Fitter, first_fitter, widest_px
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, widest_px
+from sphereorient.pose.fitter import Fitter, first_fitter
 from sphereorient.pose.neighbours import spoilt
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Flag

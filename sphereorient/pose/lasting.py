@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import RIDGE, FittedPoses, light_columns, settled
+from sphereorient.pose.lights.disk import RIDGE, light_columns
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.residuals import Residuals, by_pose
+from sphereorient.pose.poses import FittedPoses
+from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
 from sphereorient.so3 import solve_damped
 
 TILES = 4  # along each axis of the disk: errors of light are wide
@@ -57,7 +58,7 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     cameras = use.shape[1]
-    at = settled(pixels, fit, model, cameras)
+    at = fitted_residuals(pixels, fit, model)
     normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), cameras)
     others = normal.shape[-1] - 6
     turn = [0, 1, 2, *range(6, 6 + others)]

@@ -60,6 +60,12 @@ class Pixels:
         some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., kept])
         return replace(some, inner=min(len(range(0, self.inner, step)), some.grey.shape[1]))
 
+    def exposed(self, moved: Tensor | None, instants: int) -> "Pixels":
+        """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""
+        if moved is None or instants == 1:
+            return self
+        return replace(self, moved=moved.repeat_interleave(len(self) // len(moved), 0), instants=instants)
+
     def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> "Pixels":
         parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **parts)

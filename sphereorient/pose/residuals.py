@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.pose.model import SphereModel, SphereView, polynomials, scene_beside, sphere_view
+from sphereorient.pose.model import SphereModel, SphereView, polynomials, scene_beside
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
+from sphereorient.pose.view import sphere_view
 from sphereorient.so3 import solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
@@ -57,18 +59,12 @@ class Told:
 
 
 def torch_sums(
-    pixels: Pixels,
-    X: Tensor,
-    R: Tensor,
-    state: tuple[Tensor, Tensor] | None,
-    model: SphereModel,
-    cameras: int,
-    tell: bool,
+    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, tell: bool
 ) -> DiskSums:
     """Sum the linear problem of B * C disks at poses X (B, 3), mm, R_lab_body R (B, 3, 3); `state` as in `residuals`.
     `tell`: with what is told of how well they are explained.
     """
-    at = residuals(pixels, X, R, state, model, cameras)
+    at = residuals(pixels, X, R, state, model)
     precision = at.weight / at.variance
     weighted = at.design * precision[:, None]
     normal = (weighted @ at.design.mT).double()
@@ -85,12 +81,19 @@ def torch_sums(
     return DiskSums(state=(at.model, at.weight), information=information, pull=pull, told=told)
 
 
+def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
+    """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
+    return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
+
+
 def residuals(
-    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
+    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
 ) -> Residuals:
     """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
     `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
+    cameras = len(model.light.noise)
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     difference, black = model.light.at(view, pixels)  # as learnt
     tints = polynomials(view.across, max(model.shading.difference, model.shading.black))

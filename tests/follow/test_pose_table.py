@@ -6,7 +6,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.follow.poses import Poses, no_pose, pose_table
-from sphereorient.pose.fit import POSE_PARTS
+from sphereorient.pose.poses import POSE_PARTS
 from sphereorient.trajectory import Reason
 
 CAMERAS = 2

@@ -13,7 +13,7 @@ import torch
 from sphereorient import so3
 from sphereorient.cameras import Camera, sphere_radius_px
 from sphereorient.methods.results import missed_by, with_contradictions, with_lasting_errors
-from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.lasting import Lasting
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
