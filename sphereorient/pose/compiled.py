@@ -134,39 +134,6 @@ def settle(
     return fit, far
 
 
-@lru_cache(maxsize=16)
-def _of_view(view: CameraView) -> tuple[ctypes.Structure, list[Tensor]]:
-    """Return the record of a camera, and what it points to."""
-    sight, background = view.sight, view.background
-    alive = [torch.from_numpy(np.ascontiguousarray(background.mean)), sight.direction]
-    alive += [sight.origin.contiguous(), sight.axes.contiguous(), sight.pitch_rad, sight.pitch_mm]
-    behind, direction, origin, axes, pitch_rad, pitch_mm = (part.data_ptr() for part in alive)
-    if background.shown is not None:
-        alive.append(torch.from_numpy(np.ascontiguousarray(background.shown)))
-    width, height = sight.size
-    scene = _Scene(
-        width=width,
-        height=height,
-        origins=1 if sight.one_origin else width * height,
-        behind=behind,
-        shown=None if background.shown is None else alive[-1].data_ptr(),
-        direction=direction,
-        origin=origin,
-        axes=axes,
-        pitch_rad=pitch_rad,
-        pitch_mm=pitch_mm,
-        full_scale=background.full_scale,
-    )
-    return scene, alive
-
-
-@lru_cache(maxsize=64)
-def _of_stencil(stencil: Stencil) -> ctypes.Structure:
-    tiles = int(stencil.tile.max()) + 1
-    place, tile = stencil.place.data_ptr(), stencil.tile.data_ptr()
-    return _Stencil(places=len(stencil.tile), inner=stencil.inner, tiles=tiles, place=place, tile=tile)
-
-
 class _Addresses:
     """Addresses of tensors as C reads them; each lives as long as this."""
 
@@ -185,43 +152,48 @@ class _Addresses:
 
 
 @lru_cache(maxsize=16)
+def _of_view(view: CameraView) -> tuple[ctypes.Structure, _Addresses]:
+    """Return the record of a camera, and what it points to."""
+    at, sight, background = _Addresses(), view.sight, view.background
+    (width, height), shown = sight.size, background.shown
+    pointers = {name: at(getattr(sight, name)) for name in ("direction", "origin", "axes", "pitch_rad", "pitch_mm")}
+    pointers["behind"] = at(torch.from_numpy(np.ascontiguousarray(background.mean)))
+    pointers["shown"] = None if shown is None else at(torch.from_numpy(np.ascontiguousarray(shown)))
+    origins = 1 if sight.one_origin else width * height
+    return _Scene(width=width, height=height, origins=origins, full_scale=background.full_scale, **pointers), at
+
+
+@lru_cache(maxsize=64)
+def _of_stencil(stencil: Stencil) -> ctypes.Structure:
+    tiles = int(stencil.tile.max()) + 1
+    place, tile = stencil.place.data_ptr(), stencil.tile.data_ptr()
+    return _Stencil(places=len(stencil.tile), inner=stencil.inner, tiles=tiles, place=place, tile=tile)
+
+
+@lru_cache(maxsize=16)
 def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
     """Return a record with all that depends on the model alone, and what it points to."""
-    at = _Addresses()
-    light, paint, unseen = model.light.tables, model.paint, model.paint.unseen
+    at, lit, light, paint, unseen = _Addresses(), model.light, model.light.tables, model.paint, model.paint.unseen
+    pointers = {"edge": _edge_table(), "light": light.cells, "cover": light.cover, "gain": light.gain}
+    pointers |= {"noise": lit.noise, "stray": lit.stray, "limb_px": model.limb_px}
+    numbers = {"unseen_most": UNSEEN, "known_least": KNOWN, "cover_least": COVER_MIN, "noise_least": NOISE_MIN}
+    numbers |= {"tukey2": TUKEY**2, "outliers": OUTLIERS, "edges": EDGES, "edge_most": EDGE_MOST, "edge_px": EDGE_PX}
+    numbers |= {"covered": COVERED, "most_each": MOST_EACH, "least_of_window": LEAST_OF_WINDOW, "margin": MARGIN_PX}
     n_difference, n_black = model.shading.counts
     task = _Task(
         radius_mm=model.radius_mm,
         blur_px=model.blur_px,
         paint=_Table(at(paint.rows), paint.side),
-        unseen=_Table(None if unseen is None else at(unseen.rows), 0 if unseen is None else unseen.side),
-        unseen_most=UNSEEN,
-        known_least=KNOWN,
-        cover_least=COVER_MIN,
+        unseen=_Table() if unseen is None else _Table(at(unseen.rows), unseen.side),
         sine_most=math.sqrt(1.0 - DEPTH_MIN**2),
-        noise_least=NOISE_MIN,
-        tukey2=TUKEY**2,
-        outliers=OUTLIERS,
-        edge=at(_edge_table()),
-        edges=EDGES,
-        edge_most=EDGE_MOST,
         light_kind=light.kind,
-        light=at(light.cells),
         light_side=light.side,
-        cover=at(light.cover),
         depths=0 if light.cover is None else len(light.cover),
-        gain=at(light.gain),
-        noise=at(model.light.noise),
-        stray=at(model.light.stray),
         n_difference=n_difference,
         n_black=n_black,
-        limb_px=at(model.limb_px, torch.float32),
-        edge_px=EDGE_PX,
-        covered=COVERED,
-        most_each=MOST_EACH,
-        least_of_window=LEAST_OF_WINDOW,
         window=WINDOW_PX // 2,
-        margin=MARGIN_PX,
+        **numbers,
+        **{name: at(part, torch.float32) for name, part in pointers.items()},
     )
     return task, at
 

@@ -11,7 +11,7 @@ from sphereorient.pose.model import Shading, SphereModel
 from sphereorient.pose.occluders import kept
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart
-from sphereorient.pose.residuals import EDGE_PX, Told, by_pose, torch_sums
+from sphereorient.pose.residuals import EDGE_PX, by_pose, disk_sums, loss_of, residuals, scores_of, tile_scores
 from sphereorient.so3 import inverse_damped, solve_damped
 
 
@@ -25,7 +25,7 @@ class _Last:
     pull: Tensor  # (B, C, 6)
     shared: Tensor  # (B, C, 6, 6), scores of tiles
     to_centre: Tensor  # (B, C, 3), mm, from the camera, after the step
-    told: Told
+    paint_step: Tensor  # (B, C), median grey levels from black to white paint
 
 
 def refine(
@@ -44,10 +44,11 @@ def refine(
         pixels = replace(pixels, inside=kept(pixels, begin, model, most_hidden))
     origin = by_pose(pixels.origin[..., 0].double(), cameras)
     state: tuple[Tensor, Tensor] | None = None
-    for k in range(iterations):
-        sums = torch_sums(pixels, X, R, state, model, tell=k == iterations - 1)
-        state = sums.state
-        information, pull = by_pose(sums.information, cameras), by_pose(sums.pull, cameras)
+    for _ in range(iterations):
+        at = residuals(pixels, X, R, state, model)
+        state = at.model, at.weight
+        *sums, mixed = disk_sums(at)
+        information, pull = (by_pose(part, cameras) for part in sums)
         whole = (information * seen[..., None, None]).sum(1)
         force = (pull * seen[..., None]).sum(1)
         if begin.place_precision is not None:
@@ -56,23 +57,22 @@ def refine(
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, model.radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
-    assert sums.told is not None  # of the last step
     last = _Last(
         step=step,
         whole=whole,
         information=information,
         pull=pull,
-        shared=by_pose(_shared_scores(sums.told.scores, model.shading), cameras),
+        shared=by_pose(_shared_scores(tile_scores(at, mixed, pixels.tile), model.shading), cameras),
         to_centre=X[:, None] - origin,
-        told=sums.told,
+        paint_step=by_pose(at.lit[:, : pixels.inner].double().median(-1).values, cameras),
     )
     return FittedPoses(
         position_lab_mm=X,
         R_lab_body=R,
         covariance=_covariance(last, pixels, begin, model),
         **_by_each(last, model.radius_mm),
-        score=by_pose(sums.told.score, cameras),
-        nll=(by_pose(sums.told.loss, cameras) * seen).sum(1),
+        score=by_pose(scores_of(at).double(), cameras),
+        nll=(by_pose(loss_of(at, pixels.inside), cameras) * seen).sum(1),
         step=step,
     )
 
@@ -116,7 +116,7 @@ def _covariance(last: _Last, pixels: Pixels, begin: PoseStart, model: SphereMode
         found = (model.limb_px[:, None].to(lured) * lured).sum(1)[..., None]
         covariance = covariance + found @ found.mT
     finest_mm = px_mm[..., 0].masked_fill(~begin.use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    aside_px = (_limb_moved_px(by_pose(last.told.step, cameras), model) * seen).amax(1)
+    aside_px = (_limb_moved_px(last.paint_step, model) * seen).amax(1)
     aside_mm = (aside_px * finest_mm)[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / model.radius_mm, aside_mm], dim=1).square())
     any_seen = (last.whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge

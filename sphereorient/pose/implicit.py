@@ -1,5 +1,4 @@
 """A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
-
 At the minimum of sum r(pose, theta)^2 / 2 the gradient g is 0, so that d pose / d theta = -H^-1 dg/dtheta with H =
 dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H^-1 g with H constant. The fit of
 `track` cannot serve: it holds weights, light and slopes fixed, in single precision.
@@ -73,20 +72,7 @@ def implicit_pose(
 
     with torch.no_grad():
         R, X = _levenberg_marquardt(counted, R, X, iterations)
-    still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
-
-    def about(delta: Tensor) -> Tensor:
-        return counted(*_moved(R, X, delta))
-
-    slope = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())
-    gradient = slope(still)
-    with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
-        columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
-        curvature = columns.movedim(0, -1)
-        rounding = 10 * torch.finfo(curvature.dtype).eps
-        # Undetermined directions become 0.
-        inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
-    step = -(inverse @ gradient[..., None])[..., 0]
+    step = _newton_step(lambda delta: counted(*_moved(R, X, delta)), torch.zeros_like(X).repeat(1, 2))
     arrived = known & (step[:, :3].norm(dim=-1) < ARRIVED_RAD) & (step[:, 3:].norm(dim=-1) < ARRIVED_MM)
     step = torch.where(arrived[:, None], step, 0.0)
     R_fitted, X_fitted = so3.exp(step[:, :3]) @ R, X + step[:, 3:]
@@ -99,10 +85,24 @@ def implicit_pose(
     )
 
 
+def _newton_step(residuals: Callable[[Tensor], Tensor], still: Tensor) -> Tensor:
+    """Return the step (B, 6) from no change, `still`, to the minimum; differentiable, with a constant Hessian."""
+    slope = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
+    gradient = slope(still)
+    with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
+        columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
+        curvature = columns.movedim(0, -1)
+        rounding = 10 * torch.finfo(curvature.dtype).eps
+        # Undetermined directions become 0.
+        inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
+    step: Tensor = -(inverse @ gradient[..., None])[..., 0]
+    return step
+
+
 def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step makes one worse."""
     damping = torch.full_like(X[:, 0], START_DAMPING)
-    still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
+    still = torch.zeros_like(X).repeat(1, 2)
     for _ in range(iterations):
         r, slopes = _linearised(lambda delta, R=R, X=X: residual(*_moved(R, X, delta)), still)  # type: ignore[misc]
         normal, pull = slopes @ slopes.mT, (slopes @ r[..., None])[..., 0]

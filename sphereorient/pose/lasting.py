@@ -1,5 +1,4 @@
 """Errors that last over frames: what light and map leave in the same place of every picture.
-
 The fit's covariance holds what differs from frame to frame. A path through all frames averages that away; these stay.
 """
 

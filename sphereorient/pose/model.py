@@ -140,12 +140,6 @@ def polynomials(across: Tensor, order: int) -> Tensor:
     return torch.stack(columns, dim=-2)
 
 
-def cells_of_disk(across: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Return column and row (L, P) of the cells, `side` across the square about the disk, of places (L, 2, P)."""
-    column, row = ((across + 1.0) * (0.5 * side)).long().clamp(0, side - 1).unbind(1)
-    return column, row
-
-
 def stray_basis(across: Tensor) -> Tensor:
     """Return the harmonics over the angle about the disk, (..., K, P), at places (..., 2, P): 1, cos, sin, cos 2 .."""
     cos, sin = torch.nn.functional.normalize(across, dim=-2).unbind(-2)

@@ -68,13 +68,9 @@ def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereVi
         ) / (whole if parts[0].ndim == 2 else whole[:, None])
 
     return SphereView(
-        paint=painted("paint"),
+        **{name: painted(name) for name in ("paint", "across", "aside", "paint_by_rotation", "paint_by_position")},
         coverage=coverage,
-        across=painted("across"),
         outward=torch.nn.functional.normalize(painted("outward"), dim=1),
-        aside=painted("aside"),
-        paint_by_rotation=painted("paint_by_rotation"),
-        paint_by_position=painted("paint_by_position"),
         coverage_by_position=mean([view.coverage_by_position for view in views]),
         known=torch.stack(told).all(0) if told else None,
     )

@@ -35,7 +35,6 @@ class GreySearch(DiskSearch):
         settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
         bank: (K, P) int8, that of another search with the same arguments; None: made when it is needed.
-
     `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the `bank`.
     """
 
