@@ -1,4 +1,4 @@
-/* The fit of poses, pose by pose: what `refine` of fit.py computes with `torch_sums` of residuals.py, which define it.
+/* The fit of poses, pose by pose: what `refine` of fit.py computes with `disk_sums` of residuals.py, which define it.
 
    Built for several instruction sets without fused or reordered arithmetic: all of them give the same bits. Stages over
    blocks of pixels keep their data in the first cache. Pictures in single precision, sums in double. */
@@ -1056,7 +1056,7 @@ int refine(const Task *t, int64_t begin, int64_t end) {
     return without;
 }
 
-/* The fit of poses that are nearly right, as `settled` of settle.py, from whole frames. */
+/* The fit of poses that are nearly right, as `settle` of settle.py, from whole frames. */
 
 /* The scene of one camera, and its lines of sight. */
 typedef struct {
