@@ -18,7 +18,7 @@ from sphereorient.pose.camera_view import CameraView, FrameDisks
 from sphereorient.pose.model import UNSEEN, SphereModel
 from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
-from sphereorient.pose.poses import FittedPoses, PoseStart, blank_parts
+from sphereorient.pose.poses import FittedPoses, PoseStart, pose_arrays
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY
 from sphereorient.pose.settle import FIRST_EVERY, MORE, NEAR_RAD
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
@@ -85,7 +85,7 @@ def _task_of(begin: PoseStart, model: SphereModel, instants: int) -> tuple[ctype
 
 def _into(task: ctypes.Structure, use: Tensor) -> FittedPoses:
     """Return poses that a task writes: its last fields, in the order of `FittedPoses`."""
-    parts = blank_parts(use.shape[1], len(use))
+    parts = pose_arrays(use.shape[1], len(use))
     for field, part in zip(_Task._fields_[-len(parts) :], parts.values(), strict=True):
         setattr(task, field[0], part.data_ptr())
     return FittedPoses(**parts)

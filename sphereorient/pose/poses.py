@@ -83,15 +83,21 @@ class FittedPoses:
         return FittedPoses(**{name: part.index_copy(0, at, there[name]) for name, part in self.parts().items()})
 
 
-POSE_PARTS = tuple(part.name for part in fields(FittedPoses))
+SHAPES: dict[str, tuple[int, ...]] = {part.name: part.metadata["shape"] for part in fields(FittedPoses)}
+POSE_PARTS = tuple(SHAPES)
+
+
+def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
+    """Return the arrays of `FittedPoses` of a leading shape, zeros."""
+    return {
+        name: torch.zeros(*shape, *(cameras if n < 0 else n for n in tail), dtype=torch.float64)
+        for name, tail in SHAPES.items()
+    }
 
 
 def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
-    """Return arrays of `FittedPoses` of a leading shape: zeros, and the unit rotation."""
-    parts = {
-        part.name: torch.zeros(*shape, *(cameras if n < 0 else n for n in part.metadata["shape"]), dtype=torch.float64)
-        for part in fields(FittedPoses)
-    }
+    """Return the same with the unit rotation."""
+    parts = pose_arrays(cameras, *shape)
     return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
 
 
