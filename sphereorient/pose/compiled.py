@@ -26,14 +26,14 @@ from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
 READABLE = {np.dtype(name) for name in ("uint8", "uint16", "float32")}  # pixels, in this machine's order of bytes
 SOURCE = Path(__file__).with_name("refine")
-_Table, _Task, _Stencil, _Scene, _Shot, _Near = (
+_Table, _Task, _Stencil, _Scene, _Shot, Near = (
     record(SOURCE, name) for name in ("Table", "Task", "Stencil", "Scene", "Shot", "Near")
 )
 
 
 def library() -> ctypes.CDLL | None:
     """Return the compiled code for this processor; None where there is none."""
-    return compiled(SOURCE, _Near)
+    return compiled(SOURCE, Near)
 
 
 @cache
@@ -114,7 +114,7 @@ def settle(
     (poses, cameras), stencil = begin.use.shape, disks.stencil
     far = torch.full((poses,), not first)
     task, at = _task_of(begin, model, instants)
-    near = _Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD)
+    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD)
     near.most_hidden, near.held, near.far = most_hidden, begin.held, far.data_ptr()
     near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
     known = [_of_view(view) for view in disks.views]

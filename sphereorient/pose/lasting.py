@@ -62,7 +62,7 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     others = normal.shape[-1] - 6
     turn = [0, 1, 2, *range(6, 6 + others)]
     alone = [part[..., turn] for part in (normal[..., turn, :], right, ridge[..., turn, :])]
-    own = torch.stack([_of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
+    own = torch.stack([of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
     # The cameras share the pose; each has a light and a limb of its own.
     place = torch.zeros(cameras, 6 + cameras * others, 6 + others, dtype=torch.float64)
     for camera in range(cameras):
@@ -70,7 +70,7 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
         place[camera, 6 + camera * others :][:others, 6:] = torch.eye(others)
     joined = (place[:, None] @ normal @ place[:, None].mT).flatten(0, 1)
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
-    together = _of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
+    together = of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
     return Lasting(covariance=together, own_rad2=own)
 
 
@@ -111,7 +111,7 @@ def _by_tile(at: Residuals, precision: Tensor, cameras: int) -> tuple[Tensor, Te
     return normal.double(), right.double(), torch.diag_embed(RIDGE * size)
 
 
-def _of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
+def of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
     """Return the covariance (n, n) of a solution by what leaving out each of T parts changes.
     Normal equations (T, n, n), (T, n) of the parts, and a ridge (n, n) of all.
     """

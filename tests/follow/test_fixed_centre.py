@@ -84,8 +84,8 @@ def test_attitudes_err_with_the_place_as_follows_says():
     class Held:
         radius_mm, optics = RADIUS_MM, SimpleNamespace(fine=None)
 
-        def fit(self, pixels, X, R, use, level, iterations, precision):
-            return held(X, R, precision)
+        def fit(self, pixels, begin, level, iterations):
+            return held(begin.position_lab_mm, begin.R_lab_body, begin.place_precision)
 
     follows = _follows(Held(), pixels, X[0], R, use)
     firm = 1e14 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3)

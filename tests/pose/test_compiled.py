@@ -142,7 +142,7 @@ def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels,
     torch.set_num_threads(3)
     threaded = compiled.refine(pixels, start, model, most_hidden=0.4)
     torch.set_num_threads(threads)
-    plain = built_for(compiled.SOURCE, compiled._Near, "default")
+    plain = built_for(compiled.SOURCE, compiled.Near, "default")
     assert plain is not None
     monkeypatch.setattr(compiled, "library", lambda: plain)
     narrow = compiled.refine(pixels, start, model, most_hidden=0.4)

@@ -11,7 +11,7 @@ from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, re
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.lasting import Lasting, _of_left_out, lasting_errors
+from sphereorient.pose.lasting import Lasting, lasting_errors, of_left_out
 from sphereorient.pose.lights.disk import no_glints
 from sphereorient.pose.poses import FittedPoses, PoseStart
 
@@ -89,7 +89,7 @@ def test_leaving_out_is_fitting_again():
     columns = torch.randn(5, 40, 4, generator=rng, dtype=torch.float64)
     grey = torch.randn(5, 40, generator=rng, dtype=torch.float64)
     columns[3] = 0.0  # a part that shows nothing is none
-    found = _of_left_out(columns.mT @ columns, (columns.mT @ grey[..., None])[..., 0], torch.zeros(4, 4).double())
+    found = of_left_out(columns.mT @ columns, (columns.mT @ grey[..., None])[..., 0], torch.zeros(4, 4).double())
 
     def fitted_without(k: int) -> Tensor:
         rest = [part for part in range(5) if part != k]
