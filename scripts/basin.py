@@ -24,7 +24,9 @@ from sphereorient.locate import screened_frames
 from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
-from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, widest_px
+from sphereorient.pose.fitter import first_fitter
+from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch
 
 REPO = Path(__file__).resolve().parents[1]
@@ -73,7 +75,7 @@ def main() -> None:
             axis = torch.nn.functional.normalize(torch.randn(len(R), 3, generator=generator, dtype=R.dtype), dim=-1)
             at, place = so3.exp(math.radians(angle) * axis) @ R, X
             for name in list(levels)[first:]:
-                fit = fitter.fit(pixels[name], place, at, use, *levels[name])
+                fit = fitter.fit(pixels[name], PoseStart(place, at, use), *levels[name])
                 at, place = fit.R_lab_body, fit.position_lab_mm
             arrived = so3.geodesic_distance(at, R) < math.radians(ARRIVED_DEG)
             cells.append(f"{100 * float(arrived.double().mean()):.0f} %")

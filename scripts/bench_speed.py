@@ -50,7 +50,8 @@ from sphereorient.motion.matern import Prior
 from sphereorient.motion.path import RotationTrack, rotation_of
 from sphereorient.movies import write_ffv1
 from sphereorient.pose import CameraView, base_table, compiled
-from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, widest_px
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment

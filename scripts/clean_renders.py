@@ -23,9 +23,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera, R_cam_view
 from sphereorient.locate import Background
-from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table
-from sphereorient.pose.model import Light
+from sphereorient.pose.camera_view import CameraView, Optics, base_table
+from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.pixels import LinesOfSight
+from sphereorient.pose.poses import PoseStart
 from sphereorient.sphere import Sampling, SphereRenderer, load_texture
 from sphereorient.synth import random_texture
 from sphereorient.tools.design.bound import Bound, cramer_rao_bound
@@ -182,7 +184,7 @@ def refined(texture: Tensor, seen: CleanSet, start: Poses) -> Poses:
         views=[view],
         radius_mm=DIAMETER_MM / 2,
         optics=Optics(base_table(texture, DIAMETER_PX), math.hypot(SIGMA_PX, math.sqrt(1 / 12)), DIAMETER_PX),
-        light=Light.unknown(1, torch.tensor([[noise**2, 0.0, 0.0, 0.0]])),
+        light=DiskLight.unknown(1, torch.tensor([[noise**2, 0.0, 0.0, 0.0]])),
     )
     pose = fitted(fitter, seen, start, coarse=True)
     return fitted(with_light(fitter, seen, pose), seen, pose, coarse=False)
@@ -196,7 +198,7 @@ def fitted(fitter: Fitter, seen: CleanSet, start: Poses, *, coarse: bool) -> Pos
         x, r = start.position_lab_mm[k], start.R_lab_body[k]
         for level, iterations in levels:
             pixels = fitter.pixels([[seen.pictures[i].numpy()] for i in k.tolist()], x, level)
-            fit = fitter.fit(pixels, x, r, torch.ones(len(k), 1, dtype=torch.bool), level, iterations)
+            fit = fitter.fit(pixels, PoseStart(x, r, torch.ones(len(k), 1, dtype=torch.bool)), level, iterations)
             x, r = fit.position_lab_mm, fit.R_lab_body
         X.append(x)
         R.append(r)
@@ -208,7 +210,7 @@ def with_light(fitter: Fitter, seen: CleanSet, pose: Poses) -> Fitter:
     fine, first = fitter.optics.fine, torch.arange(min(16, len(seen.pictures)))
     X, R, use = pose.position_lab_mm[first], pose.R_lab_body[first], torch.ones(len(first), 1, dtype=torch.bool)
     pixels = fitter.pixels([[seen.pictures[i].numpy()] for i in first.tolist()], X, fine)
-    fit = fitter.fit(pixels, X, R, use, fine, 1)
+    fit = fitter.fit(pixels, PoseStart(X, R, use), fine, 1)
     return fitter.with_light_of(pixels, fit, use)
 
 

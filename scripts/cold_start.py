@@ -29,7 +29,8 @@ from sphereorient.locate import Background, Frame
 from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
-from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter
+from sphereorient.pose.camera_view import FIRST_BLUR_PX
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.search import GreySearch
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.scene import seeded

@@ -28,7 +28,8 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter, Optics, base_table
-from sphereorient.pose.fitter import widest_px
+from sphereorient.pose.camera_view import widest_px
+from sphereorient.pose.poses import PoseStart
 
 SCENES = ["occlusion:2", "occlusion:3", "occlusion:4", "occlusion:5", *(f"texture_error:{k}" for k in (3, 4, 5))]
 STEPS = 20  # of the fits: they have arrived
@@ -88,7 +89,7 @@ def error_deg(fitter: Fitter, recording: Recording, path: Path) -> float:
     shots, _ = sample_frames(recording, fitter.views, len(X))
     use: Tensor = torch.ones(len(X), len(fitter.views), dtype=torch.bool)
     pixels = fitter.pixels([[shot.picture for shot in frame] for frame in shots], X, fitter.optics.fine)
-    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, STEPS)
+    fit = fitter.fit(pixels, PoseStart(X, R, use), fitter.optics.fine, STEPS)
     return float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).median())
 
 

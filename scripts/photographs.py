@@ -37,7 +37,7 @@ from sphereorient.mapping.compare import compare_maps
 from sphereorient.mapping.disks import disks_of
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.methods.settings import Settings
-from sphereorient.pose.fitter import widest_px
+from sphereorient.pose.camera_view import widest_px
 from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.scene import make_scene, render_frame, seeded

@@ -20,11 +20,10 @@ from sphereorient.follow.initialise import Initialiser, by_decreasing_size, expl
 from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import SIZES, DisksPx, Fitter, Picture, Shown, Steps, size_steps
+from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
+from sphereorient.pose.fitter import DisksPx, Fitter, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.pose.settle import settled
-from sphereorient.pose.start import NearStart
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.trajectory import Reason
 
 Floats = NDArray[np.float64]
@@ -50,7 +49,7 @@ class _Predicted:
     position_lab_mm: Tensor  # (B, 3)
     R_lab_body: Tensor  # (B, 3, 3)
     precision: Tensor  # (B, 3, 3), mm^-2, of the position
-    start: partial[NearStart]  # of a fit, but for pose and use
+    start: partial[PoseStart]  # of a fit, but for pose and use
     known: Tensor  # (B, C) bool, cameras that saw the ball before
     readable: Tensor  # (B, C) bool
     sees: Tensor  # (B, C) bool, cameras to which other balls leave enough of it
@@ -191,7 +190,7 @@ class BallTracker:
             position_lab_mm=X,
             R_lab_body=R,
             precision=precision,
-            start=partial(NearStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among),
+            start=partial(PoseStart, place_precision=precision, moved=moved, held=self.centre is not None, among=among),
             known=known,
             readable=readable,
             sees=torch.ones_like(known) if visible is None else visible > LEAST_VISIBLE,
@@ -301,7 +300,7 @@ class BallTracker:
         X, R = poses
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
             pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
-            fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
+            fit = self.fitter.fit(pixels.thinned(every), PoseStart(X, R, use, precision), level, iterations)
             X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
             R = torch.where(rough[:, None, None], fit.R_lab_body, R)
         return X, R
@@ -311,7 +310,7 @@ class BallTracker:
     ) -> FittedPoses:
         """Fit poses that are nearly right."""
         begin = there.start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
-        return settled(self.fitter, there.frames, begin, disks_px)
+        return self.fitter.settled(there.frames, begin, disks_px)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
@@ -407,9 +406,8 @@ class BallTracker:
         """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
         X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
-        held = self.centre is not None
-        use = use.expand(count, -1)
-        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use, known, held, among)
+        begin = PoseStart(X, R, use.expand(count, -1), known, held=self.centre is not None, among=among)
+        return self.search.fitter.fit_through(steps, [frames] * count, begin)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""

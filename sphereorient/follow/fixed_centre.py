@@ -11,9 +11,10 @@ from sphereorient import so3
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import best_poses
 from sphereorient.locate import Frame
-from sphereorient.pose.fit import EDGE_PX, FittedPoses
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.residuals import EDGE_PX
 
 ROUNDS = 10  # of robust weights
 USUAL = 2.366  # median of chi squared with three degrees of freedom
@@ -66,7 +67,7 @@ def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], sc
     X, R, use = best_poses([found[k] for k in rows])
     fine = fitter.optics.fine
     pixels = fitter.pixels([[shot.picture for shot in frames[k]] for k in rows], X, fine)
-    fit = fitter.fit(pixels, X, R, use, fine, ITERATIONS)
+    fit = fitter.fit(pixels, PoseStart(X, R, use), fine, ITERATIONS)
     return centre_of(fitter, pixels, fit, use)
 
 
@@ -92,7 +93,7 @@ def follows_place(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use:
 
     def held_at(X: Tensor) -> Tensor:
         there = X.expand(len(R), 3)
-        return fitter.fit(pixels, there, R, use, fitter.optics.fine, ITERATIONS, beyond_doubt).R_lab_body
+        return fitter.fit(pixels, PoseStart(there, R, use, beyond_doubt), fitter.optics.fine, ITERATIONS).R_lab_body
 
     columns = [so3.log(held_at(place + by) @ held_at(place - by).mT).median(0).values for by in aside]
     return torch.stack(columns, dim=1) / (2 * ASIDE * fitter.radius_mm)

@@ -17,8 +17,9 @@ from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
 from sphereorient.locate import Found, Frame, LocateSettings, Positions, ball_at, find_positions, sightings_of
 from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import CameraView, Fitter, Picture
+from sphereorient.pose.camera_view import CameraView, Picture
+from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.search.candidates import Proposer
 from sphereorient.search.normalisation import crop_disk
 from sphereorient.trajectory import Reason
@@ -268,7 +269,7 @@ class Initialiser:
             if level is optics.fine and every == 1 and fitter.light.known:
                 one = fitter.unoccluded(one, X[:1], R[:1])  # by the likeliest pose; the same pixels for all
             pixels = one.where(torch.arange(len(one)).repeat(len(R)))
-            fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
+            fit = fitter.fit(pixels, PoseStart(X, R, use.expand(len(R), -1), held), level, iterations)
             fit = replace(fit, nll=explaining_first(fit, use))
             chosen = distinct_indices(fit.R_lab_body, fit.nll, keep)
             if not len(chosen):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.pose.fit import POSE_PARTS, FittedPoses, blank_parts
+from sphereorient.pose.poses import POSE_PARTS, FittedPoses, blank_parts
 from sphereorient.trajectory import Reason
 
 

@@ -32,7 +32,8 @@ from sphereorient.mapping.growing import GrowingMap, LiveMap
 from sphereorient.mapping.relative import RelativeTracker
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
-from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, widest_px
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.lasting import Lasting
 
 HANDED_RAD = 0.025  # turn from one frame that is handed over to the next

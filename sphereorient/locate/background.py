@@ -55,7 +55,6 @@ class Background:
 
 def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:
     """Return the clipped mean and noise per pixel of evenly spread frames (n, H, W), uint8 or uint16.
-
     Values beyond four robust sigmas are left out: the plain mean (paper, section III A) keeps 1/n of the sphere. With
     `empty` (H, W), the scene without the sphere, only the noise is measured.
     """

@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 from sphereorient.locate.background import Background
 from sphereorient.locate.outline import (
     DIRECTIONS,
-    NEAR_HIDDEN_PX,
-    NOISE_FLOOR,
-    NOISE_STEEPNESS,
     Edges,
     Outline,
+    away_from_hidden,
+    direction_bins,
     edge_points,
+    in_the_clear,
+    least_steepness,
+    stabilised,
     support,
+    window_about,
 )
 from sphereorient.locate.settings import LocateSettings
 
@@ -48,27 +51,19 @@ def find_disks(
     picture: NDArray[np.generic], background: Background, diameters_px: Sequence[float], settings: LocateSettings
 ) -> list[Outline]:
     """Return the disks in a picture (H, W) of about the expected diameters, px, one a sphere; most rim first.
-
     Every edge votes for the middles of disks of which it may be the rim: along the inward gradient, one radius away.
     `rms_px` is the standard error of the middle, which is larger where only an arc of the rim shows; `coverage` the
     share of all directions with an edge on the rim. There may be more disks than spheres.
     """
     difference = background.difference(picture)
     noise = background.typical_noise
-    lift = NOISE_FLOOR * noise
-    root = np.sqrt(cv2.GaussianBlur(difference, (0, 0), settings.edge_blur_px) + lift) - np.float32(np.sqrt(lift))
+    root = stabilised(difference, noise, settings)
     full = (difference > settings.noise_factor * background.noise).view(np.uint8)
     lit = root[::2, ::2][full[::2, ::2] > 0]
     if not lit.size:
         return []
-    floor = NOISE_STEEPNESS * noise**0.5
-    steepness = max(settings.edge_fraction * float(np.percentile(lit, 90)) / (settings.edge_blur_px * 2.5), floor)
-    edges = edge_points(root, steepness)
-    if background.shown is not None:
-        square = np.ones((2 * NEAR_HIDDEN_PX + 1,) * 2, np.uint8)
-        clear = cv2.erode(background.shown.view(np.uint8), square) > 0
-        column, row = edges.point.astype(np.int64).T
-        edges = edges.where(clear[row, column])
+    edges = edge_points(root, least_steepness(float(np.percentile(lit, 90)), noise, settings)[0])
+    edges = edges.where(in_the_clear(edges.point, away_from_hidden(background.shown, picture.shape)))
     side = max(3, round(min(diameters_px) / 2) | 1)
     column, row = edges.point.astype(np.int64).T
     edges = edges.where(cv2.boxFilter(full, cv2.CV_32F, (side, side))[row, column] > LEAST_BESIDE)
@@ -172,14 +167,10 @@ def _fitted(edges: Edges, voted: Circle, least_px: float) -> Outline | None:
 
 def _outermost(outward: Points, offset: Points) -> NDArray[np.int64]:
     """Return the index of the outermost edge of each direction that has one: the paint's own edges lie further in."""
-    direction = _direction(outward)
+    direction = direction_bins(*outward.T)
     order = np.lexsort((offset, direction))
     last = np.append(direction[order][1:] != direction[order][:-1], True)
     return np.asarray(order[last])
-
-
-def _direction(outward: Points) -> NDArray[np.int64]:
-    return ((np.arctan2(outward[:, 1], outward[:, 0]) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
 
 
 def _square_share(full: NDArray[np.uint8], shown: NDArray[np.bool_] | None, circles: Points) -> Points:
@@ -201,11 +192,9 @@ def _square_share(full: NDArray[np.uint8], shown: NDArray[np.bool_] | None, circ
 def _full_share(full: NDArray[np.uint8], shown: NDArray[np.bool_] | None, circle: Circle) -> float:
     """Return the share of a circle's pixels in the picture that differ from the background."""
     u, v, radius = circle.tolist()
-    reach = int(radius) + 1
-    left, top = max(0, int(u) - reach), max(0, int(v) - reach)
-    window = np.s_[top : max(0, int(v) + reach + 1), left : max(0, int(u) + reach + 1)]
+    window = window_about(u, v, int(radius) + 1)
     row, column = np.ogrid[: full[window].shape[0], : full[window].shape[1]]
-    inside = (row + top - v) ** 2 + (column + left - u) ** 2 < (0.95 * radius) ** 2
+    inside = (row + window[0].start - v) ** 2 + (column + window[1].start - u) ** 2 < (0.95 * radius) ** 2
     if shown is not None:
         inside = inside & shown[window]
     return float(full[window][inside].mean()) if inside.any() else 0.0

@@ -36,22 +36,17 @@ class Blob:
 
 def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     """Average by an integer factor, cropping right and lower borders (other ratios are 40 times slower)."""
-    height, width = (side // factor * factor for side in picture.shape)
-    if factor == 1:
-        return picture
-    return np.asarray(
-        cv2.resize(picture[:height, :width], (width // factor, height // factor), interpolation=cv2.INTER_AREA)
-    )
+    height, width = (side // factor for side in picture.shape)
+    whole = picture[: height * factor, : width * factor]
+    return picture if factor == 1 else np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def find_blobs(
     difference: NDArray[np.float32], noise: NDArray[np.float32], diameter_px: float, settings: LocateSettings
 ) -> list[Blob]:
     """Return at most `settings.blob_candidates` round blobs of about `diameter_px`, best first.
-
     `difference` is |frame - background|, `noise` the background's sigma, (H, W), grey levels. The blob filter is a
     difference of two box filters.
-
     Source: paper section III A.
     """
     factor = settings.reduction
@@ -76,7 +71,7 @@ def find_blobs(
             break
         u, v, merit = _judge(small, float(column), float(row), size / 2)
         blobs.append(Blob(u_px=(u + 0.5) * factor - 0.5, v_px=(v + 0.5) * factor - 0.5, merit=merit))
-        response[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 0
+        response[window_about(float(column), float(row), reach)] = 0
     return sorted(blobs, key=lambda blob: -blob.merit)
 
 
@@ -84,11 +79,11 @@ def _judge(small: NDArray[np.float32], u: float, v: float, radius: float) -> tup
     """Centre a blob on its foreground; return (u, v, merit)."""
     merit = 0.0
     for _ in range(2):
-        reach = int(np.ceil(1.5 * radius))
-        top, left = max(0, int(v) - reach), max(0, int(u) - reach)
-        window = small[top : int(v) + reach + 1, left : int(u) + reach + 1]
-        grid = np.indices(window.shape, dtype=np.float32)
-        rows, columns = grid[0] + top, grid[1] + left
+        around = window_about(u, v, int(np.ceil(1.5 * radius)))
+        window = small[around]
+        rows, columns = (
+            grid + at.start for grid, at in zip(np.indices(window.shape, dtype=np.float32), around, strict=True)
+        )
         inside = (rows - v) ** 2 + (columns - u) ** 2 <= (1.1 * radius) ** 2
         weight = (window > 0) & inside
         total, count = int(np.count_nonzero(window)), int(np.count_nonzero(weight))
@@ -140,7 +135,40 @@ def edge_points(window: NDArray[np.float32], steepness: float) -> Edges:
     return Edges(point=point, inward=gradient[keep] / norm[keep])
 
 
-def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def window_about(u: float, v: float, reach: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a picture within `reach` of a place, px."""
+    rows, columns = (slice(max(0, int(at) - reach), max(0, int(at) + reach + 1)) for at in (v, u))
+    return rows, columns
+
+
+def direction_bins(across: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return in which of `DIRECTIONS` bins vectors point, (n,)."""
+    return ((np.arctan2(down, across) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
+
+
+def stabilised(difference: NDArray[np.float32], noise: float, settings: LocateSettings) -> NDArray[np.float32]:
+    """Return the root of a blurred difference: the variance of shot noise is even, dim and bright rims count alike."""
+    lift = NOISE_FLOOR * noise
+    blurred = cv2.GaussianBlur(difference, (0, 0), settings.edge_blur_px)
+    return np.asarray(np.sqrt(blurred + lift) - np.float32(np.sqrt(lift)), np.float32)
+
+
+def least_steepness(contrast: float, noise: float, settings: LocateSettings) -> tuple[float, float]:
+    """Return the least steepness of an edge in a stabilised picture, and the floor that excludes noise."""
+    floor = NOISE_STEEPNESS * noise**0.5
+    # A step blurred by sigma has steepness contrast / (sigma sqrt(2 pi)).
+    return max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor), floor
+
+
+def away_from_hidden(shown: NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return where in a picture, or a window, edges are not those of a mask, (H, W)."""
+    if shown is None:
+        return np.ones(shape, bool)
+    square = np.ones((2 * NEAR_HIDDEN_PX + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(shown.astype(np.uint8), square) > 0)
+
+
+def in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which points (n, 2), window px, are away from the mask, (n,)."""
     limit = np.array(clear.shape[::-1]) - 1
     u, v = np.rint(place).astype(np.int64).clip(0, limit).T
@@ -151,7 +179,7 @@ def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_]) -> 
     """Return the number of directions in which the rim is away from the mask."""
     angle = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
     rim = circle[:2] + circle[2] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return max(float(_in_the_clear(rim, clear).sum()), LEAST_RIM * DIRECTIONS)
+    return max(float(in_the_clear(rim, clear).sum()), LEAST_RIM * DIRECTIONS)
 
 
 def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,8 +203,7 @@ def support(circles: NDArray[np.float64], edges: Edges, tolerance: float) -> NDA
     across, down, distance, offset = (part[near] for part in (across, down, distance, offset))
     inward = edges.inward[edge]
     radial = -(across * inward[:, 0] + down * inward[:, 1]) / np.maximum(distance, 1e-9) > 0.8
-    direction = ((np.arctan2(down, across) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
-    row = circle * DIRECTIONS + direction
+    row = circle * DIRECTIONS + direction_bins(across, down)
     counted = [
         np.bincount(row[radial & which], minlength=len(circles) * DIRECTIONS).reshape(-1, DIRECTIONS) > 0
         for which in (offset < tolerance, (offset >= tolerance) & (offset < 0.25 * circles[circle, 2]))
@@ -255,13 +282,8 @@ def _radial_edges(
     angle = np.arange(PROFILES) * (2 * np.pi / PROFILES)
     outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     at = circle[:2] + outward[:, None] * (circle[2] + offset)[None, :, None]
-    profile = cv2.remap(
-        window,
-        at[..., 0].astype(np.float32),
-        at[..., 1].astype(np.float32),
-        cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    right, down = at.astype(np.float32).transpose(2, 0, 1)
+    profile = cv2.remap(window, right, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     fall = np.asarray(cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step), np.float32)
     # Maximum within 1 px: interpolation ripples the tail of the blurred rim.
     peak = (fall >= cv2.dilate(fall, np.ones((1, 5), np.uint8))) & (fall > steepness)
@@ -273,7 +295,7 @@ def _radial_edges(
     bend = left - 2 * middle + right
     limit = np.array(window.shape[::-1]) - 1
     keep = peak.any(1) & (bend < 0) & ((at[:, -1] >= 0) & (at[:, -1] <= limit)).all(1)
-    keep &= _in_the_clear(at[rows, last + 1], clear)
+    keep &= in_the_clear(at[rows, last + 1], clear)
     shift = 0.5 * (left - right)[keep] / bend[keep]
     return outward[keep], offset[last[keep] + 1] + shift * step, middle[keep]
 
@@ -328,9 +350,7 @@ def _fit_circle(
     ellipse = np.column_stack([design, outward[:, 0] ** 2 - outward[:, 1] ** 2, 2 * outward[:, 0] * outward[:, 1]])
     wider = np.linalg.lstsq(ellipse * root[:, None], offset * root, rcond=None)[0][3]
     rms = float(np.sqrt((residual[used] ** 2).mean()))
-    angle = np.arctan2(outward[used, 1], outward[used, 0])
-    direction = ((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
-    coverage = min(len(np.unique(direction)) / _rim_in_the_clear(circle, clear), 1.0)
+    coverage = min(len(np.unique(direction_bins(*outward[used].T))) / _rim_in_the_clear(circle, clear), 1.0)
     return Outline(
         u_px=float(circle[0]),
         v_px=float(circle[1]),
@@ -352,31 +372,20 @@ def fit_outline(
 ) -> Outline | None:
     """Return the outline near a blob, picture px; None if no circle of an allowed size is supported. The fewer edges
     support a circle, the better they must fit: those of paint and of glints at the border scatter.
-
     `difference` (H, W) is |frame - background| and `noise` its sigma, grey levels; `shown` (H, W) is False where
     something hides the sphere. Robust to texture edges, bubbles and black paint on a dark background.
-
     Source: paper section III A (Canny edges, circle fit); the robust part is ours.
     """
     reach = int(np.ceil(0.5 * diameter_px * (1 + settings.diameter_tolerance) + 8))
-    left, top = max(0, int(blob.u_px) - reach), max(0, int(blob.v_px) - reach)
-    around = np.s_[top : int(blob.v_px) + reach + 1, left : int(blob.u_px) + reach + 1]
+    around = window_about(blob.u_px, blob.v_px, reach)
     window = difference[around]
-    clear = np.ones(window.shape, bool)
-    if shown is not None:
-        square = np.ones((2 * NEAR_HIDDEN_PX + 1,) * 2, np.uint8)
-        clear = cv2.erode(shown[around].astype(np.uint8), square) > 0
     if min(window.shape) < 8:
         return None
-    # The root stabilises the variance of shot noise, so that dim and bright rims count alike.
-    lift = NOISE_FLOOR * noise
-    window = np.sqrt(cv2.GaussianBlur(window, (0, 0), settings.edge_blur_px) + lift) - np.float32(np.sqrt(lift))
-    contrast = float(np.percentile(window, 90))
-    # A step blurred by sigma has steepness contrast / (sigma sqrt(2 pi)); the floor excludes noise.
-    floor = NOISE_STEEPNESS * noise**0.5
-    steepness = max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor)
+    clear = away_from_hidden(None if shown is None else shown[around], window.shape)
+    window = stabilised(window, noise, settings)
+    steepness, floor = least_steepness(float(np.percentile(window, 90)), noise, settings)
     edges = edge_points(window, steepness)
-    edges = edges.where(_in_the_clear(edges.point, clear))
+    edges = edges.where(in_the_clear(edges.point, clear))
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
     circle, painted = _ball_circle(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px)
     if circle is None:
@@ -389,4 +398,5 @@ def fit_outline(
         return None
     if fit.rms_px > ROUGH * settings.edge_tolerance_px * fit.coverage * max(fit.coverage, SHORT):
         return None
+    top, left = (at.start for at in around)
     return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top, painted=painted)

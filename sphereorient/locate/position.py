@@ -38,13 +38,11 @@ def find_positions(
     sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
 ) -> Positions:
     """Return the sphere's positions in N frames from the outlines of the cameras; in radii without a diameter.
-
     Lines of sight count by the covariance of the centres. With one outline the distance comes from its radius: flag
     `ONE_CAMERA`.
 
     Raises:
         ExperimentError: several cameras and an unknown diameter.
-
     Source: paper section III A (triangulation).
     """
     if diameter_mm is None and len(sightings) > 1:

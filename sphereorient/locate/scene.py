@@ -111,7 +111,6 @@ def learn_background(
     shown: NDArray[np.bool_] | None = None,
 ) -> Background:
     """Estimate the background of frames (n, H, W): average, find the spheres, measure their pixels from other frames.
-
     `diameter_px` is that of the sphere, or those of all. With `empty` (H, W), a given background, only the noise is
     measured. `shown` is False where the sphere is hidden.
     """
@@ -180,9 +179,7 @@ def fixed_ball(
     shown: NDArray[np.bool_] | None = None,
 ) -> tuple[Outline, Background]:
     """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
-
     Return its outline, and the background with a guess behind it.
-
     `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere.
 
     Raises:
@@ -212,9 +209,8 @@ def fixed_ball(
 
 
 def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
-    if hidden:
-        return 2 * float(cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1])
-    return 2 * float(np.sqrt(inside.sum() / np.pi))
+    around = cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1] if hidden else np.sqrt(inside.sum() / np.pi)
+    return 2 * float(around)
 
 
 def _around(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.locate.background import Background
-from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
+from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline, window_about
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.trajectory import Flag, Reason
 
@@ -67,7 +67,6 @@ def find_ball(
     frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
 ) -> Found:
     """Return the outline in a frame (H, W) and `OK`, or None and `NOT_FOUND`, `OUTLINE`, `DARK` or `SATURATED`.
-
     Source: paper section III A.
     """
     difference = background.difference(frame)
@@ -101,20 +100,16 @@ def ball_at(
     if best is None or best.coverage < settings.coverage_min:
         if not blobs or blobs[0].merit <= 0:
             return None, Reason.NOT_FOUND
-        around = _square(int(blobs[0].u_px), int(blobs[0].v_px), 0.5 * diameter_px)
+        around = window_about(blobs[0].u_px, blobs[0].v_px, int(0.5 * diameter_px))
         return None, Reason.DARK if np.percentile(difference[around], 90) < contrast_min else Reason.OUTLINE
     height, width = frame.shape
     u, v = min(max(round(best.u_px), 0), width - 1), min(max(round(best.v_px), 0), height - 1)
-    inside = _square(u, v, 0.7 * best.radius_px)
+    inside = window_about(u, v, int(0.7 * best.radius_px))
     if np.percentile(difference[inside], 90) < contrast_min:
         return None, Reason.DARK
     if np.mean(frame[inside] >= background.full_scale) > settings.saturated_share:  # type: ignore[operator]
         return None, Reason.SATURATED
     return best, Reason.OK
-
-
-def _square(u: int, v: int, half: float) -> tuple[slice, slice]:
-    return slice(max(0, v - int(half)), v + int(half) + 1), slice(max(0, u - int(half)), u + int(half) + 1)
 
 
 def sightings_of(found: Iterable[Found]) -> Sightings:
@@ -137,7 +132,6 @@ def sightings_of(found: Iterable[Found]) -> Sightings:
 
 def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
     """Replace outliers by a least-squares spline and fill short gaps, with flags and without rms; longer gaps stay NaN.
-
     Source: paper section III A.
     """
     track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
@@ -153,19 +147,11 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
         if len(missing):
             track[missing] = PchipInterpolator(known, track[known], axis=0)(missing)
             flags[missing] |= int(Flag.POSITION_INTERPOLATED)
-    reason = tuple(
-        Reason.OUTLINE if flags[k] & int(Flag.POSITION_OUTLIER_REPLACED) else reason
-        for k, reason in enumerate(sightings.reason)
-    )
-    return replace(
-        sightings,
-        centre_px=torch.from_numpy(track[:, :2].copy()),
-        radius_px=torch.from_numpy(track[:, 2].copy()),
-        outline_rms_px=rms,
-        covariance_px2=covariance,
-        flags=flags,
-        reason=reason,
-    )
+    replaced = (flags & int(Flag.POSITION_OUTLIER_REPLACED)).tolist()
+    reason = tuple(Reason.OUTLINE if now else why for now, why in zip(replaced, sightings.reason, strict=True))
+    centre_px, radius_px = (torch.from_numpy(part.copy()) for part in (track[:, :2], track[:, 2]))
+    places = replace(sightings, centre_px=centre_px, radius_px=radius_px)
+    return replace(places, outline_rms_px=rms, covariance_px2=covariance, flags=flags, reason=reason)
 
 
 def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:

@@ -19,7 +19,7 @@ from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import CameraScene, find_scenes
 from sphereorient.mapping.disks import Crop, Crops, cut_crop
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.camera_view import CameraView
 
 FREE = 1.1  # sums of two radii: disks that are nearer than this are not used
 AWAY = 0.1  # of the radius, for each frame since it was seen: how far a sphere may be from where it is expected

@@ -23,7 +23,8 @@ from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, f
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fitter import CameraView, Fitter
+from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels, stacked
 from sphereorient.search.normalisation import Blur, crop_disk, rim_share
 from sphereorient.sphere.view import perspective_view
@@ -202,7 +203,7 @@ def pixels_of(crops: Crops, fitter: Fitter, frames: Tensor, wanted: int, extra_p
     """Return about `wanted` pixels of each disk, after a blur of the picture by `extra_px`."""
     level = replace(fitter.optics.fine, extra_px=extra_px)
     X = crops.position_lab_mm[frames]
-    radius_px = float(fitter.largest_px(X).max())
+    radius_px = float(fitter.disks_px(X).largest_px.max())
     parts = []
     for k in range(len(frames)):
         whole = fitter.pixels(crops.pictures(frames[k : k + 1]), X[k : k + 1], level, radius_px)

@@ -29,9 +29,11 @@ from sphereorient.mapping.iterations import (
 )
 from sphereorient.mapping.learn import final_map, interpolated
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fitter import Fitter, Optics
+from sphereorient.pose.camera_view import Optics
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.pixels import Pixels, stacked
+from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch
 from sphereorient.sphere.texture_table import texture_table
 
@@ -203,7 +205,7 @@ class GrowingMap:
         fitter, level, R_aligned = appearance.fitter, appearance.fitter.optics.fine, self._R_aligned(learnt)[rows]
         new = self._of(rows, R_aligned, learnt.state)
         held = self._found.centre.precision.expand(len(rows), 3, 3)
-        fit = fitter.fit(new.pixels, new.position_lab_mm, R_aligned, new.use, level, FITTED, held)
+        fit = fitter.fit(new.pixels, PoseStart(new.position_lab_mm, R_aligned, new.use, held), level, FITTED)
         good = ((fit.score > appearance.score_min) | ~new.use).all(1)
         new = replace(new, R_lab_body=torch.where(good[:, None, None], fit.R_lab_body, R_aligned))
         self._learnt = replace(
@@ -327,8 +329,8 @@ def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool
     """
     fitter = replace(state.fitter, optics=optics)
     X, use = state.position_lab_mm, state.use
-    fit = fitter.fit(state.pixels, X, state.R_lab_body, use, optics.fine, FITTED)
-    fitter = replace(fitter, widest_px=WIDER * float(fitter.largest_px(X).max()))
+    fit = fitter.fit(state.pixels, PoseStart(X, state.R_lab_body, use), optics.fine, FITTED)
+    fitter = replace(fitter, widest_px=WIDER * float(fitter.disks_px(X).largest_px.max()))
     right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
     appearance = Appearance(
         fitter=fitter,
@@ -345,5 +347,6 @@ def _wrong_score(fitter: Fitter, state: State) -> float:
     rows = evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES)
     turns = so3.random_rotations(len(rows), generator=torch.Generator().manual_seed(0))
     fine = fitter.optics.fine
-    fit = fitter.fit(state.disks(rows), state.position_lab_mm[rows], turns, state.use[rows], fine, WRONG_ITERATIONS)
+    begin = PoseStart(state.position_lab_mm[rows], turns, state.use[rows])
+    fit = fitter.fit(state.disks(rows), begin, fine, WRONG_ITERATIONS)
     return float(fit.score[state.use[rows]].quantile(0.9))

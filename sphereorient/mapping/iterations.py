@@ -32,11 +32,14 @@ from sphereorient.mapping.grid import (
 from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_columns, light_sums, noise_curves, solved_light
-from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, first_fitter, widest_px
-from sphereorient.pose.lab_light import LabLight
-from sphereorient.pose.model import Light, light_basis, no_glints, no_stray
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics, widest_px
+from sphereorient.pose.fitter import Fitter, first_fitter
+from sphereorient.pose.lights.common import noise_curves
+from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
+from sphereorient.pose.lights.kinds import lit_in_the_lab
+from sphereorient.pose.model import no_stray
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
 
@@ -182,7 +185,7 @@ def iterating(state: State, settings: MapSettings, k: int) -> Generator[None, No
         state, _ = fitted(state, 3 if k == 0 else 2)
     if k < LIGHT_ITERATIONS:
         state = _with_light(state)
-    elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and isinstance(state.fitter.light, LabLight)):
+    elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and not state.fitter.light.linear):
         state = _lit_in_the_lab(state)
     yield
     if k >= SEPARATE_ITERATIONS:
@@ -215,7 +218,7 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
         if crops is not None:
             pixels = fitter.pixels(crops.pictures(state.frames[rows]), X, fine)
         precision = None if held is None else held.expand(len(rows), 3, 3)
-        return fitter.fit(pixels, X, R, use, fine, iterations, precision)
+        return fitter.fit(pixels, PoseStart(X, R, use, precision), fine, iterations)
 
     parts = list(side_by_side(one, state.batches()))
     fit = FittedPoses(**{name: torch.cat([getattr(part, name) for part in parts]) for name in POSE_PARTS})
@@ -241,7 +244,7 @@ def _with_light(state: State) -> State:
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
     noise = noise_curves(model, residual, inside, cameras)
     none = {"glints": no_glints(cameras), "stray": no_stray(cameras)}
-    light = Light(difference=difference, black=black, noise=noise, **none, known=True)
+    light = DiskLight(difference=difference, black=black, noise=noise, **none, known=True)
     return replace(state, fitter=replace(state.fitter, light=light))
 
 
@@ -251,11 +254,11 @@ def _lit_in_the_lab(state: State) -> State:
     fitter = state.map_fitter()
     X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
     pixels = state.disks(rows)
-    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 1)
-    if isinstance(fitter.light, LabLight):  # known to be better
-        lit = fitter.lit_again(pixels, fit, use)
-    else:
-        lit = fitter.lit_in_the_lab(pixels, fit, use)[0]
+    fit = fitter.fit(pixels, PoseStart(X, R, use), fitter.optics.fine, 1)
+    if fitter.light.linear:
+        lit = lit_in_the_lab(fitter, pixels, fit, use)[0]
+    else:  # known to be better
+        lit = fitter.with_light_of(pixels, fit, use)
     return replace(state, fitter=replace(state.fitter, light=lit.light))
 
 
@@ -266,7 +269,7 @@ def _rescaled(state: State) -> State:
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
     light = state.fitter.light
-    if isinstance(light, Light | LabLight) and light.known:  # the light takes over the factor, so no picture changes
+    if light.known:  # the light takes over the factor, so no picture changes
         light = replace(light, difference=light.difference * step, black=light.black + light.difference * low)
     return replace(state, texture=(state.texture - low) / step, fitter=replace(state.fitter, light=light))
 

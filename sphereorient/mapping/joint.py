@@ -69,8 +69,8 @@ def linearise(
     The light of each frame is at its best; the fitter gives views and light, not the map. Pixels of paint that the
     table marks as unseen have no weight.
     """
-    model = replace(fitter.model(fitter.optics.fine), paint=paint, blur_px=blur_px)
-    at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
+    model = replace(fitter.model(), paint=paint, blur_px=blur_px)
+    at = residuals(pixels, position_lab_mm, R_lab_body, None, model)
     return Linearisation(**vars(at), reads=paint.reads, inner=pixels.inner)
 
 

@@ -36,10 +36,10 @@ from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.verdict import jumps, paint_correlation
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
-from sphereorient.pose.lab_light import light_of, light_parts
-from sphereorient.pose.model import Lighting
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, widest_px
+from sphereorient.pose.lights.kinds import light_of
+from sphereorient.pose.model import Light
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.sphere.texture import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
@@ -76,7 +76,7 @@ class LearntMap:
     paint: Tensor  # (N, C), correlation with the paint in pictures held out of the map for it; NaN elsewhere
     jumps: Tensor  # (J,) int64, frames from which the ball turns unlike before and after
     views: Sequence[CameraView]  # with the scenes without the ball
-    light: Lighting
+    light: Light
     blur_px: float  # estimated with the map
     closure: Closure
     rounds: tuple[Iteration, ...]
@@ -148,7 +148,7 @@ def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, 
     numbers = {"closure": closure, "blur_px": state.blur_px, "done": iterations}
     parts = {"place": start.crops.position_lab_mm, "frames": start.frames, "rows": start.rows, "known": light.known}
     parts |= {"chain_rows": chain.rows, "chain": chain.R_lab_body, "first_map": start.state.texture}
-    parts |= {name: getattr(state, name) for name in STATE_PARTS} | light_parts(light)
+    parts |= {name: getattr(state, name) for name in STATE_PARTS} | light.parts()
     parts |= {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
     return {name: torch.as_tensor(part) for name, part in parts.items()}
 
@@ -302,7 +302,7 @@ def recovered(crops: Crops, state: State, chain: Tensor) -> State:
     fitter = state.map_fitter()
     optics = fitter.optics
     steps = [(level, 1, RECOVERY_ITERATIONS) for level in (optics.coarse, optics.middle, optics.fine)]
-    fit = fitter.fit_through(steps, crops.pictures(state.frames[lost]), X, R, use, held=state.fixed)
+    fit = fitter.fit_through(steps, crops.pictures(state.frames[lost]), PoseStart(X, R, use, held=state.fixed))
     R, X = fit.R_lab_body, X if state.fixed else fit.position_lab_mm
     better = _scores(fit, use) > score[lost]
     rows = (lost[better],)

@@ -14,7 +14,7 @@ from sphereorient.mapping.chain import EVERY, ITERATIONS, OVERLAP_MIN, SCALE_RAD
 from sphereorient.mapping.disks import Crop, Crops, Disks, disks_of, reduced
 from sphereorient.mapping.pairs import RelativeRotations, refine_pairs, search_pairs
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fit import blank_parts
+from sphereorient.pose.poses import blank_parts
 from sphereorient.trajectory import Reason
 
 NEAREST = 3  # keyframes that a picture is compared with, beside the one before

@@ -24,9 +24,9 @@ from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
 from sphereorient.pose import CameraView, Fitter, Optics
-from sphereorient.pose.lab_light import light_of, light_parts
 from sphereorient.pose.lasting import Lasting
-from sphereorient.pose.model import Lighting
+from sphereorient.pose.lights.kinds import light_of
+from sphereorient.pose.model import Light
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.trajectory import SPHERES
@@ -43,7 +43,7 @@ class Learnt:
     """Everything that the precise method learns from the movies, before and after tracking; made by the pipeline."""
 
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
-    light: Lighting
+    light: Light
     limb_px: torch.Tensor | None  # (C,), see `SphereModel`; None: of an older version
     lasting: Lasting
     blur_px: float
@@ -231,7 +231,7 @@ def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
         file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
-    for part, values in light_parts(learnt.light).items():
+    for part, values in learnt.light.parts().items():
         light.create_dataset(part, data=values.numpy(), track_times=False)
     if learnt.limb_px is not None:
         file.create_dataset("limb_px", data=learnt.limb_px.numpy(), track_times=False)

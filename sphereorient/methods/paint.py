@@ -23,7 +23,8 @@ from sphereorient.methods.proposers import BlurMatchedSearch, finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView
 from sphereorient.pose.blur import estimate_blur_px
-from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, defocus_radii
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.neighbours import spoilt
 from sphereorient.sphere.texture_table import TextureTable
 

@@ -14,7 +14,7 @@ from sphereorient.cameras import Camera
 from sphereorient.files.cache import cached
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
-from sphereorient.pose.fitter import defocus_radii
+from sphereorient.pose.camera_view import defocus_radii
 from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateBank
 from sphereorient.search.settings import GreySearchSettings, ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable

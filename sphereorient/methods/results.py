@@ -17,7 +17,7 @@ from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
-from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance

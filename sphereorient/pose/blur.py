@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.locate.outline import Outline
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import FINEST_PX, Fitter, level_of, widest_px
+from sphereorient.pose.camera_view import FINEST_PX, level_of, widest_px
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
 from sphereorient.sphere.texture_table import TextureTable
 
 CALM_PX = 1.0  # blur that is laid over pictures first, against noise

@@ -1,5 +1,4 @@
 """A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
-
 At the minimum of sum r(pose, theta)^2 / 2 the gradient g is 0, so that d pose / d theta = -H^-1 dg/dtheta with H =
 dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H^-1 g with H constant. The fit of
 `track` cannot serve: it holds weights, light and slopes fixed, in single precision.
@@ -73,20 +72,7 @@ def implicit_pose(
 
     with torch.no_grad():
         R, X = _levenberg_marquardt(counted, R, X, iterations)
-    still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
-
-    def about(delta: Tensor) -> Tensor:
-        return counted(*_moved(R, X, delta))
-
-    slope = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())
-    gradient = slope(still)
-    with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
-        columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
-        curvature = columns.movedim(0, -1)
-        rounding = 10 * torch.finfo(curvature.dtype).eps
-        # Undetermined directions become 0.
-        inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
-    step = -(inverse @ gradient[..., None])[..., 0]
+    step = _newton_step(lambda delta: counted(*moved_by(R, X, delta)), torch.zeros_like(X).repeat(1, 2))
     arrived = known & (step[:, :3].norm(dim=-1) < ARRIVED_RAD) & (step[:, 3:].norm(dim=-1) < ARRIVED_MM)
     step = torch.where(arrived[:, None], step, 0.0)
     R_fitted, X_fitted = so3.exp(step[:, :3]) @ R, X + step[:, 3:]
@@ -99,17 +85,31 @@ def implicit_pose(
     )
 
 
+def _newton_step(residuals: Callable[[Tensor], Tensor], still: Tensor) -> Tensor:
+    """Return the step (B, 6) from no change, `still`, to the minimum; differentiable, with a constant Hessian."""
+    slope = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
+    gradient = slope(still)
+    with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
+        columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
+        curvature = columns.movedim(0, -1)
+        rounding = 10 * torch.finfo(curvature.dtype).eps
+        # Undetermined directions become 0.
+        inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
+    step: Tensor = -(inverse @ gradient[..., None])[..., 0]
+    return step
+
+
 def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step makes one worse."""
     damping = torch.full_like(X[:, 0], START_DAMPING)
-    still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
+    still = torch.zeros_like(X).repeat(1, 2)
     for _ in range(iterations):
-        r, slopes = _linearised(lambda delta, R=R, X=X: residual(*_moved(R, X, delta)), still)  # type: ignore[misc]
+        r, slopes = _linearised(lambda delta, R=R, X=X: residual(*moved_by(R, X, delta)), still)  # type: ignore[misc]
         normal, pull = slopes @ slopes.mT, (slopes @ r[..., None])[..., 0]
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         floor = damping[:, None] * diagonal + FLAT  # a flat direction gets no step
         step: Tensor = torch.linalg.solve_ex(normal + torch.diag_embed(floor), -pull[..., None]).result[..., 0]
-        R_next, X_next = _moved(R, X, step)
+        R_next, X_next = moved_by(R, X, step)
         # Near the minimum sums of squares differ by rounding only.
         slack = 1.0 + 8.0 * torch.finfo(X.dtype).eps
         better = residual(R_next, X_next).square().sum(-1) <= r.square().sum(-1) * slack
@@ -118,7 +118,7 @@ def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: i
     return so3.nearest_rotation(R), X
 
 
-def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
+def moved_by(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
     """Apply small errors (B, 6), rad and mm, lab, from the left, to poses; Cayley's rotation is smooth at 0."""
     half = so3.hat(0.5 * delta[..., :3])
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))

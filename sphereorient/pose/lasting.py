@@ -1,5 +1,4 @@
 """Errors that last over frames: what light and map leave in the same place of every picture.
-
 The fit's covariance holds what differs from frame to frame. A path through all frames averages that away; these stay.
 """
 
@@ -9,10 +8,11 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import RIDGE, FittedPoses, light_columns, settled
+from sphereorient.pose.lights.disk import RIDGE, light_columns
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.residuals import Residuals, by_pose
+from sphereorient.pose.poses import FittedPoses
+from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
 from sphereorient.so3 import solve_damped
 from sphereorient.trajectory import Trajectory
 
@@ -58,12 +58,12 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     cameras = use.shape[1]
-    at = settled(pixels, fit, model, cameras)
+    at = fitted_residuals(pixels, fit, model)
     normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), cameras)
     others = normal.shape[-1] - 6
     turn = [0, 1, 2, *range(6, 6 + others)]
     alone = [part[..., turn] for part in (normal[..., turn, :], right, ridge[..., turn, :])]
-    own = torch.stack([_of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
+    own = torch.stack([of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
     # The cameras share the pose; each has a light and a limb of its own.
     place = torch.zeros(cameras, 6 + cameras * others, 6 + others, dtype=torch.float64)
     for camera in range(cameras):
@@ -71,7 +71,7 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
         place[camera, 6 + camera * others :][:others, 6:] = torch.eye(others)
     joined = (place[:, None] @ normal @ place[:, None].mT).flatten(0, 1)
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
-    together = _of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
+    together = of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
     return Lasting(covariance=together, own_rad2=own)
 
 
@@ -130,7 +130,7 @@ def _by_tile(at: Residuals, precision: Tensor, cameras: int) -> tuple[Tensor, Te
     return normal.double(), right.double(), torch.diag_embed(RIDGE * size)
 
 
-def _of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
+def of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
     """Return the covariance (n, n) of a solution by what leaving out each of T parts changes.
     Normal equations (T, n, n), (T, n) of the parts, and a ridge (n, n) of all.
     """

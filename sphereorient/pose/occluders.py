@@ -1,7 +1,5 @@
 """What covers the sphere (bubbles, specks, a rod, an unknown glint): connected residuals, whose pixels are not used."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import torch
@@ -10,6 +8,7 @@ from torch import Tensor
 
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import PoseStart
 from sphereorient.pose.residuals import noise_variance, residuals, robust_deviation
 
 Floats = NDArray[np.float32]
@@ -49,12 +48,12 @@ def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, m
     return hidden & (share <= most)[:, None]
 
 
-def unoccluded(pixels: Pixels, X: Tensor, R: Tensor, model: SphereModel, cameras: int, most: float) -> Pixels:
-    """Return the pixels of B * C disks without those of occluders, by poses X (B, 3), mm, R_lab_body R (B, 3, 3)."""
-    at = residuals(pixels, X, R, None, model, cameras)
+def kept(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
+    """Return the places of B * C disks that count, (B * C, P) bool, without those of occluders by the poses given."""
+    at = residuals(pixels, begin.position_lab_mm.double(), begin.R_lab_body.double(), None, model)
     counted = at.inside & ~pixels.clipped
-    hidden = occluded(pixels, at.model, model.light.noise.repeat(len(X), 1), counted, most)
-    return replace(pixels, inside=pixels.inside & ~hidden)
+    hidden = occluded(pixels, at.model, model.light.noise.repeat(len(begin.use), 1), counted, most)
+    return pixels.inside & ~hidden
 
 
 def _covered(differs: Floats, counted: Floats, down: Indices, right: Indices) -> NDArray[np.bool_]:

@@ -60,6 +60,12 @@ class Pixels:
         some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., kept])
         return replace(some, inner=min(len(range(0, self.inner, step)), some.grey.shape[1]))
 
+    def exposed(self, moved: Tensor | None, instants: int) -> "Pixels":
+        """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""
+        if moved is None or instants == 1:
+            return self
+        return replace(self, moved=moved.repeat_interleave(len(self) // len(moved), 0), instants=instants)
+
     def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> "Pixels":
         parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **parts)
@@ -112,14 +118,19 @@ class LinesOfSight:
         shapes = (len(u), 3), (len(u), 3), (len(u),), (len(u),)
         return tuple(np.broadcast_to(part, shape).astype(np.float64) for part, shape in zip(found, shapes, strict=True))
 
-    def of(self, middle_px: NDArray[np.float64], stencil: "Stencil") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the lines of sight of the places of B disks about (B, 2), px, those of `cut_pixels`: direction
-        (B, 3, P), and origin (B or 1, 3, P or 1).
+    def places(self, middle_px: NDArray[np.float64], stencil: "Stencil") -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the pixels of the places of B disks about (B, 2), px, as indices of the flattened picture, the nearest
+        ones at its border, and which places are inside of it, (B, P) each.
         """
         (width, height), (u, v) = self.size, np.rint(middle_px).astype(np.int64).T[..., None]
-        columns, rows = (u + stencil.right).clip(0, width - 1), (v + stencil.down).clip(0, height - 1)
+        columns, rows = u + stencil.right, v + stencil.down
+        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        return rows.clip(0, height - 1) * width + columns.clip(0, width - 1), inside
+
+    def of(self, middle_px: NDArray[np.float64], stencil: "Stencil") -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the lines of sight of these places: direction (B, 3, P), and origin (B or 1, 3, P or 1)."""
+        at, _ = self.places(middle_px, stencil)
         direction, origin = (part.numpy().reshape(3, -1) for part in (self.direction, self.origin))
-        at = rows * width + columns
         starts = origin[:, None] if self.one_origin else origin.take(at, axis=1)
         return direction.take(at, axis=1).swapaxes(0, 1), starts.swapaxes(0, 1)
 
@@ -205,16 +216,9 @@ def cut_pixels(
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])
-    if stencil.reach <= u < width - stencil.reach and stencil.reach <= v < height - stencil.reach:
-        inside = None
-        place = (v * width + u) + (stencil.down * width + stencil.right)
-    else:
-        columns, rows = u + stencil.right, v + stencil.down
-        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        place = rows.clip(0, height - 1) * width + columns.clip(0, width - 1)
+    ((place,), (inside,)) = sight.places(np.array([[u, v]]), stencil)
     if background.shown is not None:
-        shown = background.shown.take(place)
-        inside = shown if inside is None else inside & shown
+        inside = inside & background.shown.take(place)
     grey, behind = frame.take(place), background.mean.take(place)
     clipped = grey >= background.full_scale
     if blur_px > 0:
@@ -230,11 +234,10 @@ def cut_pixels(
     at = torch.from_numpy(place)
     flat = sight.direction.reshape(3, -1)
     pitch_rad, pitch_mm = sight.pitch(min(max(u, 0), width - 2), min(max(v, 0), height - 2))
-    count = len(place)
     return Pixels(
         grey=torch.from_numpy(grey.astype(np.float32))[None],
         behind=torch.from_numpy(behind)[None],
-        inside=torch.ones(1, count, dtype=torch.bool) if inside is None else torch.from_numpy(inside)[None],
+        inside=torch.from_numpy(inside)[None],
         clipped=torch.from_numpy(clipped)[None],
         direction=flat.index_select(1, at)[None],
         origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],

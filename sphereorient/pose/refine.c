@@ -1,4 +1,4 @@
-/* The fit of poses, pose by pose: what `refine` of fit.py computes with `torch_sums` of residuals.py, which define it.
+/* The fit of poses, pose by pose: what `refine` of fit.py computes with `disk_sums` of residuals.py, which define it.
 
    Built for several instruction sets without fused or reordered arithmetic: all of them give the same bits. Stages over
    blocks of pixels keep their data in the first cache. Pictures in single precision, sums in double. */
@@ -41,7 +41,7 @@ typedef struct {
     const float *edge; /* (edges, EDGE_COLUMNS) from -edge_most to edge_most */
     int64_t edges;
     float edge_most;
-    int64_t lab; /* light: 0 on the disk, (cameras, side, side, 2); 1 in the lab, (side^2, 3) */
+    int64_t light_kind; /* see `shine`; its map: of 0 (cameras, side, side, 2), of 1 (side^2, 3) */
     const float *light;
     int64_t light_side;
     const float *cover; /* of light in the lab, (depths, 2) */
@@ -382,40 +382,46 @@ static void mean_of_instants(const Task *t, const Disk *at) {
     }
 }
 
-/* Look up the learnt light, and what the picture shows beside the sphere. */
-static void shine(const Task *t, const Disk *at, int64_t k) {
-    const int64_t camera = k % t->cameras;
-    const float *behind = t->behind + k * t->places, *stray = t->stray + camera * HARMONICS;
-    const float *d = t->direction + k * 3 * t->places;
-    const float side = (float)t->light_side, half = 0.5f * side;
-    memcpy(at->beside, behind, sizeof(float) * (size_t)t->places);
+/* Look up light on the disk of a camera, as lights/disk.py. */
+static void shine_on_disk(const Task *t, const Disk *at, int64_t k) {
+    const float side = (float)t->light_side, half = 0.5f * side, *x = at->x, *y = at->y;
+    const float *own = t->light + 2 * (k % t->cameras) * t->light_side * t->light_side;
     float *difference = at->difference, *black = at->black;
-    const float *x = at->x, *y = at->y, *aside = at->aside, *light = t->light;
-    if (t->lab) {
-        const float gain = t->gain[camera], depths = (float)t->depths;
-        const float *out[3] = {at->out[0], at->out[1], at->out[2]}, *dx = d, *dy = d + t->places, *dz = dy + t->places;
-        INDEPENDENT
-        for (int64_t p = 0; p < t->places; p++) {
-            const float q = aside[p], depth = sqrtf(most(1.0f - q * q, 0.0f));
-            const float nx = q * out[0][p] - depth * dx[p], ny = q * out[1][p] - depth * dy[p];
-            const float nz = q * out[2][p] - depth * dz[p];
-            const float mx = dx[p] + 2.0f * depth * nx, my = dy[p] + 2.0f * depth * ny, mz = dz[p] + 2.0f * depth * nz;
-            const float *scattered = light + 3 * octahedral_cell(nx, ny, nz, side);
-            const float gloss = light[3 * octahedral_cell(mx, my, mz, side) + 2];
-            const float *cover = t->cover + 2 * placed(depth * depths, depths);
-            difference[p] = gain * cover[0] * scattered[0];
-            black[p] = gain * (cover[0] * scattered[1] + cover[1] * gloss);
-        }
-    } else {
-        const float *own = light + 2 * camera * t->light_side * t->light_side;
-        INDEPENDENT
-        for (int64_t p = 0; p < t->places; p++) {
-            const int32_t column = placed((x[p] + 1.0f) * half, side), row = placed((y[p] + 1.0f) * half, side);
-            const float *found = own + 2 * (row * (int32_t)t->light_side + column);
-            difference[p] = found[0];
-            black[p] = found[1];
-        }
+    INDEPENDENT
+    for (int64_t p = 0; p < t->places; p++) {
+        const int32_t column = placed((x[p] + 1.0f) * half, side), row = placed((y[p] + 1.0f) * half, side);
+        const float *found = own + 2 * (row * (int32_t)t->light_side + column);
+        difference[p] = found[0];
+        black[p] = found[1];
     }
+}
+
+/* Look up light in the lab, as lights/lab.py. */
+static void shine_in_lab(const Task *t, const Disk *at, int64_t k) {
+    const float side = (float)t->light_side, gain = t->gain[k % t->cameras], depths = (float)t->depths;
+    const float *dx = t->direction + k * 3 * t->places, *dy = dx + t->places, *dz = dy + t->places;
+    const float *out[3] = {at->out[0], at->out[1], at->out[2]}, *aside = at->aside, *light = t->light;
+    float *difference = at->difference, *black = at->black;
+    INDEPENDENT
+    for (int64_t p = 0; p < t->places; p++) {
+        const float q = aside[p], depth = sqrtf(most(1.0f - q * q, 0.0f));
+        const float nx = q * out[0][p] - depth * dx[p], ny = q * out[1][p] - depth * dy[p];
+        const float nz = q * out[2][p] - depth * dz[p];
+        const float mx = dx[p] + 2.0f * depth * nx, my = dy[p] + 2.0f * depth * ny, mz = dz[p] + 2.0f * depth * nz;
+        const float *scattered = light + 3 * octahedral_cell(nx, ny, nz, side);
+        const float gloss = light[3 * octahedral_cell(mx, my, mz, side) + 2];
+        const float *cover = t->cover + 2 * placed(depth * depths, depths);
+        difference[p] = gain * cover[0] * scattered[0];
+        black[p] = gain * (cover[0] * scattered[1] + cover[1] * gloss);
+    }
+}
+
+/* Look up the learnt light, by its kind, and what the picture shows beside the sphere. */
+static void shine(const Task *t, const Disk *at, int64_t k) {
+    static void (*const kinds[])(const Task *, const Disk *, int64_t) = {shine_on_disk, shine_in_lab};
+    kinds[t->light_kind](t, at, k);
+    const float *stray = t->stray + (k % t->cameras) * HARMONICS, *x = at->x, *y = at->y;
+    memcpy(at->beside, t->behind + k * t->places, sizeof(float) * (size_t)t->places);
     int none = 1;
     for (int h = 0; h < HARMONICS; h++) none &= stray[h] == 0.0f;
     for (int64_t p = none ? t->places : t->inner; p < t->places; p++) {
@@ -1050,7 +1056,7 @@ int refine(const Task *t, int64_t begin, int64_t end) {
     return without;
 }
 
-/* The fit of poses that are nearly right, as `settled` of settle.py, from whole frames. */
+/* The fit of poses that are nearly right, as `settle` of settle.py, from whole frames. */
 
 /* The scene of one camera, and its lines of sight. */
 typedef struct {
@@ -1188,7 +1194,7 @@ static void point_at(const Near *n, Task *t, int64_t pose) {
     for (int64_t c = 0; c < cameras; c++) seen += of->use[k + c];
     t->use = of->use + k;
     /* All cameras together determine the position; for one of two the distance is better known from before. */
-    t->place_precision = n->held || seen < cameras ? of->place_precision + pose * 9 : 0;
+    t->place_precision = of->place_precision && (n->held || seen < cameras) ? of->place_precision + pose * 9 : 0;
     t->position = of->position + pose * 3, t->rotation = of->rotation + pose * 9;
     t->covariance = of->covariance + pose * 36, t->step = of->step + pose * 6, t->nll = of->nll + pose;
     t->own_turn = of->own_turn + k * 3, t->own_covariance = of->own_covariance + k * 9;

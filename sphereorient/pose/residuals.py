@@ -1,4 +1,4 @@
-"""The linear problem of the fit: residuals of L disks at given poses, and what a step needs of them, `DiskSums`."""
+"""The linear problem of the fit: residuals of L disks at given poses, their sums, and how well they are explained."""
 
 import math
 from dataclasses import dataclass
@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.pose.model import SphereModel, SphereView, polynomials, scene_beside, sphere_view
+from sphereorient.pose.model import SphereModel, SphereView, polynomials, scene_beside
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
+from sphereorient.pose.view import sphere_view
 from sphereorient.so3 import solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
@@ -36,61 +38,27 @@ class Residuals:
     beside: Tensor  # (L, P), grey levels of the scene without the sphere
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DiskSums:
-    """What one step of the fit needs of L disks at one pose each; made by `torch_sums`."""
-
-    state: tuple[Tensor, Tensor]  # expected grey levels and weights, (L, P) each
-    information: Tensor  # (L, 6, 6) float64, of delta (rad) and position (mm), the light's coefficients eliminated
-    pull: Tensor  # (L, 6)
-    told: "Told | None"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Told:
-    """How well L disks are explained."""
-
-    scores: Tensor  # (L, 6, T) float64, of the tiles of the disk, summed
-    score: Tensor  # (L,), see `scores_of`
-    loss: Tensor  # (L,), nats
-    step: Tensor  # (L,), grey levels from black to white paint, median
-
-
-def torch_sums(
-    pixels: Pixels,
-    X: Tensor,
-    R: Tensor,
-    state: tuple[Tensor, Tensor] | None,
-    model: SphereModel,
-    cameras: int,
-    tell: bool,
-) -> DiskSums:
-    """Sum the linear problem of B * C disks at poses X (B, 3), mm, R_lab_body R (B, 3, 3); `state` as in `residuals`.
-    `tell`: with what is told of how well they are explained.
+def disk_sums(at: Residuals) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the linear problem of L disks as sums, the light's coefficients eliminated, see `without_light`: float64,
+    of delta (rad) and position (mm).
     """
-    at = residuals(pixels, X, R, state, model, cameras)
-    precision = at.weight / at.variance
-    weighted = at.design * precision[:, None]
-    normal = (weighted @ at.design.mT).double()
-    gradient = (weighted @ at.residual[..., None])[..., 0].double()
-    information, pull, mixed = without_light(normal, gradient)
-    told = None
-    if tell:
-        told = Told(
-            scores=_tile_scores(at, precision, mixed, pixels.tile),
-            score=scores_of(at).double(),
-            loss=_loss(at, pixels.inside),
-            step=at.lit[:, : pixels.inner].double().median(-1).values,
-        )
-    return DiskSums(state=(at.model, at.weight), information=information, pull=pull, told=told)
+    weighted = at.design * (at.weight / at.variance)[:, None]
+    return without_light((weighted @ at.design.mT).double(), (weighted @ at.residual[..., None])[..., 0].double())
+
+
+def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
+    """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
+    return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
 
 
 def residuals(
-    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
+    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
 ) -> Residuals:
     """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
     `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
+    cameras = len(model.light.noise)
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     difference, black = model.light.at(view, pixels)  # as learnt
     tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
@@ -157,10 +125,10 @@ def without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Ten
     return information, gradient[:, :6] - (mixed.mT @ gradient[:, 6:, None])[..., 0], mixed
 
 
-def _tile_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
-    """Sum the scores of the pose, the light eliminated, over tiles, (L, 6, T)."""
+def tile_scores(at: Residuals, mixed: Tensor, tile: Tensor) -> Tensor:
+    """Sum the scores of the pose, the light eliminated, over tiles (P,), (L, 6, T) float64; `mixed` as `disk_sums`."""
     by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
-    score = by_pose * (precision * at.residual)[:, None]
+    score = by_pose * (at.weight / at.variance * at.residual)[:, None]
     tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
     return tiles.index_add(2, tile, score).double()
 
@@ -185,7 +153,7 @@ def robust_deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tens
     return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
 
 
-def _loss(at: Residuals, inside: Tensor) -> Tensor:
+def loss_of(at: Residuals, inside: Tensor) -> Tensor:
     """Return Tukey's loss (L,) with the normalisation of its scale, nats; unknown paint may have any grey level."""
     share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
     loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.pose.fit import FittedPoses, settled
 from sphereorient.pose.model import UNSEEN, SphereModel, surface_normals
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
+from sphereorient.pose.residuals import fitted_residuals
 from sphereorient.sphere.texture import map_directions, unseen_share
 from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, texture_table
 
@@ -27,7 +28,7 @@ def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
     `changed`: share of the step from black to white by which it differs at least.
     """
     cameras = use.shape[1]
-    at = settled(pixels, fit, model, cameras)
+    at = fitted_residuals(pixels, fit, model)
     normal_lab, _ = surface_normals(at.view, pixels)
     normal = fit.R_lab_body.to(normal_lab.dtype).repeat_interleave(cameras, 0).mT @ normal_lab
     cells = octahedral_cells(normal[:, 0], normal[:, 1], normal[:, 2], CELLS).reshape(-1)

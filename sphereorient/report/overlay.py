@@ -18,7 +18,7 @@ from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
-from sphereorient.pose.model import Light
+from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
 from sphereorient.report.plots.style import spread
@@ -167,7 +167,7 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
     known = [(k, picture) for k, picture in pictures if picture is not None]
     greys = np.concatenate([np.zeros(0), *(picture[::3, ::3].ravel() for _, picture in known)])
     black, white = np.percentile(greys, (DARK, BRIGHT)) if len(greys) else (0.0, 1.0)
-    light: Light | None = None
+    light: DiskLight | None = None
     if len(good) and np.isfinite(half_px) and model.texture is not None:
         side = crop_side(half_px)
         model = replace(model, texture=reduced_texture(model.texture, side / MARGIN))

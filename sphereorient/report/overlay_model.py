@@ -12,8 +12,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera
 from sphereorient.errors import TextureError, refusal
 from sphereorient.movies import Grey
-from sphereorient.pose.fit import solved_light
-from sphereorient.pose.model import Light, light_basis
+from sphereorient.pose.lights.disk import DiskLight, light_basis, solved_light
 from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.sphere import see_sphere
 from sphereorient.trajectory import Trajectory
@@ -138,13 +137,13 @@ class Model:
         return CropWindow(centre_px=centre, half_px=half_px, side=side)
 
 
-def contrast(light: Light) -> float:
+def contrast(light: DiskLight) -> float:
     """Return white less black paint in the middle of the disk of one camera, grey levels."""
     middle = light_basis(torch.zeros(1, 2, 1))[0, :, 0]
     return max(float(light.difference[0] @ middle), 1e-6)
 
 
-def lit_picture(light: Light, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+def lit_picture(light: DiskLight, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
     """Return model grey levels (side, side), NaN outside, scaled by 0.5 .. 2 to the brightness of `filmed`."""
     there = np.isfinite(seen.paint)
     difference, black = (light_map[0].double() @ seen.basis(there) for light_map in (light.difference, light.black))
@@ -157,13 +156,13 @@ def lit_picture(light: Light, seen: SeenDisk, filmed: NDArray[np.float32] | None
     return np.asarray(grey, np.float32)
 
 
-def fit_light(pairs: Iterable[tuple[SeenDisk, NDArray[np.float32]]]) -> Light | None:
+def fit_light(pairs: Iterable[tuple[SeenDisk, NDArray[np.float32]]]) -> DiskLight | None:
     """Fit one light to all given frames of one camera (model, crop in grey levels); None if too few pixels are known.
 
     It has no noise, glints or stray light, which a crop is not compared with.
     """
     # One light for all frames: a fit of each frame would hide a part of a wrong orientation.
-    light, count = Light.unknown(1, torch.zeros(1, 4)), 0
+    light, count = DiskLight.unknown(1, torch.zeros(1, 4)), 0
     unknowns = 2 * light.difference.shape[1]
     normal, right = torch.zeros(unknowns, unknowns, dtype=torch.float64), torch.zeros(unknowns, dtype=torch.float64)
     for seen, grey in pairs:

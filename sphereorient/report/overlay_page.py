@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sphereorient.movies import Grey
-from sphereorient.pose.model import Light
+from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags, stated_error
 from sphereorient.report.overlay_model import CropWindow, Model, axes_px, contrast, crop, lit_picture, outline_px
 from sphereorient.trajectory import CameraTrack, Trajectory, runs_of
@@ -141,7 +141,7 @@ class OverlayView:
 
     name: str
     model: Model
-    light: Light | None  # of this camera alone; None: no frame to fit it to
+    light: DiskLight | None  # of this camera alone; None: no frame to fit it to
     black: float  # grey level shown black
     white: float
     half_px: float  # of the crop
@@ -437,7 +437,7 @@ def own_distance_px(view: OverlayView, seen: CameraTrack, k: int) -> float:
     return float(np.linalg.norm(seen.centre_px[k] - view.trail_px[k]))
 
 
-def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: Light | None) -> None:
+def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: DiskLight | None) -> None:
     """Draw the residual's scale, `width` px wide."""
     bar = canvas.pixels[at[1] : at[1] + 10, at[0] : at[0] + width]
     ramp = np.linspace(-RESIDUAL_REACH, RESIDUAL_REACH, width, dtype=np.float32)

@@ -24,7 +24,7 @@ from sphereorient.follow.poses import Poses
 from sphereorient.methods.method import Learnt, load_learnt, save_learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
-from sphereorient.pose.fit import POSE_PARTS
+from sphereorient.pose.poses import POSE_PARTS
 from sphereorient.trajectory import Reason
 from sphereorient.trajectory.trajectory import SPHERES
 

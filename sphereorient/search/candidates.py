@@ -99,32 +99,25 @@ class Candidates:
 
     def padded_views(self, leading: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (*leading, C, 3, 3) and scores (*leading, C), best first; NaN in unused places."""
-        mask = self._places
-        R = torch.full((*mask.shape, 3, 3), torch.nan, dtype=self.R_view_body.dtype)
-        score = torch.full(mask.shape, torch.nan, dtype=self.score.dtype)
-        R[mask], score[mask] = self.R_view_body, self.score
+        R, score, _ = self._padded(self.R_view_body, torch.full((3, 3), torch.nan), torch.nan)
         return R.reshape(*leading, -1, 3, 3), score.reshape(*leading, -1)
 
     def padded(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return R_lab_body (N, C, 3, 3), scores (N, C) and mask (N, C), C the largest count, at least 1.
-
         Unused places hold the unit rotation, score 0 and mask False.
         """
-        mask = self._places
-        R = torch.eye(3, dtype=self.R_view_body.dtype).repeat(*mask.shape, 1, 1)
-        score = torch.zeros(mask.shape, dtype=self.score.dtype)
-        R[mask], score[mask] = self.R_lab_body, self.score
-        return R, score, mask
+        return self._padded(self.R_lab_body, torch.eye(3), 0.0)
+
+    def _padded(self, R: Tensor, no_rotation: Tensor, no_score: float) -> tuple[Tensor, Tensor, Tensor]:
+        mask = torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
+        rotations, score = no_rotation.to(R).repeat(*mask.shape, 1, 1), self.score.new_full(mask.shape, no_score)
+        rotations[mask], score[mask] = R, self.score
+        return rotations, score, mask
 
     @property
     def best_score(self) -> Tensor:
         """Score of each frame's best candidate, (N,) float64, 0 without one."""
         return torch.tensor([float(own.score[:1].sum()) for own in self.each()], dtype=torch.float64)
-
-    @property
-    def _places(self) -> Tensor:
-        """Which of C places of each frame hold a candidate, (N, C) bool."""
-        return torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
 
 
 class Proposer(Protocol):

@@ -35,7 +35,6 @@ class GreySearch(DiskSearch):
         settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
         bank: (K, P) int8, that of another search with the same arguments; None: made when it is needed.
-
     `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the `bank`.
     """
 
@@ -120,13 +119,13 @@ class GreySearch(DiskSearch):
 
     def _normalised(self, disks: Tensor) -> Tensor:
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        return torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
+        return torch.cat([to_int8(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
 
     def _templates(self, paint: TextureTable) -> Tensor:
         """Return normalised views of all rotations, (K, P) int8."""
         normal = self._view.normal_view.T.contiguous()
         chunks = torch.split(self.templates, BATCH)
-        return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
+        return torch.cat([to_int8(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
 
     def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
         """Refine the peaks of one disk; return its proposals, best first."""
@@ -143,7 +142,7 @@ class GreySearch(DiskSearch):
         return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
 
 
-def _steps(even: Tensor) -> Tensor:
+def to_int8(even: Tensor) -> Tensor:
     """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
     scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
     # One scale for all templates: as all have length 1, integer products rank them as they are.

@@ -88,7 +88,7 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
         # Rotating the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
         turned = cross_first_axis(slope, normal_body) * gain[:, None]
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
-        R = R @ _rotation(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
+        R = R @ cayley(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
     light = _light_columns(level, level.paint.sample(R.mT @ level.normal)[0])
     found = _solved(light, target.grey, weight)
     cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
@@ -96,7 +96,7 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
     return R, torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
 
 
-def _rotation(turn: Tensor) -> Tensor:
+def cayley(turn: Tensor) -> Tensor:
     """Return rotations (Q, 3, 3) by Cayley's formula: as `so3.exp` but for terms of third order, much faster."""
     H = so3.hat(turn)
     return torch.eye(3) + (H + 0.5 * H @ H) / (1.0 + 0.25 * turn.square().sum(-1))[:, None, None]

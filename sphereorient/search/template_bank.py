@@ -28,7 +28,6 @@ HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp: in blurred 
 
 class TemplateBank(DiskSearch):
     """Search all of SO(3) for the views of a texture map that look like a disk in black and white.
-
     Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
 
     Args:
@@ -36,7 +35,6 @@ class TemplateBank(DiskSearch):
         size_px: side of the disks, rounded up to an even number; the templates of the coarse grid have half of it.
         settings: of the search; None: the defaults.
         bank: that of another search with the same arguments; None: made now.
-
     `grid` (K, 3, 3) float32 are the rotations of the coarse grid, `bank` (K, P) their templates at half size.
     """
 

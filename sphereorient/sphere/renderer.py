@@ -33,7 +33,6 @@ def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
 ) -> SphereSight:
     """Return the paint that rays (..., P, 3) see on a map (H, 2 H).
-
     `R` (..., 3, 3) takes body components to the rays' frame; `centre` (..., 3) and `radius`, () or (..., 1), have its
     unit. `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
     """
@@ -47,7 +46,6 @@ def see_sphere(
 
 def lambert(normal: Tensor, towards: Tensor, strength: Tensor | float, corner: float = 0.0) -> Tensor:
     """Return the light (...) on unit normals (..., 3) of Lambertian lamps in unit directions `towards` (..., K, 3).
-
     `strength` is (K,) or one number; `corner` rounds the shadow's edge (width in cosine; 0 is exact).
     """
     cosine = normal @ towards.mT
@@ -112,7 +110,6 @@ class SphereRenderer(nn.Module):
 
     def forward(self, R_lab_body: Any, position_mm: Any = None, radius_mm: Tensor | None = None) -> Tensor:
         """Return pictures (..., H, W), 0 black paint .. 1 white paint, of spheres with orientation (..., 3, 3).
-
         `R_lab_body` sets the dtype; without a camera it leads to the view. `position_mm` (..., 3) is the origin if
         None.
 
@@ -200,7 +197,6 @@ def fine_pixels(size_px: int, supersampling: int) -> Tensor:
 
 def aperture_matrix(size_px: int, supersampling: int, sigma_px: float) -> Tensor:
     """Return weights A (S, S supersampling) float64, picture = A fine A^T, for a pixel box and a Gaussian `sigma_px`.
-
     Source: the convolution is a difference of two normal distribution functions.
     """
     offset = fine_pixels(size_px, supersampling) - torch.arange(size_px, dtype=torch.float64)[:, None]
@@ -225,7 +221,6 @@ def rim_directions(camera: Camera, position_lab_mm: Tensor, count: int) -> tuple
 
 def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: Tensor | float) -> Tensor:
     """Return the largest distances (...) from projected centres to rims, px, plus 4 %, for centres (..., 3), mm, lab.
-
     `radius_mm` is one number or (...).
 
     Raises:
@@ -260,7 +255,6 @@ class PaintedBall:
 
 def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball: PaintedBall) -> Tensor:
     """Return grey levels (..., P) of rays (..., P, 3), twice differentiable in cameras, pose, paint and light.
-
     `position_lab_mm` is (..., 3), `R_lab_body` (..., 3, 3). Optically simpler than `SphereRenderer`: one ray per pixel.
     """
     seen = see_sphere(rays, position_lab_mm, R_lab_body, ball.texture, ball.radius_mm, smooth=True)

@@ -126,9 +126,7 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
 
 def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
     """Return the bilinear grey (...) of a map (H, 2 H) at body directions (..., 3) of any length but zero.
-
     Differentiable, continuous over the date line and the poles; map and directions share dtype and device.
-
     Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
     """
     check_texture_shape(texture)
@@ -156,7 +154,6 @@ def sample_closed(closed: Tensor, direction_body: Tensor) -> Tensor:
 
 def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     """Return the cubic B-spline grey (...) at body directions (..., 3); twice differentiable, except at the poles.
-
     Source: Unser 1999, Splines, a perfect fit, eq. 3; the texels are the coefficients: a blur of 0.58 texels.
     """
     check_texture_shape(texture)

@@ -39,7 +39,6 @@ Cells = tuple[Tensor, Tensor, Tensor]  # directions and two tangents of each, (M
 
 def octahedral_directions(side: int) -> Tensor:
     """Return unit directions at the cell centres of an octahedral map, (side^2, 3) float64, row by row.
-
     Source: Praun and Hoppe 2003 (octahedron unfolded into a square: no poles, cells of nearly equal size).
     """
     at = (torch.arange(side, dtype=torch.float64) + 0.5) * (2.0 / side) - 1.0
@@ -68,7 +67,6 @@ def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
 
 class DirectionTable(nn.Module):
     """Paint of a map (H, 2 H) as the renderer sees it, in `cells`^3 cells of the unit cube (128: 1 degree, 2 MB).
-
     Ten times faster than `SphereRenderer`; pixels at patch borders differ: for candidates, not for refinement.
     """
 
@@ -99,7 +97,6 @@ class DirectionTable(nn.Module):
 
 class TextureTable:
     """Texture map blurred by a Gaussian on the sphere (sigma `blur_rad`), as tangent planes in cells of directions.
-
     `rows` (side^2, 4) float32 come from `texture_table`; the value's error is of second order in cell size over blur.
     `unseen` is the table of the share of texels that are no paint, blurred alike; None: all are paint.
     """

@@ -37,7 +37,6 @@ class DiskView:
 
 def paint_seen(texture: Tensor, normal_view: Tensor, R_view_body: Tensor, *, smooth: bool = False) -> Tensor:
     """Return the paint (..., P) of a map (H, 2 H) at outward normals (..., P, 3); all pictures use this function.
-
     `R_view_body` (..., 3, 3) takes body components to the frame of the normals; `smooth`: spline, otherwise bilinear.
     """
     check_tail("R_view_body", R_view_body, 3, 3)
@@ -53,7 +52,6 @@ def disk_offsets(size_px: int, dtype: torch.dtype = torch.float64) -> Tensor:
 
 def orthographic_view(size_px: int, dtype: torch.dtype = torch.float32) -> DiskView:
     """Return the view from infinity: the pixel at (x, y) radii has the normal (x, y, -sqrt(1 - x^2 - y^2)).
-
     Source: paper section III (templates); docs/errata.md A4 lists the neglected effects.
     """
     origin = torch.nn.functional.pad(disk_offsets(size_px), (0, 1))
@@ -64,7 +62,6 @@ def orthographic_view(size_px: int, dtype: torch.dtype = torch.float32) -> DiskV
 
 def perspective_view(size_px: int, distance_radii: float, dtype: torch.dtype = torch.float32) -> DiskView:
     """Return the view from `distance_radii` (above 1) to the sphere's centre; the visible cap fills the disk.
-
     Source: docs/errata.md A4 (the rim lies asin(1 / distance) in front of the great circle).
     """
     offset = disk_offsets(size_px)
@@ -79,7 +76,6 @@ def sphere_normals(
     origin: Tensor, direction: Tensor, centre: Tensor, radius: float | Tensor, corner: float = 0.0
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (..., 3) where rays first meet a sphere, and 1 - (ray distance / radius)^2, (...).
-
     A ray that misses gets the normal at its nearest approach. `origin`, `direction` and `centre` are (..., 3), `radius`
     () or (...), in one frame and unit. `corner` (radii^2) above 0 rounds the limb: twice differentiable, normals within
     about sqrt(corner) of the limb are shifted inwards.
@@ -103,7 +99,6 @@ def sphere_normals(
 
 def nearest_approach(to_centre: Tensor, direction: Tensor, axis: int = -1) -> Tensor:
     """Return the vectors from a sphere's centre to the nearest points of lines of sight; all have x, y, z along `axis`.
-
     `to_centre` leads from a point of a line to the centre, `direction` is the line's unit direction.
     """
     return (to_centre * direction).sum(axis, keepdim=True) * direction - to_centre

@@ -14,7 +14,7 @@ from sphereorient import so3
 from sphereorient.calibration.contradictions import with_contradictions
 from sphereorient.cameras import Camera, sphere_radius_px
 from sphereorient.methods.results import missed_by
-from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.lasting import Lasting, with_lasting_errors
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of

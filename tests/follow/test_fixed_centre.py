@@ -27,7 +27,7 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter
-from sphereorient.pose.fit import FittedPoses
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 
@@ -84,8 +84,8 @@ def test_attitudes_err_with_the_place_as_follows_says():
     class Held:
         radius_mm, optics = RADIUS_MM, SimpleNamespace(fine=None)
 
-        def fit(self, pixels, X, R, use, level, iterations, precision):
-            return held(X, R, precision)
+        def fit(self, pixels, begin, level, iterations):
+            return held(begin.position_lab_mm, begin.R_lab_body, begin.place_precision)
 
     follows = follows_place(Held(), pixels, X[0], R, use)
     firm = 1e14 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
@@ -117,7 +117,7 @@ def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCent
     pixels = fitter.pixels([[shot.picture for shot in shots]], place.position_lab_mm[None], fine)
     firm = 1e14 * torch.eye(3, dtype=torch.float64)[None]
     R = [
-        fitter.fit(pixels, X[None], pose.R_lab_body[:1], use, fine, 6, firm).R_lab_body
+        fitter.fit(pixels, PoseStart(X[None], pose.R_lab_body[:1], use, firm), fine, 6).R_lab_body
         for X in (place.position_lab_mm, place.position_lab_mm + error_mm)
     ]
     return so3.log(R[1] @ R[0].mT)[0]

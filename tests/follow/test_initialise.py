@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 
 from sphereorient.follow.initialise import explaining_first
-from sphereorient.pose.fit import FittedPoses, blank_parts
+from sphereorient.pose.poses import FittedPoses, blank_parts
 
 
 def likelihood(nll: list[float], *score: list[float]) -> torch.Tensor:

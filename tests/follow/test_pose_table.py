@@ -6,7 +6,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.follow.poses import Poses, exchanged, no_pose, pose_table, pose_tables
-from sphereorient.pose.fit import POSE_PARTS
+from sphereorient.pose.poses import POSE_PARTS
 from sphereorient.trajectory import Reason
 
 CAMERAS = 2

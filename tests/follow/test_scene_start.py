@@ -20,7 +20,7 @@ from sphereorient.follow.scene_start import Ahead, SceneStart, look_of
 from sphereorient.locate import CameraScene, Frame, Match, places_of
 from sphereorient.locate.matching import assigned
 from sphereorient.pose import CameraView
-from sphereorient.pose.fit import blank_parts
+from sphereorient.pose.poses import blank_parts
 from sphereorient.trajectory import Reason
 
 RADIUS = 9.0

@@ -17,7 +17,7 @@ from sphereorient.follow.chunk import Chunk, mirrored, regained
 from sphereorient.follow.follower import cameras_disagree
 from sphereorient.follow.initialise import by_decreasing_size
 from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.pose.fit import blank_parts
+from sphereorient.pose.poses import blank_parts
 from sphereorient.trajectory import Reason
 
 TIMES = [0.0, 1.0, 2.5, 3.2]

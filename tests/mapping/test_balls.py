@@ -14,7 +14,7 @@ from sphereorient.locate import CameraScene
 from sphereorient.locate.outline import Outline
 from sphereorient.mapping.balls import FREE, _assigned, _crops_of, _instant, _linked, _places
 from sphereorient.mapping.disks import Crop
-from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.camera_view import CameraView
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras
 

@@ -14,6 +14,7 @@ from sphereorient.locate import Frame
 from sphereorient.mapping.disks import cut_out
 from sphereorient.mapping.growing import FIRST, FIRST_FRAMES, GrowingMap
 from sphereorient.mapping.relative import RelativeTracker
+from sphereorient.pose.poses import PoseStart
 from sphereorient.trajectory import Reason
 
 
@@ -73,7 +74,7 @@ def test_a_growing_map_finds_new_frames_in_the_body_frame_that_it_was_given(ball
     pixels = fitter.pixels([[ball.shots[k].picture] for k in rows], X, fitter.optics.fine)
     start = ball.R[60:70] @ ball.R[0].mT @ found.R_map_body.mT
     use, precision = torch.ones(10, 1, dtype=torch.bool), found.centre.precision.expand(10, 3, 3)
-    fit = fitter.fit(pixels, X, start, use, fitter.optics.fine, 5, precision)
+    fit = fitter.fit(pixels, PoseStart(X, start, use, precision), fitter.optics.fine, 5)
     error = error_deg(fit.R_lab_body @ found.R_map_body, ball.R[60:70] @ ball.R[0].mT)
     assert error.median() < 0.5
     texture, seen = growing.paint()
@@ -99,8 +100,11 @@ def test_frames_that_come_extend_the_map_in_its_body_frame_though_theirs_has_dri
     before, after = [
         one.appearance.fitter.fit(
             one.appearance.fitter.pixels([[ball.shots[44].picture]], X[None], one.appearance.fitter.optics.fine),
-            X[None], (ball.R[44] @ Q @ one.R_map_body.mT)[None], torch.ones(1, 1, dtype=torch.bool),
-            one.appearance.fitter.optics.fine, 5, one.centre.precision[None],
+            PoseStart(
+                X[None], (ball.R[44] @ Q @ one.R_map_body.mT)[None], torch.ones(1, 1, dtype=torch.bool),
+                one.centre.precision[None],
+            ),
+            one.appearance.fitter.optics.fine, 5,
         )
         for one in (first, found)
     ]  # fmt: skip

@@ -14,8 +14,8 @@ from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, fit_map, iterations, learn, take_crops
 from sphereorient.mapping.learn import read_kept, write_kept
-from sphereorient.pose import fitter
-from sphereorient.pose.lab_light import LabLight
+from sphereorient.pose.lights import kinds
+from sphereorient.pose.lights.lab import LabLight
 
 QUICK = MapSettings(rounds=3, pixels=300, height=32, baselines=(1, 2))
 
@@ -43,7 +43,7 @@ def test_a_damaged_file_is_no_state(tmp_path):
 def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch, of_cameras):
     for module in (iterations, learn):
         monkeypatch.setattr(module, "LIGHT_ITERATIONS", of_cameras)
-    monkeypatch.setattr(fitter, "MORE_EXPLAINED", -math.inf)  # whether it is better or not
+    monkeypatch.setattr(kinds, "MORE_EXPLAINED", -math.inf)  # whether it is better or not
     path, kept = unpainted(tmp_path / "scene", frames=16), tmp_path / "map.h5"
     with open_recording(path, ["cam1"], textured=False) as recording:
         crops = take_crops(recording, QUICK, LocateSettings(), silent)

@@ -14,11 +14,13 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
 from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.fit import FittedPoses, refine
-from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
-from sphereorient.pose.model import LATER, Light, Shading, SphereModel
+from sphereorient.pose.bodies import body_of
+from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.fitter import Fitter, first_fitter
+from sphereorient.pose.lights.disk import DiskLight
+from sphereorient.pose.model import LATER, Shading, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
-from sphereorient.pose.start import PoseStart
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 from sphereorient.synth import random_texture
@@ -137,9 +139,9 @@ def cut(rig: Rig, pictures: Tensor, X: Tensor, behind: float = BEHIND, full_scal
     return stacked(disks)
 
 
-def flat_light(cameras: int, sigma: float) -> Light:
+def flat_light(cameras: int, sigma: float) -> DiskLight:
     """Nothing learnt but the noise."""
-    return Light.unknown(cameras, torch.tensor([[sigma**2, 0.0, 0.0, 0.0]] * cameras))
+    return DiskLight.unknown(cameras, torch.tensor([[sigma**2, 0.0, 0.0, 0.0]] * cameras))
 
 
 def model_of(paint: TextureTable, sigma: float = 1.0, shading: Shading = LATER) -> SphereModel:
@@ -148,13 +150,20 @@ def model_of(paint: TextureTable, sigma: float = 1.0, shading: Shading = LATER) 
     return SphereModel(radius_mm=RADIUS_MM, paint=paint, blur_px=BLUR_PX, light=light, shading=shading)
 
 
+def refined(
+    pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4, most_hidden: float = 0.0
+) -> FittedPoses:
+    """Fit by compiled code, where there is any."""
+    return body_of(begin).refine(pixels, begin, model, iterations, most_hidden)
+
+
 def fitted(rig: Rig, kind: str, pixels: Pixels, X: Tensor, R: Tensor, sigma: float, **changes: object) -> FittedPoses:
     """Refine with all cameras, unless the changes say otherwise."""
     use = changes.pop("use", torch.ones(len(X), len(rig.cameras), dtype=torch.bool))
     iterations, known = changes.pop("iterations", 6), changes.pop("place_precision", None)
     given = {"radius_mm": RADIUS_MM, "paint": rig.table(kind), "blur_px": BLUR_PX}
     model = SphereModel(**given | {"light": flat_light(len(rig.cameras), sigma)} | changes)
-    return refine(pixels, PoseStart(position_lab_mm=X, R_lab_body=R, use=use, place_precision=known), model, iterations)
+    return refined(pixels, PoseStart(X, R, use, known), model, iterations)
 
 
 def turned(R: Tensor, angle_deg: float, seed: int) -> Tensor:

@@ -22,12 +22,10 @@ from refine_examples import (
 
 from sphereorient import so3
 from sphereorient.files.compiled import built_for
-from sphereorient.pose import compiled
-from sphereorient.pose.fit import POSE_PARTS, learn_light, refine
-from sphereorient.pose.lab_light import learn_lab_light
+from sphereorient.pose import compiled, fit, occluders
+from sphereorient.pose.lights.lab import lab_lights
 from sphereorient.pose.model import FIRST, LATER, SphereModel
-from sphereorient.pose.occluders import unoccluded
-from sphereorient.pose.start import PoseStart
+from sphereorient.pose.poses import POSE_PARTS, PoseStart
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
 
@@ -52,12 +50,8 @@ def model_of(**changes) -> SphereModel:
 
 
 def begin() -> PoseStart:
-    return PoseStart(
-        position_lab_mm=moved(X, 0.05, 1),
-        R_lab_body=turned(R, 0.5, 1),
-        use=torch.arange(20).reshape(10, 2) != 5,
-        place_precision=4.0 * torch.eye(3, dtype=torch.float64).expand(10, 3, 3),
-    )
+    precision = 4.0 * torch.eye(3, dtype=torch.float64).expand(10, 3, 3)
+    return PoseStart(moved(X, 0.05, 1), turned(R, 0.5, 1), torch.arange(20).reshape(10, 2) != 5, precision)
 
 
 def unseen_model(pixels) -> SphereModel:
@@ -67,26 +61,20 @@ def unseen_model(pixels) -> SphereModel:
     return model_of(paint=paint, shading=LATER)
 
 
-def learnt(pixels, learn) -> SphereModel:
+def learnt(pixels, *, lab: bool = False) -> SphereModel:
     model = model_of()
-    fit = refine(pixels, begin(), model, 6)
-    light = learn(pixels, fit, torch.ones(10, 2, dtype=torch.bool), model)
+    given = pixels, compiled.refine(pixels, begin(), model, 6), torch.ones(10, 2, dtype=torch.bool), model
+    light = list(lab_lights(*given))[-1] if lab else model.light.learnt(*given)
     stray = torch.tensor([[3.0, 1, -1, 0.5, 0, 0, 0, 0.2, 0], [0.0] * 9])
     return model_of(light=replace(light, stray=stray), shading=LATER, limb_px=torch.tensor([0.02, -0.01]))
 
 
 MODELS = {
     "first": lambda pixels: model_of(),
-    "light on the disk": lambda pixels: learnt(pixels, learn_light),
-    "light in the lab": lambda pixels: learnt(pixels, learn_lab_light),
+    "light on the disk": learnt,
+    "light in the lab": lambda pixels: learnt(pixels, lab=True),
     "unseen paint": unseen_model,
 }
-
-
-def by_torch(monkeypatch, pixels, model, iterations):
-    with monkeypatch.context() as patch:
-        patch.setattr(compiled, "library", lambda: None)
-        return refine(pixels, begin(), model, iterations)
 
 
 def assert_same(found, expected, nll=1e-3):
@@ -103,69 +91,61 @@ def assert_same(found, expected, nll=1e-3):
     assert float((found.own_turn - expected.own_turn)[seen].abs().max()) < 1e-4
 
 
+def assert_as_torch(pixels, model, iterations=4, most_hidden=0.0, nll=1e-3):
+    found, expected = (body.refine(pixels, begin(), model, iterations, most_hidden) for body in (compiled, fit))
+    assert_same(found, expected, nll)
+
+
 @pytest.mark.parametrize("kind", MODELS)
-def test_poses_covariances_and_scores_are_those_of_torch(pixels, kind, monkeypatch):
+def test_poses_covariances_and_scores_are_those_of_torch(pixels, kind):
     model = MODELS[kind](pixels)
     nll = 5e-3 if kind == "unseen paint" else 1e-3  # light is extrapolated to where the paint is unknown
     for iterations in (1, 4):
-        found, expected = refine(pixels, begin(), model, iterations), by_torch(monkeypatch, pixels, model, iterations)
-        assert_same(found, expected, nll=nll)
+        assert_as_torch(pixels, model, iterations, nll=nll)
 
 
-def test_of_a_ball_that_moves_during_the_exposure(pixels, monkeypatch):
+def test_of_a_ball_that_moves_during_the_exposure(pixels):
     moves = torch.randn(10, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.03
-    moving = replace(pixels, moved=moves.repeat_interleave(2, 0), instants=3)
-    model = learnt(pixels, learn_light)
-    assert_same(refine(moving, begin(), model), by_torch(monkeypatch, moving, model, 4))
+    assert_as_torch(pixels.exposed(moves, 3), learnt(pixels))
 
 
-def test_of_lines_of_sight_that_start_at_different_places(pixels, monkeypatch):
+def test_of_lines_of_sight_that_start_at_different_places(pixels):
     along = torch.linspace(-3, 3, pixels.grey.shape[1])  # as behind a wall
-    ported = replace(pixels, origin=pixels.origin + pixels.direction * along, pitch_mm=pixels.pitch_mm + 0.01)
-    assert_same(refine(ported, begin(), model_of()), by_torch(monkeypatch, ported, model_of(), 4))
+    origin = pixels.origin + pixels.direction * along
+    assert_as_torch(replace(pixels, origin=origin, pitch_mm=pixels.pitch_mm + 0.01), model_of())
 
 
 @pytest.mark.parametrize("kind", ["light in the lab", "unseen paint"])
-def test_occluders_are_those_of_torch(pixels, kind, monkeypatch):
+def test_occluders_are_those_of_torch(pixels, kind):
     covered = pixels.grey.clone()
     near = ((pixels.place - torch.tensor([[4], [-6]])).abs() <= 4).all(0)
     covered[::3, near] += 90.0
     covered[1, :] = covered[1].flip(0)  # so much differs that nothing is taken for an occluder
     hidden, model = replace(pixels, grey=covered), MODELS[kind](pixels)
-    every, start = torch.ones(10, 2, dtype=torch.bool), begin()
     for most in (0.4, 1e-4):
-        done = compiled.refined(hidden, start.position_lab_mm, start.R_lab_body, model, every, most_hidden=most)
-        expected = unoccluded(hidden, start.position_lab_mm, start.R_lab_body, model, 2, most)
-        assert done is not None
-        assert torch.equal(done[0], expected.inside)
-        assert bool((pixels.inside & ~expected.inside)[0, near].any()) == (most == 0.4)
-        assert torch.equal(expected.inside[1], pixels.inside[1])
-        fit = refine(hidden, start, model, 2, most)
-        with monkeypatch.context() as patch:
-            patch.setattr(compiled, "library", lambda: None)
-            assert_same(fit, refine(hidden, start, model, 2, most), nll=5e-3)
-        without = refine(expected, start, model, 2)
+        inside = occluders.kept(hidden, begin(), model, most)
+        assert torch.equal(compiled.kept(hidden, begin(), model, most), inside)
+        assert bool((pixels.inside & ~inside)[0, near].any()) == (most == 0.4)
+        assert torch.equal(inside[1], pixels.inside[1])
+        assert_as_torch(hidden, model, 2, most, nll=5e-3)
+        past = compiled.refine(hidden, begin(), model, 2, most)
+        without = compiled.refine(replace(hidden, inside=inside), begin(), model, 2)
         for name in POSE_PARTS:
-            assert torch.equal(getattr(fit, name), getattr(without, name)), name
+            assert torch.equal(getattr(past, name), getattr(without, name)), name
 
 
 def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels, monkeypatch):
-    model = learnt(pixels, learn_light)
-    whole = refine(pixels, begin(), model, most_hidden=0.4)
-    start = begin()
-    few = replace(
-        start,
-        **{name: getattr(start, name)[3:5] for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")},
-    )
-    some = refine(pixels.where(torch.arange(6, 10)), few, model, most_hidden=0.4)
+    model, start = learnt(pixels), begin()
+    whole = compiled.refine(pixels, start, model, most_hidden=0.4)
+    some = compiled.refine(pixels.where(torch.arange(6, 10)), start.of(torch.tensor([3, 4])), model, most_hidden=0.4)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
-    threaded = refine(pixels, start, model, most_hidden=0.4)
+    threaded = compiled.refine(pixels, start, model, most_hidden=0.4)
     torch.set_num_threads(threads)
-    plain = built_for(compiled.SOURCE, compiled._Near, "default")
+    plain = built_for(compiled.SOURCE, compiled.Near, "default")
     assert plain is not None
     monkeypatch.setattr(compiled, "library", lambda: plain)
-    narrow = refine(pixels, start, model, most_hidden=0.4)
+    narrow = compiled.refine(pixels, start, model, most_hidden=0.4)
     for name in POSE_PARTS:
         assert torch.equal(getattr(whole, name), getattr(threaded, name)), name
         assert torch.equal(getattr(whole, name), getattr(narrow, name)), name
@@ -175,7 +155,7 @@ def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels,
 def test_a_disk_without_a_number_gives_none_and_spoils_no_other(pixels):
     start = begin()
     lost = replace(start, position_lab_mm=start.position_lab_mm.index_fill(0, torch.tensor([2]), torch.nan))
-    found, whole = refine(pixels, lost, model_of()), refine(pixels, start, model_of())
+    found, whole = (compiled.refine(pixels, one, model_of()) for one in (lost, start))
     others = torch.arange(10) != 2
     assert bool(found.position_lab_mm[2].isnan().all())
     assert torch.equal(found.R_lab_body[others], whole.R_lab_body[others])

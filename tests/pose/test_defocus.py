@@ -12,7 +12,8 @@ from refine_examples import BLUR_PX, balls, base_of, cut, fitter_of, noisy, pict
 
 from sphereorient import so3
 from sphereorient.pose.blur import FINER, FINEST, best_blur_px, steepest_blur_px
-from sphereorient.pose.fitter import defocus_radii
+from sphereorient.pose.camera_view import defocus_radii
+from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch, GreySearchSettings
 
 WIDE = 0.2  # radii
@@ -42,7 +43,7 @@ def test_the_blur_of_the_pictures_is_found_to_a_percent():
     pixels, use = cut(rig, noisy(pictures_of(rig, "patches", X, R), 2.0, 5), X), torch.ones(4, 2, dtype=torch.bool)
     fitter = fitter_of(rig, 1.6 * BLUR_PX)
     for ratio in (FINER, FINEST):
-        fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 3)
+        fit = fitter.fit(pixels, PoseStart(X, R, use), fitter.optics.fine, 3)
         found = best_blur_px(fitter, base_of("patches"), pixels, fit, use, ratio)
         fitter = fitter_of(rig, found)
     assert found == pytest.approx(BLUR_PX, rel=0.015)

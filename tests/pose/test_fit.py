@@ -36,10 +36,10 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose import residuals as residuals_module
-from sphereorient.pose.fit import POSE_PARTS, FittedPoses
-from sphereorient.pose.fitter import Optics, PyramidLevel
+from sphereorient.pose.camera_view import Optics, PyramidLevel
 from sphereorient.pose.model import FIRST
 from sphereorient.pose.pixels import Pixels, cut_pixels, stacked
+from sphereorient.pose.poses import POSE_PARTS, FittedPoses
 from sphereorient.sphere.texture_table import texture_table
 
 SIGMA = 8.0  # grey levels, 5 % of the step from black to white

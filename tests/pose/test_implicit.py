@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError
-from sphereorient.pose.implicit import ImplicitPose, _moved, implicit_pose
+from sphereorient.pose.implicit import ImplicitPose, implicit_pose, moved_by
 
 
 def f64(value: object) -> Tensor:
@@ -155,11 +155,11 @@ def test_single_precision_stays_single(points):
 
 def test_small_errors_multiply_from_the_left_in_lab_components():
     R, delta = so3.exp(f64([0.7, 0.2, -0.4]))[None], f64([[1e-3, -2e-3, 5e-4, 0.1, 0.2, 0.3]])
-    turned, place = _moved(R, f64([[1.0, 2.0, 3.0]]), delta)
+    turned, place = moved_by(R, f64([[1.0, 2.0, 3.0]]), delta)
     assert_close(turned, so3.exp(delta[:, :3]) @ R, 1e-9)  # the third order: (2.3e-3)^3 / 12
     assert_close(place, f64([[1.1, 2.2, 3.3]]))
     assert (turned - R @ so3.exp(delta[:, :3])).abs().max() > 1e-4
-    large = _moved(R, f64([[0.0] * 3]), f64([[0.3, 0.9, -0.5, 0.0, 0.0, 0.0]]))[0]
+    large = moved_by(R, f64([[0.0] * 3]), f64([[0.3, 0.9, -0.5, 0.0, 0.0, 0.0]]))[0]
     assert_close(large @ large.mT, torch.eye(3, dtype=torch.float64)[None])
 
 

@@ -17,30 +17,29 @@ from refine_examples import (
     fitter_of,
     flat_light,
     model_of,
+    refined,
     rig_of,
 )
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose import fitter
-from sphereorient.pose.fit import FittedPoses, learn_light, refine
-from sphereorient.pose.lab_light import (
+from sphereorient.pose.lights import kinds
+from sphereorient.pose.lights.kinds import light_of, lit_in_the_lab
+from sphereorient.pose.lights.lab import (
     KNOTS,
-    LAB_PARTS,
     MIRRORED,
     SCATTERED,
     LabLight,
     directions,
     harmonics,
     knot_shares,
-    learn_lab_light,
-    light_of,
-    light_parts,
+    lab_lights,
 )
-from sphereorient.pose.model import FIRST, LATER, SphereModel, no_stray, scene_beside, sphere_view, stray_basis
+from sphereorient.pose.model import FIRST, LATER, SphereModel, no_stray, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.pose.residuals import residuals
-from sphereorient.pose.start import PoseStart
+from sphereorient.pose.view import sphere_view
 from sphereorient.sphere.texture_table import octahedral_directions
 
 SIGMA = 2.0  # grey levels
@@ -88,6 +87,12 @@ def test_knots_make_functions_that_are_linear_between_them():
 # --- a planted light
 
 
+def lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
+    """The last estimate."""
+    *_, light = lab_lights(pixels, fit, use, model)
+    return light
+
+
 def planted(cameras: int) -> LabLight:
     """A lamp, a window that the gloss mirrors, a cover that dims the limb; the second camera has less gain."""
     scattered = torch.zeros((SCATTERED + 1) ** 2)
@@ -129,8 +134,8 @@ def learnt(count: int = 12, cameras: int = 2) -> tuple[LabLight, FittedPoses]:
     rig, pixels, X, R, model = pictures(count, cameras)
     use = torch.ones(count, cameras, dtype=torch.bool)
     fit = fitted(rig, "patches", pixels, X, R, SIGMA, shading=FIRST)
-    model = replace(model, light=learn_light(pixels, fit, use, model), shading=LATER)
-    return learn_lab_light(pixels, fit, use, model), fit
+    model = replace(model, light=model.light.learnt(pixels, fit, use, model), shading=LATER)
+    return lab_light(pixels, fit, use, model), fit
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -144,7 +149,7 @@ def test_a_planted_light_is_found_again(cameras):
     for got, expected in zip(light.at(view, pixels), planted(cameras).at(view, pixels), strict=True):
         error = (got - expected)[within]
         assert error.square().mean().sqrt() < 7.0
-    at = residuals(pixels, X, R, None, replace(model, light=light, shading=LATER), cameras)
+    at = residuals(pixels, X, R, None, replace(model, light=light, shading=LATER))
     assert float(at.residual[at.inside].square().mean()) == pytest.approx(SIGMA**2, rel=0.05)
     at = torch.tensor([1.0, 80.0, 80.0**2, 80.0**3])
     for noise in light.noise:
@@ -169,7 +174,9 @@ def test_flicker_of_each_frame_bends_no_light():
     pixels = replace(pixels, grey=(pixels.grey - beside) * (1 + flicker) + beside)
     use = torch.ones(12, 2, dtype=torch.bool)
     fit = fitted(rig, "patches", pixels, X, R, SIGMA, shading=FIRST)
-    light = learn_lab_light(pixels, fit, use, replace(model, light=learn_light(pixels, fit, use, model), shading=LATER))
+    light = lab_light(
+        pixels, fit, use, replace(model, light=model.light.learnt(pixels, fit, use, model), shading=LATER)
+    )
     _, pixels, X, R, model = pictures(6, 2, 9)
     view = sphere_view(pixels, X.repeat_interleave(2, 0), R.repeat_interleave(2, 0), model)
     within = view.aside < 0.95
@@ -180,10 +187,11 @@ def test_flicker_of_each_frame_bends_no_light():
 def test_it_explains_other_frames_better_than_maps_of_each_disk():
     light, fit = learnt()
     _, pixels, X, R, model = pictures(6, 2, 9)
-    maps = learn_light(pictures()[1], fit, torch.ones(12, 2, dtype=torch.bool), pictures()[4])
+    _, shown, *_, without = pictures()
+    maps = without.light.learnt(shown, fit, torch.ones(12, 2, dtype=torch.bool), without)
     left = []
     for lit in (light, maps):
-        at = residuals(pixels, X, R, None, replace(model, light=lit, shading=LATER), 2)
+        at = residuals(pixels, X, R, None, replace(model, light=lit, shading=LATER))
         left.append(float((at.residual * at.inside).square().mean()))
     assert left[0] < left[1]
 
@@ -205,8 +213,8 @@ def test_light_beside_the_sphere_is_found_and_moves_no_pose():
     pixels, planted_stray = with_glare(pixels, X, R, model)
     use = torch.ones(12, 2, dtype=torch.bool)
     fit = fitted(rig, "patches", pixels, X, R, SIGMA, shading=FIRST)
-    maps = learn_light(pixels, fit, use, model)
-    lab = learn_lab_light(pixels, fit, use, replace(model, light=maps, shading=LATER))
+    maps = model.light.learnt(pixels, fit, use, model)
+    lab = lab_light(pixels, fit, use, replace(model, light=maps, shading=LATER))
     round_it = torch.linspace(0, 6.28, 50)
     basis = stray_basis(torch.stack([round_it.cos(), round_it.sin()]))
     for light in (maps, lab):
@@ -214,7 +222,7 @@ def test_light_beside_the_sphere_is_found_and_moves_no_pose():
     off, stated = [], []
     for light in (lab, replace(lab, stray=no_stray(2))):
         model = replace(model, light=light, shading=LATER)
-        fit = refine(pixels, PoseStart(position_lab_mm=X, R_lab_body=R, use=use), model)
+        fit = refined(pixels, PoseStart(X, R, use), model)
         off.append(float((fit.position_lab_mm - X).mean(0).norm()))
         stated.append(float(fit.covariance[:, 3:, 3:].diagonal(dim1=1, dim2=2).mean().sqrt()))
     assert off[0] < 0.5 * off[1]
@@ -227,7 +235,7 @@ def test_no_light_beside_the_sphere_is_invented():
 
 
 def test_files_without_stray_light_are_read():
-    parts = {name: part for name, part in light_parts(planted(2)).items() if name != "stray"}
+    parts = {name: part for name, part in planted(2).parts().items() if name != "stray"}
     assert light_of(parts, True).stray.equal(no_stray(2))
 
 
@@ -236,11 +244,11 @@ def test_rows_not_in_use_change_nothing():
     use = torch.ones(12, 2, dtype=torch.bool)
     use[3:, 1] = False
     _, fit = learnt()
-    model = replace(model, light=learn_light(pixels, fit, use, model), shading=LATER)
+    model = replace(model, light=model.light.learnt(pixels, fit, use, model), shading=LATER)
     spoilt = pixels.grey.clone()
     spoilt[7::2] = torch.nan
-    one, other = (learn_lab_light(part, fit, use, model) for part in (pixels, replace(pixels, grey=spoilt)))
-    for name in LAB_PARTS:
+    one, other = (lab_light(part, fit, use, model) for part in (pixels, replace(pixels, grey=spoilt)))
+    for name in LabLight.names():
         assert getattr(one, name).equal(getattr(other, name))
         assert getattr(one, name).isfinite().all()
 
@@ -252,13 +260,13 @@ def test_poses_without_a_camera_may_have_no_place():
     _, fit = learnt()
     X = fit.position_lab_mm.clone()
     X[5] = torch.nan
-    model = replace(model, light=learn_light(pixels, fit, use, model), shading=LATER)
-    light = learn_lab_light(pixels, replace(fit, position_lab_mm=X), use, model)
-    for name in LAB_PARTS:
+    model = replace(model, light=model.light.learnt(pixels, fit, use, model), shading=LATER)
+    light = lab_light(pixels, replace(fit, position_lab_mm=X), use, model)
+    for name in LabLight.names():
         assert getattr(light, name).isfinite().all()
     one = use.clone()
     one[:, 0] = False  # a camera that never sees the ball has no light of its own
-    alone = learn_lab_light(pixels, fit, one, model)
+    alone = lab_light(pixels, fit, one, model)
     assert float(alone.gain[0]) == 1
     assert alone.gloss.isfinite().all()
 
@@ -305,13 +313,13 @@ def test_a_light_that_both_cameras_see_is_learnt_in_the_lab():
     rig, pixels, X, R, _ = pictures()
     use = torch.ones(12, 2, dtype=torch.bool)
     first = fitter_of(rig)
-    fit = first.fit(pixels, X, R, use, first.optics.fine, 4)
+    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
     maps = first.with_light_of(pixels, fit, use)
-    lit, again, rivals = maps.lit_in_the_lab(pixels, fit, use, preferred=True)
+    lit, again, rivals = lit_in_the_lab(maps, pixels, fit, use, preferred=True)
     assert rivals is None
     assert isinstance(lit.light, LabLight)
     smooth = first.with_light_of(pixels, fit, use, glints=False)
-    assert again.score.mean() > smooth.fit(pixels, X, R, use, first.optics.fine, 3).score.mean()
+    assert again.score.mean() > smooth.fit(pixels, PoseStart(X, R, use), first.optics.fine, 3).score.mean()
 
 
 def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
@@ -323,19 +331,19 @@ def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
     pixels = replace(pixels, grey=lit + (1 - view.coverage) * pixels.behind + noise)
     use = torch.ones(12, 2, dtype=torch.bool)
     first = fitter_of(rig)
-    fit = first.fit(pixels, X, R, use, first.optics.fine, 4)
+    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
     maps = first.with_light_of(pixels, fit, use)
-    assert maps.lit_in_the_lab(pixels, fit, use)[:2] == (maps, fit)
+    assert lit_in_the_lab(maps, pixels, fit, use)[:2] == (maps, fit)
 
 
 def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
     rig, pixels, X, R, _ = pictures()
     use = torch.ones(12, 2, dtype=torch.bool)
     first = fitter_of(rig)
-    fit = first.fit(pixels, X, R, use, first.optics.fine, 4)
+    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
     maps = first.with_light_of(pixels, fit, use)
-    monkeypatch.setattr(fitter, "MORE_EXPLAINED", math.inf)  # neither explains clearly more
-    lit, kept, rivals = maps.lit_in_the_lab(pixels, fit, use)
+    monkeypatch.setattr(kinds, "MORE_EXPLAINED", math.inf)  # neither explains clearly more
+    lit, kept, rivals = lit_in_the_lab(maps, pixels, fit, use)
     assert lit is maps
     assert kept is fit
     one, other, held = rivals
@@ -350,4 +358,4 @@ def test_few_poses_stay_with_maps():
     some = pixels.where(torch.arange(12))
     _, fit = learnt()
     maps = fitter_of(rig)
-    assert maps.lit_in_the_lab(some, fit.of(torch.arange(6)), torch.ones(6, 2, dtype=torch.bool))[0] is maps
+    assert lit_in_the_lab(maps, some, fit.of(torch.arange(6)), torch.ones(6, 2, dtype=torch.bool))[0] is maps

@@ -7,14 +7,13 @@ from functools import cache
 
 import torch
 from conftest import assert_close
-from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, rig_of
+from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, refined, rig_of
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import FittedPoses, learn_light, refine
-from sphereorient.pose.lasting import Lasting, _of_left_out, lasting_errors
-from sphereorient.pose.model import no_glints
-from sphereorient.pose.start import PoseStart
+from sphereorient.pose.lasting import Lasting, lasting_errors, of_left_out
+from sphereorient.pose.lights.disk import no_glints
+from sphereorient.pose.poses import FittedPoses, PoseStart
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y
@@ -38,10 +37,10 @@ def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, 
     fit = fitted(RIG, "patches", pixels, X, R, SIGMA)
     model, use = model_of(RIG.table("patches"), SIGMA), torch.ones(count, 2, dtype=torch.bool)
     for _ in range(2):
-        light = learn_light(pixels, fit, use, model)
+        light = model.light.learnt(pixels, fit, use, model)
         model = replace(model, light=light if glints else replace(light, glints=no_glints(2)))
-        begin = PoseStart(position_lab_mm=fit.position_lab_mm, R_lab_body=fit.R_lab_body, use=use)
-        fit = refine(pixels, begin, model, 3)
+        begin = PoseStart(fit.position_lab_mm, fit.R_lab_body, use)
+        fit = refined(pixels, begin, model, 3)
     found = lasting_errors(pixels, fit, use, model)
     off = torch.cat([so3.log(fit.R_lab_body @ R.mT), fit.position_lab_mm - X], dim=-1)
     return off, fit, found
@@ -90,7 +89,7 @@ def test_leaving_out_is_fitting_again():
     columns = torch.randn(5, 40, 4, generator=rng, dtype=torch.float64)
     grey = torch.randn(5, 40, generator=rng, dtype=torch.float64)
     columns[3] = 0.0  # a part that shows nothing is none
-    found = _of_left_out(columns.mT @ columns, (columns.mT @ grey[..., None])[..., 0], torch.zeros(4, 4).double())
+    found = of_left_out(columns.mT @ columns, (columns.mT @ grey[..., None])[..., 0], torch.zeros(4, 4).double())
 
     def fitted_without(k: int) -> Tensor:
         rest = [part for part in range(5) if part != k]

@@ -18,26 +18,19 @@ from refine_examples import (
     fitted,
     model_of,
     noisy,
+    refined,
     rig_of,
     share_pictures,
 )
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import learn_light, light_columns, light_sums, noise_curve, refine, solved_light
-from sphereorient.pose.model import (
-    FIRST,
-    Light,
-    Lighting,
-    SphereView,
-    light_basis,
-    no_glints,
-    no_stray,
-    polynomials,
-    sphere_view,
-)
+from sphereorient.pose.lights.common import noise_curve
+from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
+from sphereorient.pose.model import FIRST, SphereView, no_stray, polynomials
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.start import PoseStart
+from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.view import sphere_view
 
 KINDS = ("patches",)
 NOISE = torch.tensor([[4.0, 0.05, 0.001, 0.0]])  # grey levels^2 and so on
@@ -51,7 +44,7 @@ def disk_places(count: int, radius: float = 1.0, seed: int = 1) -> Tensor:
     return torch.stack([r * angle.cos(), r * angle.sin()])[None]
 
 
-def looked_up(light: Lighting, across: Tensor) -> tuple[Tensor, Tensor]:
+def looked_up(light: DiskLight, across: Tensor) -> tuple[Tensor, Tensor]:
     """Difference and black of maps of the disk at places (L, 2, P)."""
     return light.at(SimpleNamespace(across=across), None)
 
@@ -96,7 +89,7 @@ def test_beyond_the_limb_and_on_it_the_functions_are_finite_and_so_are_their_slo
 
 def test_maps_that_are_looked_up_are_the_sums_of_functions():
     rng = torch.Generator().manual_seed(5)
-    light = Light(
+    light = DiskLight(
         difference=50 * torch.randn(2, 25, generator=rng),
         black=20 * torch.randn(2, 25, generator=rng),
         noise=NOISE.repeat(2, 1),
@@ -120,7 +113,7 @@ def test_a_lamp_is_looked_up_to_a_grey_level():
     across = disk_places(5000, 0.98)
     difference, black = maps_of(*lamp_coefficients())
     none = {"glints": no_glints(1), "stray": no_stray(1)}
-    light = Light(difference=difference[None], black=black[None], noise=NOISE, **none, known=True)
+    light = DiskLight(difference=difference[None], black=black[None], noise=NOISE, **none, known=True)
     for got, expected in zip(looked_up(light, across), lamp(across, 0), strict=True):
         assert (got - expected)[across.norm(dim=1) < 0.9].abs().max() < 1.0
         assert (got - expected).square().mean().sqrt() < 0.4
@@ -138,7 +131,7 @@ def maps_of(*coefficients: Tensor) -> tuple[Tensor, ...]:
 
 
 def test_unknown_light_is_one_and_nothing_everywhere():
-    light = Light.unknown(3, NOISE.repeat(3, 1))
+    light = DiskLight.unknown(3, NOISE.repeat(3, 1))
     assert not light.known
     difference, black = looked_up(light, disk_places(500, 1.2).repeat(6, 1, 1))
     assert (difference == 1).all()
@@ -264,7 +257,7 @@ def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():
     use = torch.ones(12, 2, dtype=torch.bool)
     fit = fitted(rig, "patches", pixels, X, R, 5.0, shading=FIRST)
     model = model_of(rig.table("patches"), 5.0, FIRST)
-    light = learn_light(pixels, fit, use, model)
+    light = model.light.learnt(pixels, fit, use, model)
     assert light.known
     across = disk_places(3000, 0.9).repeat(2, 1, 1)
     for k, part in enumerate(looked_up(light, across)):
@@ -281,7 +274,7 @@ def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():
     some[6:, 1] = False
     grey = pixels.grey.clone()
     grey[13::2] = 255 - grey[13::2]
-    fewer, spoilt = (learn_light(shown, fit, some, model) for shown in (pixels, replace(pixels, grey=grey)))
+    fewer, spoilt = (model.light.learnt(shown, fit, some, model) for shown in (pixels, replace(pixels, grey=grey)))
     for name in ("difference", "black", "noise"):
         assert_close(getattr(spoilt, name), getattr(fewer, name), atol=1e-6)
     assert not fewer.noise[1].equal(light.noise[1])
@@ -294,8 +287,8 @@ def test_light_is_hardly_bent_by_the_errors_of_poses_that_were_found_without_it(
     pixels = cut(rig, lamp_pictures(rig, X, R, 1.0), X)
     use = torch.ones(24, 2, dtype=torch.bool)
     fit, model = fitted(rig, "patches", pixels, X, R, 1.0), model_of(rig.table("patches"), 1.0)
-    lit = replace(model, light=learn_light(pixels, fit, use, model))
-    again = refine(pixels, PoseStart(position_lab_mm=fit.position_lab_mm, R_lab_body=fit.R_lab_body, use=use), lit)
+    lit = replace(model, light=model.light.learnt(pixels, fit, use, model))
+    again = refined(pixels, PoseStart(fit.position_lab_mm, fit.R_lab_body, use), lit)
     before, after = (so3.log(one.R_lab_body @ R.mT).mean(0).norm() for one in (fit, again))
     assert after < 0.25 * before
 

@@ -29,8 +29,9 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.cameras.ideal import TelecentricCamera
-from sphereorient.pose.model import SphereView, sphere_view
+from sphereorient.pose.model import SphereView
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
+from sphereorient.pose.view import sphere_view
 from sphereorient.sphere import sample_texture
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 

@@ -24,11 +24,11 @@ from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
-from sphereorient.pose.fitter import CameraView, first_fitter
-from sphereorient.pose.model import sphere_view
+from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.neighbours import Neighbours, spoilt
-from sphereorient.pose.settle import settled
-from sphereorient.pose.start import NearStart
+from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.view import sphere_view
 
 RIG, COUNT = rig_of(), 4
 
@@ -107,7 +107,7 @@ def test_a_nearer_ball_that_moves_covers_what_it_covers_at_both_ends_of_the_expo
 
 def test_fits_look_past_the_other_ball_compiled_or_not_and_without_one_keep_their_bytes(scene, monkeypatch):
     fitter, frames, X, R, others = scene
-    begin = NearStart(
+    begin = PoseStart(
         position_lab_mm=X,
         R_lab_body=torch.cat([turned(R[k : k + 1], 0.3, k) for k in range(COUNT)]),
         use=torch.ones(COUNT, 2, dtype=torch.bool),
@@ -115,12 +115,12 @@ def test_fits_look_past_the_other_ball_compiled_or_not_and_without_one_keep_thei
         moved=torch.zeros(COUNT, 6, dtype=torch.float64),
         held=False,
     )
-    plain, past = settled(fitter, frames, begin), settled(fitter, frames, replace(begin, among=others))
+    plain, past = fitter.settled(frames, begin), fitter.settled(frames, replace(begin, among=others))
     off = [torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)) for fit in (plain, past)]
     assert float(off[1].max()) < 0.3
     assert float(off[1][:-1].max()) < 0.7 * float(off[0][:-1].max())
     assert torch.equal(past.R_lab_body[-1], plain.R_lab_body[-1])
     assert torch.equal(past.covariance[-1], plain.covariance[-1])
     monkeypatch.setattr(compiled, "library", lambda: None)
-    slow = settled(fitter, frames, replace(begin, among=others))
+    slow = fitter.settled(frames, replace(begin, among=others))
     assert float(torch.rad2deg(so3.geodesic_distance(slow.R_lab_body, past.R_lab_body)).max()) < 2e-3

@@ -11,8 +11,8 @@ from refine_examples import BEHIND, BLUR_PX, RADIUS_MM, balls, noisy, paint_of, 
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.pose import fitter
-from sphereorient.pose.fitter import PoseFitter
+from sphereorient.pose import camera_view
+from sphereorient.pose.pose_fitter import PoseFitter
 
 RIG = rig_of(64.0)
 
@@ -64,7 +64,7 @@ TABLES = [(80, 0.4, 512), (100, 0.4, 512), (160, 0.4, 1024), (400, 0.8, 1024)]
 @pytest.mark.parametrize(("diameter_px", "blur_px", "side"), TABLES)
 def test_large_disks_have_a_finer_table(monkeypatch, diameter_px, blur_px, side):
     """At 250 px the usual table alone cost 0.009 degrees for 0.0025."""
-    monkeypatch.setattr(fitter, "texture_table", lambda texture, blur_rad, side, unseen: (blur_rad, side))
-    blur_rad, cells = fitter.base_table(torch.zeros(4, 8), diameter_px)
+    monkeypatch.setattr(camera_view, "texture_table", lambda texture, blur_rad, side, unseen: (blur_rad, side))
+    blur_rad, cells = camera_view.base_table(torch.zeros(4, 8), diameter_px)
     assert blur_rad * diameter_px / 2 == pytest.approx(blur_px)
     assert cells == side

@@ -24,10 +24,10 @@ from refine_examples import (
 from sphereorient import so3
 from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
-from sphereorient.pose.fit import POSE_PARTS
-from sphereorient.pose.fitter import CameraView, first_fitter
-from sphereorient.pose.settle import NEAR_RAD, settled
-from sphereorient.pose.start import NearStart
+from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.fitter import first_fitter
+from sphereorient.pose.poses import POSE_PARTS, PoseStart
+from sphereorient.pose.settle import NEAR_RAD
 
 RIG, COUNT = rig_of(), 6
 pytestmark = pytest.mark.skipif(
@@ -55,13 +55,13 @@ def scene():
     return fitter, pictures, X, R
 
 
-def start(X, R, *, held: bool = False) -> NearStart:
+def start(X, R, *, held: bool = False) -> PoseStart:
     """Poses off by less and by more than the first step can mend."""
     count = len(X)
     off = torch.linspace(0.05, 2.0, count).tolist()
     use = torch.ones(count, 2, dtype=torch.bool)
     use[1, 0] = False
-    return NearStart(
+    return PoseStart(
         position_lab_mm=X if held else torch.cat([moved(X[k : k + 1], 0.05 * off[k], k) for k in range(count)]),
         R_lab_body=torch.cat([turned(R[k : k + 1], off[k], k) for k in range(count)]),
         use=use,
@@ -84,9 +84,9 @@ def assert_same(found, expected) -> None:
 def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
     fitter, pictures, X, R = scene
     frames, begin = [list(row) for row in pictures.astype(kind)], start(X, R, held=held)
-    found = settled(fitter, frames, begin)
+    found = fitter.settled(frames, begin)
     monkeypatch.setattr(compiled, "library", lambda: None)
-    expected = settled(fitter, frames, begin)
+    expected = fitter.settled(frames, begin)
     assert_same(found, expected)
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, R)).max()) < 0.5
 
@@ -94,7 +94,7 @@ def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
 def test_a_fit_goes_on_while_its_steps_are_long(scene):
     fitter, pictures, X, R = scene
     far = torch.cat([turned(R[k : k + 1], 15.0, k) for k in range(COUNT)])
-    fit = settled(fitter, [list(row) for row in pictures], replace(start(X, R), R_lab_body=far))
+    fit = fitter.settled([list(row) for row in pictures], replace(start(X, R), R_lab_body=far))
     assert float(fit.step[:, :3].norm(dim=-1).max()) < NEAR_RAD
     assert float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).max()) < 0.5
 
@@ -102,10 +102,10 @@ def test_a_fit_goes_on_while_its_steps_are_long(scene):
 def test_the_shutter_is_open_while_the_ball_moves(scene, monkeypatch):
     fitter, pictures, X, R = scene
     frames, begin = [list(row) for row in pictures], start(X, R)
-    found = settled(replace(fitter, instants=3), frames, begin)
-    assert not torch.equal(found.R_lab_body, settled(fitter, frames, begin).R_lab_body)
+    found = replace(fitter, instants=3).settled(frames, begin)
+    assert not torch.equal(found.R_lab_body, fitter.settled(frames, begin).R_lab_body)
     monkeypatch.setattr(compiled, "library", lambda: None)
-    assert_same(found, settled(replace(fitter, instants=3), frames, begin))
+    assert_same(found, replace(fitter, instants=3).settled(frames, begin))
 
 
 def test_lines_of_sight_may_start_at_different_places(scene, monkeypatch):
@@ -118,17 +118,17 @@ def test_lines_of_sight_may_start_at_different_places(scene, monkeypatch):
     ported.one_origin, ported.pitch_mm = False, torch.full_like(sight.pitch_rad, 0.01)
     views[1] = replace(views[1], sight=ported)
     behind_a_wall, frames = replace(fitter, views=views), [list(row) for row in pictures]
-    found = settled(behind_a_wall, frames, start(X, R))
+    found = behind_a_wall.settled(frames, start(X, R))
     monkeypatch.setattr(compiled, "library", lambda: None)
-    assert_same(found, settled(behind_a_wall, frames, start(X, R)))
+    assert_same(found, behind_a_wall.settled(frames, start(X, R)))
 
 
 def test_a_pose_does_not_depend_on_its_batch_or_on_how_a_frame_lies_in_memory(scene):
     fitter, pictures, X, R = scene
     frames, begin = [list(row) for row in pictures.astype(np.uint8)], start(X, R)
-    whole = settled(fitter, frames, begin)
+    whole = fitter.settled(frames, begin)
     rows = torch.tensor([1, 5])
     flipped = [[np.ascontiguousarray(frame[:, ::-1])[:, ::-1] for frame in frames[k]] for k in rows.tolist()]
-    some = settled(fitter, flipped, begin.of(rows))
+    some = fitter.settled(flipped, begin.of(rows))
     for name in POSE_PARTS:
         assert torch.equal(getattr(whole, name)[rows], getattr(some, name)), name

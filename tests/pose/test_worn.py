@@ -10,7 +10,6 @@ import torch
 from refine_examples import BLUR_PX, balls, cut, fitted, model_of, noisy, paint_of, pictures_of, rig_of, turn_errors
 
 from sphereorient import so3
-from sphereorient.pose.fit import learn_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN
 from sphereorient.pose.worn import CELLS, without, worn_cells, worn_of_text, worn_share, worn_text
 from sphereorient.sphere.texture import map_directions
@@ -38,7 +37,7 @@ def found(pixels, paint, use=USE):
     """Fit with a map, learn the light, and return where the paint differs."""
     model = model_of(table(paint), SIGMA, FIRST)
     fit = fitted(RIG, "patches", pixels, X, R, SIGMA, paint=model.paint, shading=FIRST)
-    model = replace(model, light=learn_light(pixels, fit, use, model), shading=LATER)
+    model = replace(model, light=model.light.learnt(pixels, fit, use, model), shading=LATER)
     return worn_cells(pixels, fit, use, model), fit, model
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, OutputError, TrackError
 from sphereorient.files.whole_file import writing
-from sphereorient.pose.model import light_basis
+from sphereorient.pose.lights.disk import light_basis
 from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, flag_words, frame_warnings
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
 from sphereorient.report.overlay_model import (

@@ -13,7 +13,7 @@ from orient_examples import attitudes, best_errors_deg, of_disk, texture_of
 from sphereorient import so3
 from sphereorient.errors import ShapeError
 from sphereorient.search import Candidates, GreySearch, GreySearchSettings
-from sphereorient.search.grey_search import BATCH, DEVIATIONS, _steps
+from sphereorient.search.grey_search import BATCH, DEVIATIONS, to_int8
 from sphereorient.sphere import perspective_view, reduced_texture
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
@@ -248,7 +248,7 @@ def test_whole_numbers_keep_the_correlation_to_a_few_thousandths():
     search = grey_search_of("blobs")
     even = search._normalise(camera_disks("blobs", attitudes(BATCH)))
     per_unit = (127 / DEVIATIONS) ** 2 * even.shape[1]
-    steps = _steps(even)
+    steps = to_int8(even)
     assert (steps.abs() < 127).float().mean() > 0.999  # hardly anything is cut off
     assert search.bank.shape[1] == steps.shape[1]
     bank = search.bank[:500].float()

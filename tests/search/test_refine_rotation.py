@@ -13,7 +13,7 @@ from orient_examples import attitudes, texture_of
 
 from sphereorient import so3
 from sphereorient.search.normalisation import Blur, LocalNormalisation, rim_share
-from sphereorient.search.refine_rotation import DetailLevel, _rotation, detail_level, level_reference, refine_rotation
+from sphereorient.search.refine_rotation import DetailLevel, cayley, detail_level, level_reference, refine_rotation
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 from sphereorient.sphere.view import disk_offsets
@@ -72,7 +72,7 @@ def test_each_axis_is_turned_the_right_way():
 
 def test_the_steps_rotation_is_one_and_that_of_exp_to_third_order():
     turn = 0.14 * torch.nn.functional.normalize(torch.randn(30, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-    R = _rotation(turn)
+    R = cayley(turn)
     assert_close(R @ R.mT, torch.eye(3).expand(30, 3, 3), atol=1e-6)
     assert so3.geodesic_distance(R, so3.exp(turn)).max() < 0.14**3 / 12 + 1e-6
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera, R_cam_view, Rays
 from sphereorient.errors import CameraError, SettingsError, ShapeError
-from sphereorient.pose.implicit import _moved
+from sphereorient.pose.implicit import moved_by
 from sphereorient.sphere import Sampling, SphereRenderer, sample_texture, sphere_normals
 from sphereorient.sphere.renderer import (
     SHADE,
@@ -270,7 +270,7 @@ def test_the_picture_is_smooth_to_the_second_order_limb_included(rng):
     R = so3.exp(f64([0.4, -0.8, 0.5]))
 
     def picture(delta: Tensor, texture: Tensor) -> Tensor:
-        turned, place = _moved(R, f64([0.3, 0.1, -0.2]), delta)
+        turned, place = moved_by(R, f64([0.3, 0.1, -0.2]), delta)
         return expected_grey(rays, place, turned, a_ball(texture, 0.8))
 
     still = torch.zeros(6, dtype=torch.float64).requires_grad_()

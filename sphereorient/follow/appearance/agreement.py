@@ -17,8 +17,9 @@ from sphereorient.follow.appearance.presence import nothing, proven
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table
 from sphereorient.locate import Frame
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Fitter, Picture, widest_px
+from sphereorient.pose.camera_view import Picture, widest_px
+from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.trajectory import Reason
 
 TRIED = 6  # frames
@@ -174,7 +175,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         only[:, camera] = True
         X, R, _ = best_poses([found[k] for k in tried])
         steps = ((fitter.optics.middle, 3, 3), (fitter.optics.fine, 4, 3))
-        fit = fitter.fit_through(steps, [pictures[k] for k in tried], X, R, only)
+        fit = fitter.fit_through(steps, [pictures[k] for k in tried], PoseStart(X, R, only))
         X, R = fit.position_lab_mm, fit.R_lab_body
         joint = torch.cat([found[k].score[:1, camera] for k in tried])
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))

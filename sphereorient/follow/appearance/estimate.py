@@ -31,7 +31,8 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.fitter import CameraView, Fitter, Optics, Picture, widest_px
+from sphereorient.pose.camera_view import CameraView, Optics, Picture, widest_px
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.sphere.texture_table import TextureTable
@@ -84,7 +85,7 @@ def estimate_appearance(
     views = with_least_merit(search, sure, sample.poses[2]) if alone else studied.fitter.views
     fitter, fit, use = _as_followed(studied, views), studied.fit, studied.use
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
-    lasting = lasting_errors(studied.pixels, fit, use, fitter.model(fitter.optics.fine))
+    lasting = lasting_errors(studied.pixels, fit, use, fitter.model())
     return Appearance(
         fitter=fitter,
         still=replace(fitter, optics=still.fitter.optics, instants=1) if moves else fitter,
@@ -136,7 +137,7 @@ def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
 def _as_followed(studied: Studied, views: Sequence[CameraView]) -> Fitter:
     """Return the fitter of frames that are followed, with the largest disk and the place of the limb."""
     fitter = studied.fitter
-    widest = WIDER * float(fitter.largest_px(studied.fit.position_lab_mm).max())
+    widest = WIDER * float(fitter.disks_px(studied.fit.position_lab_mm).largest_px.max())
     return replace(fitter, views=views, widest_px=widest, limb_px=limb_px(fitter, studied.fit, studied.use))
 
 

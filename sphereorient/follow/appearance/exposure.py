@@ -13,8 +13,10 @@ from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import CLEAR, Following, Studied
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import best_poses
-from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, widest_px
+from sphereorient.pose.camera_view import FINEST_PX, Optics, widest_px
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.neighbours import Neighbours
+from sphereorient.pose.poses import PoseStart
 
 LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
 MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured
@@ -32,7 +34,7 @@ def with_motion(
     if moved is None:
         return studied, False
     known = studied.use & moved.isfinite().all(1)[:, None]
-    whole, pixels = (open_.exposed(part, moved.nan_to_num()) for part in (studied.whole, studied.pixels))
+    whole, pixels = (part.exposed(moved.nan_to_num(), open_.instants) for part in (studied.whole, studied.pixels))
     opened = light_and_blur(replace(studied, fitter=open_, whole=whole, pixels=pixels, use=known), given=False)
     more = opened.fitter.left(pixels, opened.fit, known) - studied.fitter.left(studied.pixels, studied.fit, known)
     return (opened, False) if more < 0 else (studied, more > MORE_LEFT)
@@ -58,7 +60,7 @@ def _exposed(
             pictures = [[shot.picture for shot in shots[k]] for k in these.tolist()]
             known, shown, was = seen[these], usable[these], before.of(these)
             beside = None if others is None else others.of(some[these])
-            there = fitter.fit_through(fitter.optics.steps, pictures, X, R, known & shown, neighbours=beside)
+            there = fitter.fit_through(fitter.optics.steps, pictures, PoseStart(X, R, known & shown, among=beside))
             right = ((1 - there.score <= CLEAR * (1 - was.score)) | ~known).all(1) & (shown | ~known).all(1)
             turn = so3.log(there.R_lab_body @ was.R_lab_body.mT)
             way = torch.cat([turn, there.position_lab_mm - was.position_lab_mm], dim=-1)

@@ -5,7 +5,10 @@ from dataclasses import replace
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.record import Studied, enough_of, soft
 from sphereorient.pose.blur import FINER, FINEST, best_blur_px
-from sphereorient.pose.fitter import Fitter, Optics, Rivals, widest_px
+from sphereorient.pose.camera_view import Optics, widest_px
+from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.lights import kinds
+from sphereorient.pose.lights.kinds import Rivals
 from sphereorient.pose.occluders import USUALLY_HIDDEN
 
 BLUR_ROUNDS = 4
@@ -48,7 +51,9 @@ def lit_in_the_lab(studied: Studied, *, preferred: bool) -> tuple[Studied, Rival
     """Let light be a function of directions in the lab where that explains more, or, if `preferred`, about as much;
     return also the fits of two models that explain as much as each other.
     """
-    fitter, fit, rivals = studied.fitter.lit_in_the_lab(studied.pixels, studied.fit, studied.use, preferred=preferred)
+    fitter, fit, rivals = kinds.lit_in_the_lab(
+        studied.fitter, studied.pixels, studied.fit, studied.use, preferred=preferred
+    )
     return replace(studied, fitter=fitter, fit=fit), rivals
 
 
@@ -63,5 +68,5 @@ def without_occluders(studied: Studied) -> Studied:
         return replace(studied, fitter=replace(fitter, most_hidden=0.0))
     if not bool(hidden.any()):
         return studied
-    fitter = fitter.lit_again(free, fit, use)
+    fitter = fitter.with_light_of(free, fit, use)
     return replace(studied, fitter=fitter, fit=fitter.again(free, fit, use))

@@ -13,7 +13,9 @@ from sphereorient.follow.appearance.record import ALWAYS, clear_of, soft
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.locate import Frame
-from sphereorient.pose.fitter import LEAST_LEFT, CameraView, Fitter
+from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.fitter import LEAST_LEFT, Fitter
+from sphereorient.pose.poses import PoseStart
 from sphereorient.trajectory import Reason
 
 BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
@@ -121,7 +123,7 @@ def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:
         return poses
     pictures = [[shot.picture for shot in shots]] * len(poses)
     X, R, use = poses.position_lab_mm, poses.R_lab_body, usable.expand(len(poses), -1)
-    fit = fitter.fit_through(fitter.optics.steps, pictures, X, R, use)
+    fit = fitter.fit_through(fitter.optics.steps, pictures, PoseStart(X, R, use))
     order = fit.nll.argsort(stable=True)
     if float(fit.score[order[0], usable].min()) < clear_of(float(poses.score[0, poses.use].min())):
         return poses

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from sphereorient.follow.poses import Poses
 from sphereorient.locate import Frame
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Fitter, defocus_radii, widest_px
+from sphereorient.pose.camera_view import defocus_radii, widest_px
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.pose.worn import worn_share
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -105,10 +106,9 @@ class Studied:
     @classmethod
     def begun(cls, fitter: Fitter, paint: TextureTable, whole: Pixels, poses: tuple[Tensor, Tensor, Tensor]) -> Self:
         """Fit poses: positions (B, 3), rotations (B, 3, 3) and use (B, C)."""
-        X, R, use = poses
         pixels = enough_of(whole)
-        fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
-        return cls(fitter=fitter, paint=paint, whole=whole, pixels=pixels, fit=fit, use=use)
+        fit = fitter.fit(pixels, PoseStart(*poses), fitter.optics.fine, 4)
+        return cls(fitter=fitter, paint=paint, whole=whole, pixels=pixels, fit=fit, use=poses[2])
 
     @property
     def right_score(self) -> float:

@@ -7,9 +7,11 @@ import torch
 from torch import Tensor
 
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import FEWEST_LIT, Fitter, Optics, some_of, widest_px
+from sphereorient.pose.camera_view import Optics, widest_px
+from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.lights.kinds import FEWEST_LIT, some_of
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.worn import CHANGED, without, worn_cells, worn_share
 
 # By how much paint differs that is not used, round by round: while poses are wrong, so do the borders of right paint.
@@ -31,13 +33,13 @@ def without_worn(studied: Studied) -> tuple[Studied, Tensor | None]:
         return studied, None
     # Of a ball that turns little glints take the place of worn paint.
     bare = fitter.with_light_of(pixels, fit, use, glints=False)
-    if worn_share(worn_cells(pixels, fit, use, bare.model(bare.optics.fine))) < WORN_SEEN:
+    if worn_share(worn_cells(pixels, fit, use, bare.model())) < WORN_SEEN:
         return studied, None
 
     def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor | None]:
         now, worn = bare, None
         for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
-            worn = worn_cells(pixels, fit, use, now.model(now.optics.fine), changed)
+            worn = worn_cells(pixels, fit, use, now.model(), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
             optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
             now = replace(now, optics=optics).with_light_of(pixels, fit, use, glints=False)

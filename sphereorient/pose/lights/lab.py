@@ -1,11 +1,8 @@
-"""One light in the lab for all cameras and places: what the paint scatters, and what its gloss mirrors.
-
-`learn_lab_light` estimates it from the fits that `learn_light` estimates maps of the disk from.
-"""
+"""One light in the lab for all cameras and places: what the paint scatters, and what its gloss mirrors."""
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -14,21 +11,19 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
-from sphereorient.pose.fit import FittedPoses, learn_stray, noise_curves
+from sphereorient.pose.lights.common import learn_stray, noise_curves
 from sphereorient.pose.model import (
     LATER,
-    LIGHT_PARTS,
     Light,
-    Lighting,
     LightTables,
     SphereModel,
     SphereView,
-    no_stray,
     polynomials,
     scene_beside,
     surface_normals,
 )
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import by_pose, residuals
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -49,21 +44,21 @@ SHADE = (0.04, 0.02)  # of its own offset, in units of white less black paint
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LabLight:
-    """Light that depends on directions in the lab only, and the noise of the pictures of C cameras.
-    At depth z below the disk's face, where the normal is n and the line of sight d, a pixel of the sphere shows
+class LabLight(Light):
+    """Light that depends on directions in the lab only. At depth z below the disk's face, where the normal is n and the
+    line of sight d, a pixel of the sphere shows
     gain (through(z) (paint difference(n) + black(n)) + mirrored(z) gloss(d + 2 z n)).
     """
 
-    difference: Tensor  # (K,), harmonics of white less black paint, grey levels
+    difference: Tensor  # (K,), harmonics
     black: Tensor  # (K,)
     gloss: Tensor  # (M,), harmonics of the mirrored surroundings, grey levels
     through: Tensor  # (n,), share of light that leaves the paint, at KNOTS of the depth; 1 at the disk's middle
     mirrored: Tensor  # (n,), share of light that the surface mirrors
     gain: Tensor  # (C,), of the cameras
-    noise: Tensor  # (C, 4), see `Light`
-    stray: Tensor  # (C, K), see `Lighting`
-    known: bool = True
+
+    of_cameras = ("noise", "stray", "gain")
+    linear = False
 
     @cached_property
     def _map(self) -> Tensor:
@@ -79,10 +74,10 @@ class LabLight:
 
     @property
     def tables(self) -> LightTables:
-        """What `at` looks up."""
-        return LightTables(cells=self._map, side=SIDE, cover=self._cover, gain=self.gain)
+        """The map of directions, (side^2, 3), and the cover's functions."""
+        return LightTables(kind=1, cells=self._map, side=SIDE, cover=self._cover, gain=self.gain)
 
-    def parts(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, ...]:
+    def shown(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, ...]:
         """Return difference, black, gloss (grey levels), through and mirrored of L disks, (L, P) each."""
         normal, mirror, depth = directions(view, pixels)
         cells = [octahedral_cells(part[:, 0], part[:, 1], part[:, 2], SIDE).reshape(-1) for part in (normal, mirror)]
@@ -92,36 +87,20 @@ class LabLight:
         return tuple(part.reshape(depth.shape) for part in found)
 
     def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
-        """Return difference and black, grey levels, (L, P) each, of L disks, the C cameras of a pose side by side."""
-        difference, black, gloss, through, mirrored = self.parts(view, pixels)
+        """Look up difference and black; see `Light.at`."""
+        difference, black, gloss, through, mirrored = self.shown(view, pixels)
         gain = self.gain.repeat(len(gloss) // len(self.gain))[:, None]
         return gain * through * difference, gain * (through * black + mirrored * gloss)
 
-    def of(self, *cameras: int) -> "LabLight":
-        """Return the light as some cameras see it."""
-        some = list(cameras)
-        return replace(self, gain=self.gain[some], noise=self.noise[some], stray=self.stray[some])
-
-    def to(self, device: torch.device) -> "LabLight":
-        """Return the light on another device."""
-        return replace(self, **{name: getattr(self, name).to(device) for name in LAB_PARTS})
+    def learnt(
+        self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
+    ) -> "LabLight":
+        """Estimate light and noise from this light on; see `Light.learnt`."""
+        *_, light = lab_lights(pixels, fit, use, model, self)
+        return light
 
 
 UNKNOWN = ("difference", "black", "gloss", "through", "mirrored")
-LAB_PARTS = tuple(field.name for field in fields(LabLight) if field.name != "known")
-
-
-def light_parts(light: Lighting) -> dict[str, Tensor]:
-    """Return the tensors that a light consists of, by name, on the CPU."""
-    names = LAB_PARTS if isinstance(light, LabLight) else LIGHT_PARTS
-    return {name: getattr(light, name).cpu() for name in names}
-
-
-def light_of(parts: Mapping[str, Tensor], known: bool) -> Light | LabLight:
-    """Return the light that consists of some tensors, `light_parts` and others; older files lack stray light."""
-    parts = {"stray": no_stray(len(parts["noise"])), **parts}
-    kind, names = (LabLight, LAB_PARTS) if "gloss" in parts else (Light, LIGHT_PARTS)
-    return kind(known=known, **{name: parts[name] for name in names})
 
 
 def directions(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
@@ -182,34 +161,26 @@ def _cells(coefficients: Tensor, degree: int) -> Tensor:
     return sample_texture(grid, octahedral_directions(SIDE)).float()
 
 
-def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
-    """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known: from
-    there where it is a light of the lab, else from an even one.
-    """
-    *_, light = lab_lights(pixels, fit, use, model)
-    return light
-
-
-def lab_lights(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Iterator[LabLight]:
-    """Yield the estimates of `learn_lab_light` half-way and at the end.
-    Gauss-Newton at the fits' poses; the light of each frame may differ a little, as its tints do in the fit.
+def lab_lights(
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, first: LabLight | None = None
+) -> Iterator[LabLight]:
+    """Yield the light and the noise of the fits of B * C disks, those of `use` (B, C) bool, estimated half-way and at
+    the end. Gauss-Newton at the fits' poses from the first light, None: an even one as bright as that of the model; the
+    light of each frame may differ a little, as its tints do in the fit.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
-    cameras, used = use.shape[1], use.reshape(-1, 1)
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
+    used = use.reshape(-1, 1)
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
     bases = _bases(at.view, pixels)
-    if isinstance(model.light, LabLight):
-        light, rounds = model.light, AGAIN
-    else:
-        light, rounds = _flat(model.light, at.view, pixels, use), ROUNDS
+    light, rounds = (_flat(model.light, at.view, pixels, use), ROUNDS) if first is None else (first, AGAIN)
     light = replace(light, stray=learn_stray(at, pixels, use, light.stray))
     for done in range(1, rounds + 1):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
-        at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
+        at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
         if done in (rounds // 2, rounds):
             counted = at.inside & ~pixels.clipped & used
-            yield replace(light, noise=noise_curves(at.model, at.residual, counted, cameras))
+            yield replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
 
 
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
@@ -222,7 +193,7 @@ def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
     return over[0], over[1], knot_shares(depth).mT
 
 
-def _flat(known: Lighting, view: SphereView, pixels: Pixels, use: Tensor) -> LabLight:
+def _flat(known: Light, view: SphereView, pixels: Pixels, use: Tensor) -> LabLight:
     """Return an even light as bright as a known one, without gloss; a camera that is never in use has gain 1."""
     used, cameras = use.reshape(-1, 1), use.shape[1]
     share = by_pose(view.coverage.where(used, 0.0), cameras)
@@ -252,7 +223,7 @@ def _better(
     unknown = [getattr(light, name) for name in UNKNOWN]
     now, sizes = torch.cat(unknown).double(), [len(part) for part in unknown]
     normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
-    difference, black, gloss, through, mirrored = light.parts(view, pixels)
+    difference, black, gloss, through, mirrored = light.shown(view, pixels)
     shown, ground = light.at(view, pixels)
     cover = view.coverage * light.gain.repeat(len(gloss) // len(light.gain))[:, None]
     learnt = view.coverage * (view.paint * shown + ground)

@@ -1,0 +1,198 @@
+"""What the fits need of each camera, and the paint as its pictures blur it."""
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.cameras import Camera, centre_lab_mm, holds_disk, sphere_radius_px
+from sphereorient.locate import Background, CameraScene
+from sphereorient.movies import OnDemand
+from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
+from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
+
+Picture = NDArray[np.generic]
+Shown = Picture | OnDemand  # of which fits cut out disks
+
+RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
+SIZES = 1.06  # ratio of neighbouring stencil sizes
+FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
+COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
+SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
+FINER_SIDES = 2  # of the usual table, for disks of over 100 px: 16 MB
+FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraView:
+    """One calibrated camera and its movie's empty scene; made by the pipeline, read by the fits."""
+
+    name: str
+    camera: Camera
+    background: Background
+    diameter_px: float  # of the sphere in the middle of the volume
+    sight: LinesOfSight
+    merit_min: float = 0.0  # see `CameraScene`
+
+    @classmethod
+    def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":
+        """Return the view of a camera whose scene is known."""
+        return cls(name=name, camera=camera, sight=LinesOfSight(camera), **vars(scene))
+
+    @property
+    def scene(self) -> CameraScene:
+        """What is known of the camera's movie."""
+        return CameraScene(background=self.background, diameter_px=self.diameter_px, merit_min=self.merit_min)
+
+    def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+        """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
+        return sphere_radius_px(self.camera, position_lab_mm, radius_mm)
+
+    def smear_px(self, position_lab_mm: Tensor, moved: Tensor, radius_mm: float) -> Tensor:
+        """Return how far the middle of the disk moves in the picture, (B,), px, of spheres at (B, 3), mm.
+        `moved` (B, 6): turn (rad) and move (mm) of the sphere while the shutter is open.
+        """
+        sight = torch.nn.functional.normalize(position_lab_mm - centre_lab_mm(self.camera), dim=-1)
+        front = moved[:, 3:] + torch.linalg.cross(moved[:, :3], -radius_mm * sight)
+        across = front - (front * sight).sum(-1, keepdim=True) * sight
+        smear: Tensor = across.norm(dim=-1) * self.radius_px(position_lab_mm, radius_mm) / radius_mm
+        return smear
+
+    def shows_whole(self, centre_px: Tensor, radius_px: Tensor) -> Tensor:
+        """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
+        return holds_disk(self.camera, centre_px, radius_px)
+
+
+def widest_px(views: Sequence[CameraView]) -> float:
+    """Return the expected diameter of the sphere, px, in the camera that sees it largest."""
+    return max(view.diameter_px for view in views)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PyramidLevel:
+    """One width of detail: what is laid over the picture, which pixels are looked at, the paint as blurred."""
+
+    extra_px: float
+    blur_px: float
+    paint: TextureTable
+
+    def stencil(self, radius_px: float) -> Stencil:
+        """Return the places of a disk of some radius."""
+        return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
+
+
+Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
+
+
+class Optics:
+    """Texture tables at the levels of blur of the fits: pictures of blur `blur_px` and disks of `diameter_px`, px."""
+
+    def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
+        self.blur_px = blur_px
+        self._radius_px = diameter_px / 2
+        self.fine = level_of(base, blur_px, 0.0, self._radius_px)
+
+    # Each from the one before: a wider blur allows a smaller table.
+    @cached_property
+    def middle(self) -> PyramidLevel:
+        """The level of a fit that is right to a few degrees."""
+        return level_of(self.fine.paint, self.blur_px, MIDDLE * self._radius_px, self._radius_px)
+
+    @cached_property
+    def coarse(self) -> PyramidLevel:
+        """The level of a fit from a candidate."""
+        return level_of(self.middle.paint, self.blur_px, COARSE * self._radius_px, self._radius_px)
+
+    @property
+    def steps(self) -> Steps:
+        """The steps of a fit from poses that are roughly right to all detail."""
+        return (self.coarse, 1, 4), (self.middle, 1, 3), (self.fine, 1, 4)
+
+    def to(self, device: torch.device) -> "Optics":
+        """Return the same with its tables on another device."""
+        moved = copy(self)
+        for name in ("fine", "middle", "coarse"):
+            level: PyramidLevel = getattr(self, name)
+            setattr(moved, name, replace(level, paint=level.paint.to(device)))
+        return moved
+
+
+def level_of(base: TextureTable, blur_px: float, extra_px: float, radius_px: float) -> PyramidLevel:
+    """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`."""
+    whole = math.hypot(blur_px, extra_px)
+    return PyramidLevel(extra_px=extra_px, blur_px=whole, paint=base.blurred(whole / radius_px))
+
+
+def base_table(texture: Tensor, diameter_px: float, unseen: Tensor | None = None) -> TextureTable:
+    """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it.
+    `unseen` (H, 2 H) bool: texels that are no paint.
+    """
+    blur_rad = max(FINEST_PX * 2 / diameter_px, BASE_RAD / FINER_SIDES)
+    finer = 1 << max(0, math.ceil(math.log2(BASE_RAD / blur_rad)))  # large disks resolve smaller cells
+    return texture_table(texture, blur_rad, finer * SIDE, unseen)
+
+
+def size_steps(ratio: float) -> int:
+    """Return how many steps of `SIZES` a ratio of stencil sizes needs."""
+    return math.ceil(math.log(ratio) / math.log(SIZES))
+
+
+def defocus_radii(blur_px: float, diameter_px: float) -> float:
+    """Return the blur of pictures, radii, as the search needs it: 0 unless they are defocused."""
+    blur = 2 * blur_px / diameter_px
+    return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameDisks:
+    """The disks of B spheres in the frames of C cameras; made by `FrameDisks.of`."""
+
+    views: Sequence[CameraView]  # C
+    frames: Sequence[Sequence[Picture]]  # B of C, decoded at least where the disks are
+    middle_px: Tensor  # (C, B, 2)
+    stencil: Stencil
+    hidden: Tensor | None  # (B * C, P) bool, places that do not count; None: all count
+
+    @classmethod
+    def of(
+        cls,
+        views: Sequence[CameraView],
+        pictures: Sequence[Sequence[Shown]],
+        middle_px: Tensor,
+        stencil: Stencil,
+        hidden: Tensor | None = None,
+        blur_px: float = 0.0,
+    ) -> "FrameDisks":
+        """Decode what the disks about `middle_px` and a blur laid over them read of the pictures."""
+        middles = middle_px.nan_to_num().tolist()
+
+        def window(b: int, c: int) -> tuple[int, int, int, int]:
+            return window_of(middles[c][b], stencil, blur_px, views[c].sight.size)
+
+        for b, row in enumerate(pictures):
+            for c, frame in enumerate(row):
+                if isinstance(frame, OnDemand):  # all of them, before the first is waited for
+                    frame.ask(*window(b, c))
+        frames = [
+            [frame.part(*window(b, c)) if isinstance(frame, OnDemand) else frame for c, frame in enumerate(row)]
+            for b, row in enumerate(pictures)
+        ]
+        return cls(views=views, frames=frames, middle_px=middle_px, stencil=stencil, hidden=hidden)
+
+    def pixels(self, blur_px: float = 0.0) -> Pixels:
+        """Return the pixels of the B * C disks, with a blur laid over the frames."""
+        middles = self.middle_px.nan_to_num().tolist()
+        pixels = stacked(
+            [
+                cut_pixels(frame, view.background, view.sight, middles[c][b], self.stencil, blur_px)
+                for b, frames in enumerate(self.frames)
+                for c, (view, frame) in enumerate(zip(self.views, frames, strict=True))
+            ]
+        )
+        return pixels if self.hidden is None else replace(pixels, inside=pixels.inside & ~self.hidden)

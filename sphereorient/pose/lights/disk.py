@@ -1,0 +1,156 @@
+"""Light as maps over the disk of each camera: sums of functions, and glints of lamps that the surface mirrors."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from sphereorient.pose.lights.common import learn_stray, noise_curves
+from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_stray, polynomials, scene_beside
+from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.poses import FittedPoses
+from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
+from sphereorient.so3 import inverse_damped
+
+MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
+ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
+GLINTS = 32  # cells across the disk
+WHOLE = 0.99  # coverage of a pixel that the limb does not cut
+RIDGE = 1e-5  # of light maps, relative to the diagonal
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DiskLight(Light):
+    """Light on the disk, one map per camera."""
+
+    difference: Tensor  # (C, K), of `light_basis`
+    black: Tensor  # (C, K)
+    glints: Tensor  # (C, G, G), more of black, over the square about the disk: lamps that the surface mirrors
+
+    of_cameras = ("difference", "black", "noise", "stray", "glints")
+    linear = True
+
+    @classmethod
+    def unknown(cls, cameras: int, noise: Tensor) -> "DiskLight":
+        """Return flat light, for the first fits: difference is 1 everywhere, black and glints are 0."""
+        count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
+        difference = torch.zeros(cameras, count)
+        difference[:, 0] = 1.0
+        black, glints, stray = torch.zeros(cameras, count), no_glints(cameras), no_stray(cameras)
+        return cls(difference=difference, black=black, glints=glints, noise=noise, stray=stray, known=False)
+
+    @cached_property
+    def _map(self) -> Tensor:
+        """Return difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
+        at = (torch.arange(MAP_SIDE, dtype=torch.float32, device=self.difference.device) + 0.5) * (2.0 / MAP_SIDE) - 1.0
+        y, x = torch.meshgrid(at, at, indexing="ij")
+        across = torch.stack([x, y]).reshape(2, -1)
+        # Cells that the limb cuts take their value on the disk.
+        across = across / across.norm(dim=0).clamp_min(1.0)
+        basis = light_basis(across)
+        black = self.black @ basis + glints_at(self.glints, across.mT.expand(len(self.glints), -1, -1))
+        return torch.stack([self.difference @ basis, black], dim=-1).reshape(-1, 2)
+
+    @property
+    def tables(self) -> LightTables:
+        """The maps, (C * side^2, 2)."""
+        return LightTables(kind=0, cells=self._map, side=MAP_SIDE)
+
+    def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Look up difference and black; see `Light.at`."""
+        across, cameras = view.across, len(self.difference)
+        column, row = ((across + 1.0) * (0.5 * MAP_SIDE)).to(torch.int32).clamp_(0, MAP_SIDE - 1).unbind(1)
+        camera = torch.arange(len(across), device=across.device, dtype=torch.int32) % cameras
+        cell = (camera[:, None] * MAP_SIDE + row) * MAP_SIDE + column
+        found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
+        return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
+
+    def learnt(
+        self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
+    ) -> "DiskLight":
+        """Estimate light and noise anew; see `Light.learnt`. Each pose may change with the light: a light at given
+        poses favours them, however wrong they are.
+        """
+        cameras = use.shape[1]
+        at = fitted_residuals(pixels, fit, model)
+        stray = learn_stray(at, pixels, use, self.stray)
+        found = learn_glints(at, use, self.glints) if glints else no_glints(cameras)
+        mirrored = at.view.coverage * glints_at(found.repeat(len(use), 1, 1), at.view.across.mT)
+        lit = replace(pixels, behind=scene_beside(at.view, pixels, stray), grey=pixels.grey - mirrored)
+        columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
+        normal, right = light_sums(columns, at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
+        normal, right = by_pose(normal, cameras), by_pose(right, cameras)
+        by_light = normal[..., 6:, :6].flatten(1, 2)  # (B, C 2K, 6): the cameras share the pose
+        mixed = by_light @ inverse_damped(normal[..., :6, :6].sum(1))
+        each = torch.einsum("cd,cij->cidj", torch.eye(cameras, dtype=torch.float64), normal[..., 6:, 6:].sum(0))
+        whole = each.flatten(2, 3).flatten(0, 1) - (mixed @ by_light.mT).sum(0)
+        force = right[..., 6:].sum(0).flatten() - (mixed @ right[..., :6].sum(1)[..., None])[..., 0].sum(0)
+        difference, black = solved_light(whole, force).reshape(cameras, -1).chunk(2, dim=-1)
+        counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
+        noise = noise_curves(at.model, at.residual, counted, cameras)
+        return DiskLight(difference=difference, black=black, noise=noise, stray=stray, glints=found)
+
+
+def light_basis(across: Tensor) -> Tensor:
+    """Return the basis of light maps, (..., K, P): polynomials in the normal's components, which fit grazing lamps."""
+    depth = (1.0 - across.square().sum(-2)).clamp_min(0).sqrt()
+    return torch.cat([polynomials(across, ORDER), polynomials(across, DEPTH_ORDER) * depth[..., None, :]], dim=-2)
+
+
+def no_glints(cameras: int) -> Tensor:
+    """Return the glints of a surface that mirrors no lamp."""
+    return torch.zeros(cameras, GLINTS, GLINTS)
+
+
+def glints_at(glints: Tensor, across: Tensor) -> Tensor:
+    """Return the glints (L, G, G) of L disks at places (L, P, 2), radii: grey levels (L, P), linear between cells."""
+    sampled = torch.nn.functional.grid_sample(
+        glints[:, None], across[:, None].to(glints), padding_mode="border", align_corners=False
+    )
+    return sampled[:, 0, 0]
+
+
+def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
+    """Estimate what the surface mirrors, (C, G, G), see `Light`, from what B * C disks, those of `use` (B, C), leave
+    in the same cell of the disk, but for its limb. `known` (C, G, G) is the one that the residuals hold. By how much a
+    cell's mean is drawn to 0 follows from the scatter over the disks: of a mat ball all are.
+    Source: empirical Bayes, James and Stein 1961.
+    """
+    cameras, cells = use.shape[1], GLINTS**2
+    column, row = ((at.view.across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
+    precision = (at.weight / at.variance * (at.view.coverage > WHOLE) * use.reshape(-1, 1)).double()
+    sums = precision.new_zeros(2, len(precision), cells)
+    sums[0].scatter_add_(1, row * GLINTS + column, precision)
+    sums[1].scatter_add_(1, row * GLINTS + column, precision * at.residual)
+    weight, pull = (by_pose(part, cameras) for part in sums)  # (B, C, cells)
+    whole = weight.sum(0).clamp_min(1e-30)
+    mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
+    off = pull - weight * mean
+    error2 = off.square().sum(0) / whole.square() * number / (number - 1)
+    told = number > 1
+    signal2 = torch.where(told, mean.square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
+    signal2 = signal2.clamp_min(0.0)[:, None]
+    share = torch.where(told, signal2 / (signal2 + error2), 0.0).nan_to_num()
+    return known + (share * mean).reshape(known.shape).float()
+
+
+def light_columns(view: SphereView) -> Tensor:
+    """Return what each coefficient of light maps, K of difference and K of black, adds to L disks, (L, 2 K, P)."""
+    basis = light_basis(view.across)
+    return torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
+
+
+def light_sums(columns: Tensor, view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal equations of what columns (L, n, P) add to L disks, (L, n, n) and (L, n); precision (L, P)."""
+    weighted = columns * precision[:, None]
+    target = pixels.grey - (1.0 - view.coverage) * pixels.behind
+    return (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double()
+
+
+def solved_light(normal: Tensor, right: Tensor) -> Tensor:
+    """Solve summed normal equations (..., n, n), (..., n) for coefficients of light maps, (..., n)."""
+    # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge picks the smallest coefficients.
+    ridge = RIDGE * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
+    solution: Tensor = torch.linalg.solve(normal + torch.diag_embed(ridge), right)
+    return solution.float()

@@ -1,0 +1,110 @@
+"""`PoseFitter`: poses from pictures without the pipeline."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from sphereorient.cameras import Camera
+from sphereorient.errors import CameraError, SettingsError, ShapeError, check_finite, check_tail, refusal, tensor_of
+from sphereorient.locate import Background, CameraScene
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, base_table
+from sphereorient.pose.fitter import first_fitter
+from sphereorient.pose.poses import PoseStart
+from sphereorient.so3 import check_rotations
+from sphereorient.sphere.texture import as_texture
+
+NOISE = 1.0  # grey levels, of a background of one grey
+
+
+class PoseFitter(nn.Module):
+    """Fits poses of a sphere of known texture to pictures of one or more calibrated cameras, coarse to fine.
+
+    Args:
+        cameras: one, or C of them.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        radius_mm: of the sphere.
+        diameter_px: expected diameter of the sphere's disk in the pictures.
+        blur_px: standard deviation of optics, pixel and exposure together, px.
+        background: (C, H, W), grey levels of the scene without the sphere; None: black.
+
+    Raises:
+        CameraError: something else than cameras.
+        SettingsError: radius or diameter not above 0.
+        ShapeError: texture is not (H, 2 H), or not of numbers 0 .. 1.
+    """
+
+    def __init__(
+        self,
+        cameras: Camera | Sequence[Camera],
+        texture: Tensor | NDArray[np.generic],
+        *,
+        radius_mm: float,
+        diameter_px: float,
+        blur_px: float = FIRST_BLUR_PX,
+        background: Tensor | NDArray[np.generic] | None = None,
+    ) -> None:
+        super().__init__()
+        seen = list(cameras) if isinstance(cameras, Sequence) else [cameras]
+        for one in seen:
+            if not hasattr(one, "image_size"):
+                do = "pass one of load_cameras(path).values(), or a list of them"
+                raise CameraError(refusal("cameras", expected="cameras", got=type(one).__name__, do=do))
+        for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px)):
+            if not value > 0:
+                raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do="measure it"))
+        self.register_buffer("texture", as_texture(texture).float())
+        views = []
+        for k, camera in enumerate(seen):
+            width, height = camera.image_size
+            mean = np.zeros((height, width), np.float32) if background is None else _grey(background[k])
+            noise = np.full(mean.shape, NOISE, np.float32)
+            scene = CameraScene(
+                background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
+            )
+            views.append(CameraView.of(f"camera {k + 1}", camera, scene))
+        base = base_table(self.get_buffer("texture").cpu(), diameter_px)
+        self.fitter = first_fitter(views, radius_mm, base, blur_px)
+
+    def forward(
+        self,
+        pictures: Tensor | NDArray[np.generic],
+        R_lab_body: ArrayLike | Tensor,
+        position_lab_mm: ArrayLike | Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return fitted R_lab_body (..., 3, 3), position_lab_mm (..., 3) and covariance (..., 6, 6), float64.
+        The covariance is of delta (rad, lab) and position (mm). Pictures (..., C, H, W) are grey levels, (..., H, W)
+        for a single camera; the start is right to about 10 degrees and a few pixels.
+
+        Raises:
+            ShapeError: shapes that do not fit together, starts that are no rotations, pictures that are not finite.
+        """
+        R, X = tensor_of("R_lab_body", R_lab_body).double(), tensor_of("position_lab_mm", position_lab_mm).double()
+        check_rotations("R_lab_body", R)
+        check_tail("position_lab_mm", X, 3)
+        device = self.get_buffer("texture").device
+        fitter = self.fitter if device == self.fitter.device else self.fitter.on(device)
+        views = fitter.views
+        height, width = views[0].background.mean.shape
+        grey = tensor_of("pictures", pictures)
+        lead = R.shape[:-2]
+        if grey.shape[-2:] != (height, width) or grey.numel() != lead.numel() * len(views) * height * width:
+            expected = f"(..., {len(views)}, {height}, {width}) with {lead.numel()} poses"
+            raise ShapeError(
+                refusal("pictures", expected=expected, got=str(tuple(grey.shape)), do="pass one picture per camera")
+            )
+        check_finite("pictures", grey)
+        frames = [[_grey(one) for one in row] for row in grey.reshape(-1, len(views), height, width)]
+        R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
+        use = torch.ones(len(R), len(views), dtype=torch.bool)
+        covariance = torch.zeros(len(R), 6, 6, dtype=torch.float64)
+        if len(R):
+            fit = fitter.fit_through(fitter.optics.steps, frames, PoseStart(X, R, use))
+            R, X, covariance = fit.R_lab_body, fit.position_lab_mm, fit.covariance
+        return R.reshape(*lead, 3, 3), X.reshape(*lead, 3), covariance.reshape(*lead, 6, 6)
+
+
+def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:
+    return np.asarray(torch.as_tensor(picture).detach().cpu().numpy(), np.float32)

@@ -1,0 +1,112 @@
+"""Where fits of poses begin, and what they return."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from sphereorient.pose.neighbours import Neighbours
+from sphereorient.pose.pixels import Pixels
+
+
+@dataclass(frozen=True, eq=False)
+class PoseStart:
+    """Where the fit of B poses begins."""
+
+    position_lab_mm: Tensor  # (B, 3)
+    R_lab_body: Tensor  # (B, 3, 3)
+    use: Tensor  # (B, C) bool, the cameras that see the sphere; a pose without any stays
+    place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
+    moved: Tensor | None = None  # (B, 6), turn (rad) and move (mm) while the shutter is open; None: as if at rest
+    held: bool = False  # whether each step begins at the given position
+    among: Neighbours | None = None  # None: no other sphere is in view
+
+    def of(self, rows: Tensor) -> "PoseStart":
+        """Return some of the poses, by index."""
+        parts: dict[str, Any] = {name: part[rows] for name, part in vars(self).items() if isinstance(part, Tensor)}
+        return replace(self, **parts, among=None if self.among is None else self.among.of(rows))
+
+    def after(self, fit: "FittedPoses") -> "PoseStart":
+        """Return the start of a further fit, after one that ended there."""
+        X = self.position_lab_mm if self.held else fit.position_lab_mm
+        return replace(self, position_lab_mm=X, R_lab_body=fit.R_lab_body)
+
+
+def _of(*shape: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of a part of `FittedPoses` beyond the leading one; -1: of each camera."""
+    return {"shape": shape}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FittedPoses:
+    """Poses fitted to the pictures of C cameras, with covariance; float64, of any leading shape.
+    Compiled code writes the parts in this order.
+    """
+
+    position_lab_mm: Tensor = field(metadata=_of(3))
+    R_lab_body: Tensor = field(metadata=_of(3, 3))
+    covariance: Tensor = field(metadata=_of(6, 6))  # of delta (rad) and position (mm), lab
+    own_turn: Tensor = field(metadata=_of(-1, 3))  # rad: rotation of the pose by each camera alone, position held
+    own_covariance: Tensor = field(metadata=_of(-1, 3, 3))  # rad^2
+    # mm, lab: how each camera alone would move the sphere, distance by size included.
+    own_move: Tensor = field(metadata=_of(-1, 3))
+    own_sigma_mm: Tensor = field(metadata=_of(-1))  # of the place by each camera alone, across its line of sight
+    excess: Tensor = field(metadata=_of(-1))  # deviation of own rotation over that of independent noise; right model: 1
+    # 1 less the share of the picture's variance that is left; 0 of hardly any known paint.
+    score: Tensor = field(metadata=_of(-1))
+    nll: Tensor = field(metadata=_of())  # negative log-likelihood of all pixels, as if they were independent
+    step: Tensor = field(metadata=_of(6))  # the last one of the fit
+
+    def parts(self) -> dict[str, Tensor]:
+        """Return the arrays by name."""
+        return {name: getattr(self, name) for name in POSE_PARTS}
+
+    def of(self, rows: Tensor) -> "FittedPoses":
+        """Return some of the poses (B,), by index."""
+        return FittedPoses(**{name: part[rows] for name, part in self.parts().items()})
+
+    def where(self, mask: Tensor, other: "FittedPoses") -> "FittedPoses":
+        """Return these poses where the mask (B,) holds, the others elsewhere."""
+        own, others = self.parts(), other.parts()
+        return FittedPoses(
+            **{
+                name: torch.where(mask.reshape(-1, *[1] * (part.ndim - 1)), part, others[name])
+                for name, part in own.items()
+            }
+        )
+
+    def with_rows(self, rows: Sequence[int], others: "FittedPoses") -> "FittedPoses":
+        """Return the poses (B,) with others in some rows, by index."""
+        at, there = torch.tensor(rows), others.parts()
+        return FittedPoses(**{name: part.index_copy(0, at, there[name]) for name, part in self.parts().items()})
+
+
+SHAPES: dict[str, tuple[int, ...]] = {part.name: part.metadata["shape"] for part in fields(FittedPoses)}
+POSE_PARTS = tuple(SHAPES)
+
+
+def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
+    """Return the arrays of `FittedPoses` of a leading shape, zeros."""
+    return {
+        name: torch.zeros(*shape, *(cameras if n < 0 else n for n in tail), dtype=torch.float64)
+        for name, tail in SHAPES.items()
+    }
+
+
+def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
+    """Return the same with the unit rotation."""
+    parts = pose_arrays(cameras, *shape)
+    return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
+
+
+Record = TypeVar("Record", Pixels, PoseStart, FittedPoses)
+
+
+def moved_to(device: torch.device, record: Record) -> Record:
+    """Return a record with its tensors on a device; all of them are on one."""
+    tensors: dict[str, Any] = {name: part for name, part in vars(record).items() if isinstance(part, Tensor)}
+    if next(iter(tensors.values())).device == device:
+        return record
+    return replace(record, **{name: part.to(device) for name, part in tensors.items()})
