@@ -1,5 +1,6 @@
 """The pictures of the overlay: each camera's frame, and crop, re-rendered picture and residual of each sphere."""
 
+import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,6 @@ SHIFT = 4  # bits of a pixel's fraction
 DOT, SPACE = 3.0, 3.5  # px, of dotted lines
 HEAD, FOOT, GAP, TITLE = 62, 40, 10, 24  # px: bands above and below, between panels, titles
 SIDE = 310  # px, of square panels, at most
-MOST_ROWS = 3  # of panels beside a frame: with more their pictures are too small
 STRIP = 16  # px, from strip to strip
 NAME = 14  # letters of a sphere's name that are shown
 ABOVE = 0.25  # of the radius: from the outline to the name
@@ -212,8 +212,8 @@ class Page:
         height, foot = FRAME_HEIGHT, FOOT + STRIP * len(self.balls)
         sizes = [view.model.camera.image_size for view in self.balls[0].views]
         widths = [round(min(width / rows, WIDEST) * height) for width, rows in sizes]
-        columns = -(-len(self.balls) // MOST_ROWS)
-        rows = -(-len(self.balls) // columns)
+        rows = math.ceil(math.sqrt(len(self.balls)))
+        columns = math.ceil(len(self.balls) / rows)
         side = min(SIDE, height // rows - TITLE - LINE - 4)
         across = 3 * (side + GAP)
         width = max(max(widths) + columns * across + 2 * GAP, LEAST_WIDTH)
@@ -275,7 +275,7 @@ class Page:
             left += 8 * len(words) + 14
         canvas.text((left, top + 16), "axes solid: towards the camera, dotted: away", 13, FAINT)
         valid = sum(int(ball.track.valid.sum()) for ball in self.balls)
-        words = f"whole track: green valid, orange in doubt, grey not valid ({valid} of {frames} valid)"
+        words = f"track: green valid ({valid} of {frames}), orange in doubt, grey not valid"
         canvas.text((width - GAP, top + 16), words, 13, FAINT, "rs")
         names = max(len(ball.name) for ball in self.balls)
         left = GAP + (LETTER * names + GAP if names else 0)
