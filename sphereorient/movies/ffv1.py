@@ -18,7 +18,6 @@ TRAILER = 8  # bytes after each slice: 3 its size, 1 a status, 4 the check sum
 REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 INVERTED = 0xFFFFFFFF  # zlib inverts check sums before and after
 MOST = 9  # bits of a number's exponent that have a state of their own
-SHOWN_SHARE = 0.75  # of the pixels that are not 0: slices of other grids share less than this with those of FFmpeg's
 STUB = 14  # bytes of a slice that says it lies outside of the picture
 
 
@@ -68,29 +67,22 @@ class SliceDecoder:
         self.places: tuple[Rectangle, ...] = ()
 
     def matches(self, packet: bytes, picture: Grey) -> bool:
-        """Learn from one packet and its picture (H, W) where slices lie, which FFmpeg cuts row by row; return whether
-        each one alone gives its part and nothing else. Where it does not, or where the picture is too dark to tell,
-        whole frames must be decoded.
+        """Learn from one packet and its picture (H, W) where slices lie: on the one grid, row by row, on which each
+        alone gives its part and nothing else. Return False where none is, or where the picture is too dark to tell:
+        then whole frames must be decoded.
         """
         slices = split_slices(packet)
-        if slices is None or np.mean(picture > 0) < SHOWN_SHARE:
+        if slices is None or len(slices) < 2:
             return False
-        count = len(slices)
-        grids = ((rows, columns) for rows in range(2, count) for columns in range(rows, 2 * rows))
-        grid = next((one for one in grids if one[0] * one[1] == count), None)
-        if grid is None:
-            return False
-        self.dtype = picture.dtype
-        down, across = ([k * size // n for k in range(n + 1)] for size, n in zip(self.shape, grid, strict=True))
-        self.places = tuple(
-            Rectangle(left, top, right, bottom) for top, bottom in pairwise(down) for left, right in pairwise(across)
-        )
-        for number, place in enumerate(self.places):
+        self.dtype, count = picture.dtype, len(slices)
+        grids = [_grid(self.shape, rows, count // rows) for rows in range(1, count + 1) if count % rows == 0]
+        for number in range(count):
             self._own = threading.local()  # a fresh decoder leaves 0 beside its slice
-            alone, expected = self.decoded(slices, {number}), np.zeros_like(picture)
-            expected[_pixels(place)] = picture[_pixels(place)]
-            if alone is None or not np.array_equal(alone, expected):
-                return False
+            alone = self.decoded(slices, {number})
+            grids = [] if alone is None else [one for one in grids if _holds(alone, picture, one[number])]
+        if len(grids) != 1:
+            return False
+        (self.places,) = grids
         return True
 
     def decode(self, slices: Sequence[bytes], numbers: Sequence[int], into: Grey) -> None:
@@ -118,6 +110,20 @@ class SliceDecoder:
             context.height, context.width = self.shape
             context.thread_count = 1
         return context
+
+
+def _grid(shape: tuple[int, int], rows: int, columns: int) -> tuple[Rectangle, ...]:
+    """Return the slices of a grid, row by row. Source: RFC 9043, 4.6."""
+    down, across = ([k * size // n for k in range(n + 1)] for size, n in zip(shape, (rows, columns), strict=True))
+    return tuple(
+        Rectangle(left, top, right, bottom) for top, bottom in pairwise(down) for left, right in pairwise(across)
+    )
+
+
+def _holds(alone: Grey, picture: Grey, place: Rectangle) -> bool:
+    """Return whether a picture shows one part of another, and 0 beside it."""
+    part = _pixels(place)
+    return np.array_equal(alone[part], picture[part]) and np.count_nonzero(alone) == np.count_nonzero(alone[part])
 
 
 def _pixels(place: Rectangle) -> tuple[slice, slice]:

@@ -163,9 +163,19 @@ def test_a_stub_is_a_slice_whose_check_sum_is_right(first: bool) -> None:
     assert split_slices(stub_slice(first)) == [stub_slice(first)]
 
 
-def test_pictures_too_dark_to_tell_slices_apart_are_decoded_whole(tmp_path: Path) -> None:
+@pytest.mark.parametrize("slices", ["4", "6", "24"])
+def test_a_bright_ball_on_black_tells_the_slices_apart(tmp_path: Path, slices: str) -> None:
     expected = pictures()
-    for picture in expected:
-        picture[:40] = 0
+    expected[0][:] = 0
+    expected[0][50:90, 60:100] = 200  # the others are bright everywhere
+    found = demanded(written(tmp_path / "m.mkv", expected, slices=slices))
+    for picture, whole in zip(found, expected, strict=True):
+        assert isinstance(picture, OnDemand)
+        np.testing.assert_array_equal(picture.part(0, 0, 1, 1), whole)
+
+
+def test_movies_whose_first_picture_is_black_are_decoded_whole(tmp_path: Path) -> None:
+    expected = pictures()
+    expected[0][:] = 0
     for picture, whole in zip(demanded(written(tmp_path / "m.mkv", expected, slices="4")), expected, strict=True):
         np.testing.assert_array_equal(picture, whole)
