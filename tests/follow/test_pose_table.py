@@ -111,7 +111,9 @@ def test_batches_of_several_balls_give_the_tables_of_all_their_frames():
 
 
 def test_exchanged_tables_are_those_of_exchanged_frames():
-    one, other = [poses(1, 1), poses(3, 2), poses(2, 3)], [poses(2, 4), poses(1, 5), poses(1, 6)]
+    blind = (Reason.OK, Reason.NOT_FOUND)
+    one = [poses(1, 1), poses(3, 2), poses(2, 3)]
+    other = [poses(2, 4, blind), poses(1, 5, blind), poses(1, 6, blind)]
     row = torch.tensor([[0, 1, 0], [1, 0, 1]])
     wanted = [pose_table(frames, CAMERAS) for frames in ([one[0], other[1], one[2]], [other[0], one[1], other[2]])]
     for found, whole in zip(
