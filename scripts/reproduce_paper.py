@@ -221,9 +221,8 @@ Segments count from {least} frames and {share} T_L on, with T_L = 0.3 s.
 {table}
 
 Where the methods differ from the truth: `paper` computes alpha from averages of omega. This low-pass removes most of
-the strong bursts, so its rms and its flatness are too small. `precise` estimates the spectrum of the motion itself;
-its frames off by over 10° lie in a few movies, most of them measured by one camera (flag 4): mirrored lamps, bubbles
-and the turning disks are taken for parts of the sphere there. They spoil its acceleration (flatness, rms).
+the strong bursts, so its rms and its flatness are too small. `precise` estimates the spectrum of the motion itself,
+and smooths no more than that allows; it measures more frames than `paper`, so that its truth is of other frames, too.
 The acceleration of these movies is Gaussian; the paper's is not (a = 0.6). The decay time of the durations follows from
 the size of the field and the velocity of the sphere, as in any flow; the paper compares it with T_L. No segment is
 longer than a movie.
