@@ -59,6 +59,21 @@ def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
     assert_close(so3.exp(f64(expected.turn)) @ f64(expected.R_before), so3.exp(angle(3.2, change) * AXIS), 1e-9)
 
 
+@pytest.mark.parametrize("change", [0.0, 0.02])
+def test_a_later_pose_is_that_of_the_polynomial_and_its_error_holds_the_next_lower_order(change):
+    times = [0.0, 1.0, 2.0, 3.0, 4.0]
+    ahead = lane([0, 1, 2], change, times).extrapolated(4)
+    assert_close(ahead.position_lab_mm, place(4.0, change), 1e-9)
+    assert_close(ahead.R_lab_body, so3.exp(angle(4.0, change) * AXIS), 1e-9)
+    # Weights 3, -8, 6 of the three poses; the line through the last two is off by twice the second difference.
+    lower = 3 * angle(2.0, change) - 2 * angle(1.0, change) - angle(4.0, change)
+    move = lower * f64([2.0, 1.0, -1.0])
+    spread = (9 + 64 + 36) * 1e-10
+    assert_close(ahead.covariance[3:, 3:], (spread + move @ move) * torch.eye(3).double(), 1e-12)
+    assert_close(ahead.covariance[:3, :3], (spread + lower**2 * (AXIS @ AXIS)) * torch.eye(3).double(), 1e-12)
+    assert lane([2], change).extrapolated(3) is None
+
+
 def test_the_shutter_sees_its_share_of_the_motion():
     # From 2 to 3.2: a shutter that is open for 0.3 of these 1.2 sees a quarter of the way.
     expected = lane([0, 1, 2], 0.0).expected(3, RADIUS_MM, exposure_s=0.3)
