@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from torch import Tensor
-
 from sphereorient.errors import ExperimentError
 from sphereorient.follow.appearance.agreement import ProvenPoses, agreeing_poses, limb_px, proven_poses, usual_apart_rad
 from sphereorient.follow.appearance.exposure import with_motion
@@ -31,10 +29,9 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.camera_view import CameraView, Optics, Picture, widest_px
+from sphereorient.pose.camera_view import CameraView, Optics, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
-from sphereorient.pose.neighbours import Neighbours
 from sphereorient.sphere.texture_table import TextureTable
 
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
@@ -61,7 +58,7 @@ def estimate_appearance(
     given = settings.blur_px is not None
     others = None if among is None else among.neighbours.of(sample.frame)
     pictures = [[shot.picture for shot in frames[k]] for k in sample.frame]
-    studied = light_and_blur(_begun(search.fitter, base, pictures, sample.poses, others), given=given)
+    studied = light_and_blur(Studied.begun(search.fitter, base, pictures, sample.poses, others), given=given)
     if not given and (matched := _matched(search, studied)) is not None:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
@@ -109,18 +106,6 @@ def _chosen(
         return search, list(among.found), proven_poses(among.found)
     search, found = find_poses(search, frames)
     return search, found, agreeing_poses(search, frames, found)
-
-
-def _begun(
-    fitter: Fitter,
-    base: TextureTable,
-    pictures: Sequence[Sequence[Picture]],
-    poses: tuple[Tensor, Tensor, Tensor],
-    others: Neighbours | None,
-) -> Studied:
-    """Fit the poses that are studied, with the light that is assumed."""
-    whole = fitter.pixels(pictures, poses[0], fitter.optics.fine, neighbours=others)
-    return Studied.begun(fitter, base, whole, poses)
 
 
 def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sphereorient.follow.poses import Poses
 from sphereorient.locate import Frame
-from sphereorient.pose.camera_view import defocus_radii, widest_px
+from sphereorient.pose.camera_view import Picture, defocus_radii, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.neighbours import Neighbours
@@ -104,10 +104,19 @@ class Studied:
     use: Tensor  # (B, C) bool
 
     @classmethod
-    def begun(cls, fitter: Fitter, paint: TextureTable, whole: Pixels, poses: tuple[Tensor, Tensor, Tensor]) -> Self:
-        """Fit poses: positions (B, 3), rotations (B, 3, 3) and use (B, C)."""
+    def begun(
+        cls,
+        fitter: Fitter,
+        paint: TextureTable,
+        pictures: Sequence[Sequence[Picture]],
+        poses: tuple[Tensor, Tensor, Tensor],
+        others: Neighbours | None,
+    ) -> Self:
+        """Fit poses, with the light that is assumed: positions (B, 3), rotations (B, 3, 3) and use (B, C)."""
+        fine = fitter.optics.fine
+        whole = fitter.pixels(pictures, poses[0], fine, neighbours=others)
         pixels = enough_of(whole)
-        fit = fitter.fit(pixels, PoseStart(*poses), fitter.optics.fine, 4)
+        fit = fitter.fit(pixels, PoseStart(*poses), fine, 4)
         return cls(fitter=fitter, paint=paint, whole=whole, pixels=pixels, fit=fit, use=poses[2])
 
     @property
