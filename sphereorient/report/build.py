@@ -237,13 +237,13 @@ def _strips(
 def _folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes the report at the end, or is removed after an error."""
     out = out.resolve()  # a linked folder is followed
-    check_folder(out)
+    check_report_folder(out)
     aside, old = unfinished(out), unfinished(out)
     try:
         for part in KINDS:
             (aside / part).mkdir(parents=True)
         yield aside
-        check_folder(out)  # again: it may have changed meanwhile
+        check_report_folder(out)  # again: it may have changed meanwhile
         if out.exists():
             out.replace(old)
         aside.replace(out)
@@ -257,7 +257,7 @@ def _folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def check_folder(out: Path) -> None:
+def check_report_folder(out: Path) -> None:
     """Raise OutputError if a folder has more in it than an older report, whose page carries the mark."""
     page, found = out / "index.html", set(out.rglob("*"))
     ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}")}

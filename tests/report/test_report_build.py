@@ -16,7 +16,7 @@ from ensembles import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.cli import main
 from sphereorient.errors import OutputError
 from sphereorient.pose.worn import CELLS, UNUSED_PAINT, worn_text
-from sphereorient.report.build import check_folder
+from sphereorient.report.build import check_report_folder
 from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.trajectory import Trajectory
 
@@ -222,11 +222,11 @@ def test_a_file_of_the_users_in_a_report_stays(tmp_path, name):
     out = tmp_path / "report"
     (out / name).parent.mkdir(parents=True)
     (out / "index.html").write_text('<!doctype html>\n<meta name="generator" content="made by sphereorient">')
-    check_folder(out)
+    check_report_folder(out)
     (out / name).write_text("mine")
     with pytest.raises(OutputError, match="got something else in it"):
-        check_folder(out)
+        check_report_folder(out)
     (out / name).unlink()
     (out / "index.html").write_text("<!doctype html>\n<p>my own page</p>")
     with pytest.raises(OutputError, match="got something else in it"):
-        check_folder(out)
+        check_report_folder(out)
