@@ -46,8 +46,10 @@ class Learnt:
     light: Light
     limb_px: torch.Tensor | None  # (C,), see `SphereModel`; None: of an older version
     lasting: Lasting
-    blur_px: float
+    blur_px: float  # of the paint
+    limb_blur_px: float
     still_blur_px: float  # of frames whose motion is not known
+    still_limb_blur_px: float
     instants: int  # of the exposure that fits render
     most_hidden: float  # share of a disk that occluders may cover
     widest_px: float
@@ -75,7 +77,9 @@ class Learnt:
             limb_px=fitter.limb_px,
             lasting=study.lasting,
             blur_px=fitter.optics.blur_px,
+            limb_blur_px=fitter.optics.limb_blur_px,
             still_blur_px=study.still.optics.blur_px,
+            still_limb_blur_px=study.still.optics.limb_blur_px,
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
@@ -101,14 +105,15 @@ class Learnt:
         fitter = still = Fitter(
             views=views,
             radius_mm=recording.experiment.radius_mm,
-            optics=Optics(paint, self.still_blur_px, widest),
+            optics=Optics(paint, self.still_blur_px, widest, self.still_limb_blur_px),
             light=self.light,
             widest_px=self.widest_px,
             limb_px=self.limb_px,
             most_hidden=self.most_hidden,
         )
         if self.instants > 1:
-            fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
+            optics = Optics(paint, self.blur_px, widest, self.limb_blur_px)
+            fitter = replace(still, optics=optics, instants=self.instants)
         told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "majority", "worn")}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
@@ -219,8 +224,10 @@ def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
     file.attrs["most_hidden"] = learnt.most_hidden
     for name in WHETHER:
         file.attrs[name] = getattr(learnt, name)
+    file.attrs["limb_blur_px"] = learnt.limb_blur_px
     if learnt.instants > 1:
-        file.attrs["still_blur_px"], file.attrs["instants"] = learnt.still_blur_px, learnt.instants
+        file.attrs["instants"] = learnt.instants
+        file.attrs["still_blur_px"], file.attrs["still_limb_blur_px"] = learnt.still_blur_px, learnt.still_limb_blur_px
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
     if learnt.majority:
@@ -278,9 +285,14 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     acceleration = file.attrs.get("acceleration_rad_s2")
     told: dict[str, Any] = {name: bool(file.attrs.get(name, False)) for name in WHETHER}
     told |= {name: float(file.attrs[name]) for name in NUMBERS}
+    still_blur_px = float(file.attrs.get("still_blur_px", file.attrs["blur_px"]))
+    limb_blur_px = float(file.attrs.get("limb_blur_px", file.attrs["blur_px"]))  # an older version knew one blur
+    of_limb = limb_blur_px if still_blur_px == told["blur_px"] else still_blur_px
     return Learnt(
         scenes=scenes,
-        still_blur_px=float(file.attrs.get("still_blur_px", file.attrs["blur_px"])),
+        limb_blur_px=limb_blur_px,
+        still_blur_px=still_blur_px,
+        still_limb_blur_px=float(file.attrs.get("still_limb_blur_px", of_limb)),
         instants=int(file.attrs.get("instants", 1)),
         most_hidden=float(file.attrs.get("most_hidden", 0.0)),  # an older version sought none
         light=light_of(parts, bool(light.attrs["known"])),

@@ -13,7 +13,7 @@ from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
-from sphereorient.so3 import solve_damped
+from sphereorient.so3 import inverse_damped, solve_damped
 from sphereorient.trajectory import Trajectory
 
 TILES = 4  # along each axis of the disk: errors of light are wide
@@ -59,20 +59,51 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     """
     cameras = use.shape[1]
     at = fitted_residuals(pixels, fit, model)
-    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), cameras)
+    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), _px_mm(pixels, fit), cameras)
     others = normal.shape[-1] - 6
     turn = [0, 1, 2, *range(6, 6 + others)]
     alone = [part[..., turn] for part in (normal[..., turn, :], right, ridge[..., turn, :])]
     own = torch.stack([of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
-    # The cameras share the pose; each has a light and a limb of its own.
+    together = of_left_out(*_joined(normal, right, ridge))[:6, :6]
+    return Lasting(covariance=together, own_rad2=own)
+
+
+def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> float:
+    """Return by how much the limb of B * C disks, those of `use` (B, C), is blurred more than in the model, px.
+    One turn and move of all poses, with the light of each camera and the place of its limb, may change with it.
+    """
+    cameras = use.shape[1]
+    at = fitted_residuals(pixels, fit, model)
+    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), _px_mm(pixels, fit), cameras)
+    joined, pulled, ridges = _joined(normal, right, ridge)
+    wider = torch.arange(1, cameras + 1) * (normal.shape[-1] - 6) + 5
+    bread = inverse_damped(joined.sum(0) + ridges)
+    seen = use.any(0).double()
+    told = seen / bread.diagonal()[wider].clamp_min(1e-30)
+    found = (bread @ pulled.sum(0))[wider]
+    return -float((told * found).sum() / told.sum().clamp_min(1e-30))
+
+
+def _px_mm(pixels: Pixels, fit: FittedPoses) -> Tensor:
+    """Return the size of a pixel at the sphere, (B * C,), mm."""
+    origin = pixels.origin[..., 0].double()
+    X = fit.position_lab_mm.repeat_interleave(len(origin) // len(fit.position_lab_mm), 0)
+    px_mm: Tensor = pixels.pitch_mm + pixels.pitch_rad * (X - origin).norm(dim=-1)
+    return px_mm.to(pixels.grey)
+
+
+def _joined(normal: Tensor, right: Tensor, ridge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the normal equations of all cameras, (C * T, n, n), (C * T, n), (n, n), from those of each: they share the
+    pose; each has a light and a limb of its own.
+    """
+    cameras, others = len(normal), normal.shape[-1] - 6
     place = torch.zeros(cameras, 6 + cameras * others, 6 + others, dtype=torch.float64)
     for camera in range(cameras):
         place[camera, :6, :6] = torch.eye(6)
         place[camera, 6 + camera * others :][:others, 6:] = torch.eye(others)
     joined = (place[:, None] @ normal @ place[:, None].mT).flatten(0, 1)
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
-    together = of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
-    return Lasting(covariance=together, own_rad2=own)
+    return joined, pulled, (place @ ridge @ place.mT).sum(0)
 
 
 def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
@@ -99,12 +130,12 @@ def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
     return covariance + (1 - 1 / size.clamp_min(1)) * difference[..., :, None] * difference[..., None, :]
 
 
-def _by_tile(at: Residuals, precision: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:
+def _by_tile(at: Residuals, precision: Tensor, px_mm: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
     the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
     tiles of its own.
     """
-    limb = at.over * at.view.coverage_by_position.norm(dim=1)
+    limb = px_mm[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
     wider = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
     columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack([limb, wider], dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]
