@@ -34,7 +34,7 @@ from sphereorient.trajectory.trajectory import SPHERES
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
 WHETHER = ("together", "second_ball", "sharper")
-LASTING = ("covariance", "own_rad2")
+LASTING = ("covariance", "own_rad2", "alone")
 NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
 
@@ -281,7 +281,8 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting.none(len(scenes))
     if "lasting" in file:
-        lasting = Lasting(**{part: torch.from_numpy(file["lasting"][part][()]) for part in LASTING})
+        kept = {part: torch.from_numpy(values[()]) for part, values in file["lasting"].items()}
+        lasting = Lasting.of_older(**kept) if "alone" not in kept else Lasting(**kept)
     acceleration = file.attrs.get("acceleration_rad_s2")
     told: dict[str, Any] = {name: bool(file.attrs.get(name, False)) for name in WHETHER}
     told |= {name: float(file.attrs[name]) for name in NUMBERS}
