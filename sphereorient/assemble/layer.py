@@ -255,6 +255,8 @@ def soft_track(
     temperature: float = 1.0,
 ) -> SoftTrack:
     """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
+    Raises ShapeError (the inputs differ in frames or candidates), SettingsError (`turn_rad` or the temperature is not
+    above 0).
 
     Args:
         R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
@@ -263,10 +265,6 @@ def soft_track(
         mask: (..., N, C) bool, True for a candidate.
         turn_rad: standard deviation of the rotation between neighbouring frames; grows with the frames of a gap.
         temperature: of the soft path, in units of the costs.
-
-    Raises:
-        ShapeError: the inputs differ in frames or candidates.
-        SettingsError: `turn_rad` or the temperature is not above 0.
     """
     check_tail("R_lab_body", R_lab_body, *mask.shape, 3, 3)
     check_tail("position_lab_mm", position_lab_mm, *mask.shape, 3)
@@ -294,10 +292,8 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
     """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
     NaN does not count; marginals (..., N, C) are not negative; NaN where all are 0. The gradient is always finite.
+    Raises ShapeError (candidates and marginals differ in shape).
     Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
-
-    Raises:
-        ShapeError: candidates and marginals differ in shape.
     """
     check_tail("R_lab_body", R_lab_body, *marginals.shape[-1:], 3, 3)
     known = torch.where(R_lab_body.isnan(), 0.0, R_lab_body)

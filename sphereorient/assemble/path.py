@@ -51,10 +51,8 @@ def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, setting
     """Choose one candidate of each frame for each camera, by the least cost over the whole movie; time_s (N,)
     increases.
     Frames without candidates of `quality_min` are skipped: the cost of the link over them is divided by its time.
+    Raises ShapeError (a camera has another number of frames than there are times).
     Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
-
-    Raises:
-        ShapeError: a camera has another number of frames than there are times.
     """
     for name, each in candidates.items():
         if len(each) != len(time_s):

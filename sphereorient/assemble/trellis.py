@@ -40,6 +40,7 @@ def shortest_path(
     """Find the cheapest path that visits one candidate in each step; of equal paths, the one with the lowest last
     index.
     Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
+    Raises ShapeError (costs and mask differ in shape).
     Source: Bellman 1957, Viterbi 1967.
 
     Args:
@@ -47,9 +48,6 @@ def shortest_path(
         mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
         node_cost: (..., N, C), of a candidate by itself.
         triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the order second.
-
-    Raises:
-        ShapeError: costs and mask differ in shape.
     """
     order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if 0 in mask.shape[-2:]:
@@ -89,11 +87,8 @@ def soft_path(
     triple_cost: Tensor | None = None,
 ) -> SoftPath:
     """Weigh all paths by exp(-cost / temperature), temperature > 0; the other arguments are those of `shortest_path`.
+    Raises ShapeError (costs and mask differ in shape), SettingsError (the temperature is not above 0).
     Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
-
-    Raises:
-        ShapeError: costs and mask differ in shape.
-        SettingsError: the temperature is not above 0.
     """
     order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if not 0 < temperature < torch.inf:
@@ -217,10 +212,8 @@ def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor |
     """Return the paper's cost d(A, B) (2 - T_A - T_B) / dt, rad/s, from each candidate (row) to each of the next step.
     Shapes: R_lab_body (..., N, C, 3, 3), score T (..., N, C), increasing time_s (..., N), result (..., N - 1, C, C).
     With a mask (..., N, C), each edge comes from the last step before it with candidates.
+    Raises ShapeError (the inputs differ in steps or candidates).
     Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
-
-    Raises:
-        ShapeError: the inputs differ in steps or candidates.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("score", score, *R_lab_body.shape[-4:-2])

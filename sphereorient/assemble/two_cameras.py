@@ -42,11 +42,8 @@ def fuse(
     Stretches that differ by more than `repair_deg` are repaired, of more than two cameras by majority where there is
     one. Then each frame is the mean of all, weighted by the inverse moving variance of xi; their differences give the
     sigma, so that one camera alone has none. Flags: `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
+    Raises ExperimentError (no camera), ShapeError (paths, candidates and times differ in cameras or frames).
     Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
-
-    Raises:
-        ExperimentError: no camera.
-        ShapeError: paths, candidates and times differ in cameras or frames.
     """
     _check(paths, candidates, time_s)
     names = list(paths)

@@ -45,10 +45,8 @@ def take_crops_of_all(
 ) -> dict[str, Crops]:
     """Crop each of several moving spheres in every frame, by name. Names of spheres of one size are given by chance,
     and kept: a sphere is the one that is where it is expected. Only disks that no other one touches are used.
-
-    Raises:
-        ExperimentError: a sphere without a diameter, or one that is said to stay in its place.
-        PaintError: no frame shows as many spheres as are named, each by itself.
+    Raises ExperimentError (a sphere without a diameter, or one that is said to stay in its place), PaintError (no frame
+    shows as many spheres as are named, each by itself).
     """
     names, streams = recording.experiment.names, recording.streams
     scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]

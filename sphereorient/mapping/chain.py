@@ -45,9 +45,7 @@ class PairwiseAttitudes:
 
 def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
     """Find the orientations of N instants from disks, each seen by at least one camera.
-
-    Raises:
-        PaintError: the sphere does not rotate, the cameras see different rotations, or no patch is seen twice.
+    Raises PaintError (the sphere does not rotate, the cameras see different rotations, or no patch is seen twice).
     """
     if len(disks) < 2:
         raise too_few(len(disks))

@@ -81,9 +81,7 @@ class Evidence:
 
 def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
     """Find orientations of N unordered photographs in disks, finally in `finer` ones; only the largest set gets any.
-
-    Raises:
-        PaintError: fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres.
+    Raises PaintError (fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres).
     """
     if len(disks) < FEWEST:
         do = "take more pictures of the ball, of all its sides"

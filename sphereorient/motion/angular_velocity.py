@@ -18,6 +18,8 @@ def omega_from_orientations(
     A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt), weight m^2, optimal for white attitude noise. It damps f
     cycles per frame by sin(2 pi f m) / (2 pi f m). 2 max(m) |omega| dt must stay well below pi (not checked). The error
     comes from the scatter of the separations; NaN with fewer than two.
+    Raises ShapeError (R_lab_body does not end in (N, 3, 3)), SettingsError (no separation, one below 1, or one given
+    twice).
     Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
 
     Args:
@@ -26,10 +28,6 @@ def omega_from_orientations(
         separations: values of m, frames, from 1 up, each once.
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
         min_separations: number of separations that a frame needs, else NaN.
-
-    Raises:
-        ShapeError: R_lab_body does not end in (N, 3, 3).
-        SettingsError: no separation, one below 1, or one given twice.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     if R_lab_body.dim() < 3:

@@ -47,6 +47,7 @@ def measure_motion(
     """Return smooth pose, velocity, acceleration, omega, alpha of all frames whose neighbours determine them, else NaN.
     Positions are smoothed with the Gaussian of velocity, orientations with that of alpha, by the chordal mean on SO(3).
     Nothing crosses the ends of a segment; single lost frames are bridged. Body components need the frame's orientation.
+    Raises ShapeError (wrong last axes, or unequal numbers of frames).
     Source: the paper, section III; docs/errata.md E4 and E6; the mean: Moakher 2002, SIAM J. Matrix Anal. 24, 1.
 
     Args:
@@ -57,9 +58,6 @@ def measure_motion(
         settings: widths and limits.
         sigmas: of the position's coordinates, mm, and of delta in R_true = exp([delta]x) R, rad, (..., N) or
             (..., N, 3) each; None or NaN: unknown.
-
-    Raises:
-        ShapeError: wrong last axes, or unequal numbers of frames.
     """
     check_tail("position_mm", position_mm, 3)
     check_tail("R_lab_body", R_lab_body, 3, 3)

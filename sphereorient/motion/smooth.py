@@ -89,12 +89,9 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     `known`, with one factor on the sigmas. The errors of a frame's orientation and position go together (`coupling`):
     orientations are smoothed as they are given the smoothed positions. There is no lag; ends are included, gaps inside
     a segment filled, outliers rejected. A segment of one measured frame has no derivatives, of two no accelerations; a
-    track too short for the estimation has no derivatives.
+    track too short for the estimation has no derivatives. Raises ShapeError (times that do not increase).
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
     SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
-
-    Raises:
-        ShapeError: times that do not increase.
     """
     names = ("time_s", "position_lab_mm", "position_cov_mm2", "R_lab_body", "orientation_cov_rad2")
     parts = (getattr(measured, name) for name in names)

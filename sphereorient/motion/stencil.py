@@ -73,10 +73,8 @@ def gaussian_derivative(
     """Return the derivative (..., N, D) of x (..., N, D), in its unit / s^order, by a Gaussian kernel; order 0 smooths.
     NaN where the window (`truncate` sigmas on each side) reaches a missing value or an end. Exact for polynomials up to
     degree order + 1. A sine of f cycles per frame is damped by about exp(-(2 pi f sigma)^2 / 2).
+    Raises SettingsError (an order other than 0, 1, 2, or a width that is not positive).
     Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
-
-    Raises:
-        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
     kernel = gaussian_kernel(sigma_frames, order, truncate, x)
     near = windows(x.mT, kernel.shape[-1] // 2)
@@ -108,9 +106,7 @@ def gap_aware_stencil(
     A neighbour is used where its mirror image is measured and both are in the segment; polynomials stay exact. `there`
     (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN where less than
     `min_share` of the Gaussian's weight is measured.
-
-    Raises:
-        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
+    Raises SettingsError (an order other than 0, 1, 2, or a width that is not positive).
     """
     half = _half_width(sigma_frames, order, truncate)
     like = torch.empty(0, dtype=torch.float64, device=there.device)

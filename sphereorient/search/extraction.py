@@ -60,10 +60,8 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
 def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Tensor:
     """Return the paint of grey disks (F, S, S) float32 in the mask (S, S): -1 black, +1 white, 0 undecided or outside.
     Otsu's thresholds of the whole disk and of two moving square regions must agree.
+    Raises ShapeError (disks and mask differ in size).
     Source: paper section III B.
-
-    Raises:
-        ShapeError: disks and mask differ in size.
     """
     check_disks(disks, *inside.shape)
     grey = stretch_contrast(disks, inside, settings.black_share, settings.white_share)

@@ -91,9 +91,7 @@ class GreySearch(DiskSearch):
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
         The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
         the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
-
-        Raises:
-            ShapeError: the disks are of another size.
+        Raises ShapeError (the disks are of another size).
         """
         check_disks(disks, self.size_px, self.size_px)
         parts: list[Candidates] = []

@@ -56,10 +56,7 @@ def multi_lag(
     """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
     The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
     fit over four lags n or more separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
-
-    Raises:
-        TrackError: too few segments or lags for the fit.
-
+    Raises TrackError (too few segments or lags for the fit).
     Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)

@@ -28,10 +28,7 @@ class Reliability:
 def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
     """Compare probabilities (N,), 0 .. 1 or NaN (left out), with outcomes (N,), bool, in at most `bins` bins.
     Bins have equal counts, but equal probabilities stay in one bin.
-
-    Raises:
-        ShapeError: unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin.
-
+    Raises ShapeError (unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin).
     Source: Naeini et al. 2015 (expected calibration error) with bins of equal count; interval: Wilson 1927.
     """
     said, came = np.asarray(probability, np.float64), np.asarray(outcome, np.bool_)

@@ -69,10 +69,7 @@ def summarise(
 ) -> Summary:
     """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
     A single segment gives only the table, without intervals; without a segment that counts its numbers are NaN.
-
-    Raises:
-        TrackError: no valid frame, or tracks of kernels and of smoothers together.
-
+    Raises TrackError (no valid frame, or tracks of kernels and of smoothers together).
     Source: the paper, section IV, with docs/errata.md A5, E6, E7.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
