@@ -34,9 +34,8 @@ def omega_from_orientations(
         got = str(tuple(R_lab_body.shape))
         raise ShapeError(refusal("R_lab_body", expected="shape (..., N, 3, 3)", got=got, do="pass all frames at once"))
     check_separations(separations)
-    there = R_lab_body.isfinite().all(-1).all(-1)
-    R = torch.where(there[..., None, None], R_lab_body, torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device))
-    usable = usable_separations(there, separations, segment)  # (..., N, S)
+    there = R_lab_body.isfinite().all((-1, -2))
+    usable, R = usable_separations(there, separations, segment), torch.where(there[..., None, None], R_lab_body, 0.0)
     # frames that wrap around an end are never used
     turns = torch.stack([R.roll(-m, -3) @ R.roll(m, -3).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
     return mean_over_separations(turns, usable, dt_s, separations, min_separations)
@@ -121,13 +120,9 @@ def omega_from_markers(
     seen = points_lab.isfinite().all(-1)  # (..., N, K)
     points = torch.where(seen[..., None], points_lab, 0.0)
     usable = usable_separations(seen.sum(-1) >= FEWEST_POINTS, separations, segment)
-    turns, enough = [], []
-    for m in separations:
-        both = seen.roll(-m, -2) & seen.roll(m, -2)
-        common = both.sum(-1) >= FEWEST_POINTS
-        # equal weights keep the mean defined where the turn is not used
-        weights = torch.where(common[..., None], both, True).to(points.dtype)
-        turns.append(kabsch(points.roll(m, -3), points.roll(-m, -3), weights))
-        enough.append(common)
-    usable = usable & torch.stack(enough, dim=-1)
-    return mean_over_separations(torch.stack(turns, dim=-3), usable, dt_s, separations, min_separations)
+    both = torch.stack([seen.roll(-m, -2) & seen.roll(m, -2) for m in separations], dim=-2)  # (..., N, S, K)
+    common = both.sum(-1) >= FEWEST_POINTS
+    # equal weights keep the mean defined where the turn is not used
+    weights = torch.where(common[..., None], both, True).to(points.dtype)
+    before, after = (torch.stack([points.roll(side * m, -3) for m in separations], -3) for side in (1, -1))
+    return mean_over_separations(kabsch(before, after, weights), usable & common, dt_s, separations, min_separations)

@@ -159,6 +159,11 @@ class SegmentTrack:
         return StateSpace(**steps, start=start, measured=self.away(), covariance=self.covariance, used=self.used)
 
 
+def mahalanobis2(off: Floats, covariance: Floats) -> Floats:
+    """Return the squared Mahalanobis distances (n,) of deviations (n, 3) of covariances (n, 3, 3)."""
+    return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off))
+
+
 def _by_axis(blocks: Floats) -> Floats:
     """Return matrices (M, n, n) of one axis as those of three, (M, 3 n, 3 n)."""
     count, size = blocks.shape[:2]
