@@ -13,19 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient import so3
+from sphereorient.assemble import trellis
 from sphereorient.assemble.second_order import Chosen, physical_path
 from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
-from sphereorient.assemble.trellis import (
-    ShortestPath,
-    SoftPath,
-    edge_costs,
-    shortest_path,
-    soft_path,
-    taken,
-    turns_over_gaps,
-    visited_before,
-)
+from sphereorient.assemble.trellis import ShortestPath, SoftPath, soft_path, taken, visited_before
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 Values = Tensor | NDArray[np.floating]
@@ -125,8 +117,8 @@ class PathLayer(nn.Module):
         if self.order == 2 and self.soft is None:
             return self._histories(R, -score, variance, there, time)
         if self.order == 1:
-            edge = edge_costs(R, score, time, there)
-            return shortest_path(edge, there) if self.soft is None else soft_path(edge, there, self.soft)
+            edge = trellis.edge_costs(R, score, time, there)
+            return trellis.shortest_path(edge, there) if self.soft is None else soft_path(edge, there, self.soft)
         assert self.soft is not None
         edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
         return soft_path(edge, there, self.soft, node, triple)
@@ -286,7 +278,7 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
     R_lab_body (..., N, C, 3, 3) is finite everywhere; an edge starts at the last frame with candidates in the mask.
     """
     frames = torch.arange(mask.shape[-2], device=mask.device) - visited_before(mask)
-    return 0.5 * (turns_over_gaps(R_lab_body, mask) / (turn_rad * frames[..., 1:, None, None])).square()
+    return 0.5 * (trellis.turns_over_gaps(R_lab_body, mask) / (turn_rad * frames[..., 1:, None, None])).square()
 
 
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.assemble.beam import BeamSearch, Histories
-from sphereorient.assemble.second_order_cost import SecondOrderCost
+from sphereorient.assemble.beam import BeamSearch, CandidateRows, Histories, Ints, rotated, rotation_between
+from sphereorient.assemble.second_order_cost import Floats, SecondOrderCost
 from sphereorient.assemble.segments import flags_where, number_segments
 from sphereorient.assemble.settings import PathSettings
-from sphereorient.assemble.states import CandidateRows, Floats, Ints, rotated, rotation_between
 from sphereorient.trajectory import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
