@@ -40,10 +40,8 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
     at = (torch.arange(bins, dtype=histogram.dtype, device=histogram.device) + 0.5) / bins
     weight = histogram / histogram.sum(-1, keepdim=True).clamp_min(torch.finfo(histogram.dtype).tiny)
     below = weight.cumsum(-1)[..., :-1]
-    sum_below = (weight * at).cumsum(-1)
-    mean = sum_below[..., -1:]
-    sum_below = sum_below[..., :-1]
-    above = 1.0 - below
+    sums = (weight * at).cumsum(-1)
+    sum_below, mean, above = sums[..., :-1], sums[..., -1:], 1.0 - below
     mixed = (below > 1e-6) & (above > 1e-6)
     safe_below, safe_above = torch.where(mixed, below, 1.0), torch.where(mixed, above, 1.0)
     step = torch.where(mixed, (mean - sum_below) / safe_above - sum_below / safe_below, 0.0)
@@ -65,21 +63,17 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
     """
     check_disks(disks, *inside.shape)
     grey = stretch_contrast(disks, inside, settings.black_share, settings.white_share)
-    one_hot = _one_hot(grey, inside)
+    bin_of = (grey * BINS).long().clamp(0, BINS - 1)
+    member = grey.new_zeros(grey.shape[0], BINS, *grey.shape[1:])  # of each pixel in the histogram's bins
+    one_hot = member.scatter_(1, bin_of[:, None], 1.0) * inside
     threshold, _ = otsu(one_hot.sum((-2, -1)))
     vote = torch.where(grey > threshold[:, None, None], 1.0, -1.0)
     for share in settings.regions:
-        local = _moving_threshold(one_hot, threshold, share, settings.region_contrast_min)
-        agree = vote * torch.where(grey > local, 1.0, -1.0)
-        vote = torch.where(agree > 0, vote, torch.zeros_like(vote))
+        local = torch.where(
+            grey > _moving_threshold(one_hot, threshold, share, settings.region_contrast_min), 1.0, -1.0
+        )
+        vote = torch.where(vote * local > 0, vote, 0.0)
     return vote * inside
-
-
-def _one_hot(grey: Tensor, inside: Tensor) -> Tensor:
-    """Return the membership of each pixel in the histogram's bins, (F, B, S, S); 0 outside the disk."""
-    bin_of = (grey * BINS).long().clamp(0, BINS - 1)
-    member = grey.new_zeros(grey.shape[0], BINS, *grey.shape[1:])
-    return member.scatter_(1, bin_of[:, None], 1.0) * inside
 
 
 def _moving_threshold(one_hot: Tensor, fallback: Tensor, share: float, contrast_min: float) -> Tensor:

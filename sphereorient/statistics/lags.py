@@ -152,12 +152,12 @@ def increments(
         sums.append(segment_sums(np.stack([np.ones_like(d2), d2, d2 * d2], axis=-1), segment, ensemble.segments))
         counts.append(len(first))
         lags.append(lag)
-    whole = np.stack(sums, axis=1)  # (S, L, 3, 3)
+    whole, lag_frames = np.stack(sums, axis=1), np.array(lags, dtype=np.int64)  # (S, L, 3, 3), (L,)
     found = studentized(whole.reshape(*whole.shape[:2], 9), _rms_and_flatness, np.ones(8, bool), settings)
     return Increments(
         quantity=quantity,
-        lag_s=np.asarray(np.array(lags, dtype=np.int64) * ensemble.step_s, np.float64),
-        lag_frames=np.array(lags, dtype=np.int64),
+        lag_s=np.asarray(lag_frames * ensemble.step_s, np.float64),
+        lag_frames=lag_frames,
         rms=found.part((..., slice(0, 4))),
         flatness=found.part((..., slice(4, 8))),
         pairs=np.array(counts),

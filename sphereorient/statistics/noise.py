@@ -70,13 +70,8 @@ def multi_lag(
     lag_s = step_s * np.array(lags)
     found = bootstrap(whole, lambda totals: _extrapolated(totals[..., 0] / totals[..., 1], lag_s), settings)
     total = whole.sum(0)
-    return MultiLag(
-        quantity=quantity,
-        lag_s=lag_s,
-        naive=total[..., 0] / total[..., 1] / lag_s[:, None] ** 4,
-        variance=found.part(0),
-        noise_variance=found.part(1),
-    )
+    naive = total[..., 0] / total[..., 1] / lag_s[:, None] ** 4
+    return MultiLag(quantity=quantity, lag_s=lag_s, naive=naive, variance=found.part(0), noise_variance=found.part(1))
 
 
 def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float) -> Floats:
