@@ -44,9 +44,7 @@ class _Motions:
     time_s: Floats  # (N,)
 
     def away(self, frames: Indices, row: int, to_row: int, to: int) -> Floats:
-        """Return how far the pose of a row in a frame is from where other frames, the nearest one first, predict it:
-        move (mm) and turn (rad), (2,).
-        """
+        """Return move (mm) and turn (rad), (2,), of a row's pose off its prediction by frames, the nearest first."""
         t = self.time_s[frames] - self.time_s[frames[0]]
         scale = np.abs(t).max() or 1.0
         R0 = self.R_lab_body[row, frames[0]]

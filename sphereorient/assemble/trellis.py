@@ -154,9 +154,7 @@ def _steps(edges: Tensor, visited: Tensor, order: int) -> Iterator[tuple[Tensor,
 def _laid_out(
     edge_cost: Tensor | None, node_cost: Tensor | None, triple_cost: Tensor | None, mask: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return totals before the first step (..., *state) and edges (..., N, *state, C) from the step visited last.
-    Every path begins in place 0 (order 2: twice), at no cost.
-    """
+    """Return totals before the first step (..., *state), 0 in place 0 only, and edges (..., N, *state, C) into each."""
     like, (steps, width) = _like(edge_cost, triple_cost), mask.shape[-2:]
     rank, last = mask.any(-1).cumsum(-1), visited_before(mask)
     first = torch.arange(width, device=mask.device) == 0

@@ -38,9 +38,7 @@ class Cause:
 def other_readings(
     cameras: Mapping[str, Camera], centre_px: Tensor, R_view_body: Tensor, flips: Sequence[str] = tuple(FLIPS)
 ) -> Iterator[tuple[Cause, Tensor, Tensor]]:
-    """Yield causes with centres (N, C, 2), px, and attitudes (N, C, 3, 3) as they are if two movies are swapped, or one
-    is flipped.
-    """
+    """Yield causes, centres (N, C, 2), px, and attitudes (N, C, 3, 3) with two movies swapped, or one flipped."""
     names, sizes = list(cameras), [camera.image_size for camera in cameras.values()]
     for k, m in combinations(range(len(names)), 2):
         if sizes[k] == sizes[m]:

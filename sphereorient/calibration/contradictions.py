@@ -56,9 +56,7 @@ class Consistency:
 
 
 def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
-    """Compare the cameras in pairs; where they contradict each other, find the likeliest causes.
-    The cause that leaves least is the likeliest.
-    """
+    """Compare the cameras in pairs; where they contradict each other, find the causes that leave least."""
     compare = Comparison(seen, limits)
     found = compare(compare.sights())
     count = int(torch.isfinite(found[..., 0]).sum(1).amax()) if len(found) else 0

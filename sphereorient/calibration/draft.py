@@ -39,9 +39,7 @@ class PlateSeen:
 
 
 def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
-    """Return the pictures of a folder by pose, then camera: cam1_07.png is pose 7 of cam1; 07.png of the only one.
-    CameraError for a folder without such names.
-    """
+    """Return pictures by pose, then camera: cam1_07.png, or 07.png of the only one; CameraError without such names."""
     poses: dict[int, dict[str, str]] = defaultdict(dict)
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
     for path in files:

@@ -91,9 +91,7 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
 
 
 def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Return the grey levels (H, W) of a picture of a plate; CameraError for a file that is no picture or too large, or
-    not of `image_size` (W, H).
-    """
+    """Return a picture's grey levels (H, W); CameraError if it is none, too large, or not of `image_size` (W, H)."""
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
     # Do not decode a file that claims more pixels than any camera has.

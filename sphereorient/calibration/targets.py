@@ -127,9 +127,7 @@ class Chessboard(CalibrationTarget):
 
 @dataclass(frozen=True, kw_only=True)
 class CharucoBoard(CalibrationTarget):
-    """A chessboard of columns x rows squares with markers in the bright ones; a visible part is enough.
-    Index (0, 0) is the lower left inner corner as OpenCV draws it.
-    """
+    """A chessboard of columns x rows squares with markers; a part is enough; (0, 0): OpenCV's lower left corner."""
 
     marker_mm: float  # side of a marker
     dictionary: str = "DICT_4X4_50"  # OpenCV's name

@@ -36,10 +36,10 @@ def shared_maps(learnt: Mapping[str, LearntMap]) -> dict[str, SharedMap]:
             joined = _joined(found[first].learnt, one, R)
             own = replace(one, R_lab_body=one.R_lab_body @ R)
             found[name] = SharedMap(learnt=own, first=first, correlation=compared.correlation)
-            for same in [other for other in found if found[other].first == first]:
-                own = found[same].learnt
-                own = replace(own, texture=joined.texture, seen=joined.seen, sigma=joined.sigma)
-                found[same] = replace(found[same], learnt=own)
+            for same, its in found.items():
+                if its.first == first:
+                    own = replace(its.learnt, texture=joined.texture, seen=joined.seen, sigma=joined.sigma)
+                    found[same] = replace(its, learnt=own)
             break
     return found
 

@@ -136,20 +136,25 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
 def _fixed_scene(
     recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings
 ) -> tuple[Outline, CameraScene]:
-    """Return outline and scene of a ball that stays in its place: what changes in the pictures is the ball."""
+    """Return outline and scene of a fixed ball; PaintError if outlines scatter far more in place than in size."""
     pictures = stream.spread(4 * settings.background_frames)
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     outline, background = fixed_ball(pictures, locating, empty, stream.shown)
     scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
     each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
-    _check_still([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], stream.name)
+    seen = torch.tensor([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], dtype=torch.float64)
+    if len(seen) >= OUTLINES_MIN:
+        middle = seen.median(0).values
+        u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()
+        wander = math.hypot(u, v)
+        if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
+            got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: false`, and the diameter"
+            raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
     return outline, scene
 
 
 def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSettings) -> Crops:
-    """Return an empty record with the views and the one position (1, 3) of a ball that stays in its place; raise as
-    `take_crops` does.
-    """
+    """Return an empty record with the views and the one position (1, 3) of a fixed ball; raise as `take_crops`."""
     views, sightings = [], {}
     for stream in recording.streams:
         outline, scene = _fixed_scene(recording, stream, settings, locating)
@@ -161,24 +166,9 @@ def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSet
     return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=none, radius_mm=radius_mm, fixed=True)
 
 
-def _check_still(outlines: list[tuple[float, float, float]], name: str) -> None:
-    """Raise PaintError if a fixed ball's outlines (u, v, radius), px, scatter far more in place than in size."""
-    if len(outlines) < OUTLINES_MIN:
-        return
-    seen = torch.tensor(outlines, dtype=torch.float64)
-    middle = seen.median(0).values
-    u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()
-    wander = math.hypot(u, v)
-    if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
-        got, do = f"one that wanders by {wander:.1f} px in {name}", "write `fixed: false`, and the diameter"
-        raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
-
-
 def evenly_spread(rows: Tensor, count: int) -> Tensor:
     """Return at most `count` of the rows, evenly spread, ends included."""
-    if len(rows) <= count:
-        return rows
-    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
+    return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long()]
 
 
 def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
@@ -191,24 +181,20 @@ def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Cr
 
 def cut_out(place: Crops, pictures: Sequence[Picture]) -> list[Crop]:
     """Cut a ball in a known place, position (1, 3), out of a picture of each camera."""
-    X = place.position_lab_mm
-    found = []
+    X, found = place.position_lab_mm, []
     for view, picture in zip(place.views, pictures, strict=True):
-        (u, v), radius_px = view.camera.project(X)[0].tolist(), float(view.radius_px(X, place.radius_mm))
-        found.append(cut_crop(picture, u, v, radius_px))
+        u, v = view.camera.project(X)[0].tolist()
+        found.append(cut_crop(picture, u, v, float(view.radius_px(X, place.radius_mm))))
     return found
 
 
 def pixels_of(crops: Crops, fitter: Fitter, frames: Tensor, wanted: int, extra_px: float = 0.0) -> Pixels:
     """Return about `wanted` pixels of each disk, after a blur of the picture by `extra_px`."""
-    level = replace(fitter.optics.fine, extra_px=extra_px)
-    X = crops.position_lab_mm[frames]
+    level, X = replace(fitter.optics.fine, extra_px=extra_px), crops.position_lab_mm[frames]
     radius_px = float(fitter.disks_px(X).largest_px.max())
-    parts = []
-    for k in range(len(frames)):
-        whole = fitter.pixels(crops.pictures(frames[k : k + 1]), X[k : k + 1], level, radius_px)
-        parts.append(whole.thinned(max(1, round(whole.grey.shape[1] / wanted))))
-    return stacked(parts)
+    each = zip(torch.split(frames, 1), torch.split(X, 1), strict=True)
+    wholes = (fitter.pixels(crops.pictures(frame), place, level, radius_px) for frame, place in each)
+    return stacked([whole.thinned(max(1, round(whole.grey.shape[1] / wanted))) for whole in wholes])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -316,8 +302,8 @@ def normalised_disks(
     flat = pictures.reshape(-1, size, size).float()
     if shown is not None:  # fill what is hidden with the ball's mean grey
         part = shown.reshape(-1, size, size)
-        inside = part * share
-        usual = (flat * inside).sum((1, 2), keepdim=True) / inside.sum((1, 2), keepdim=True).clamp_min(1e-6)
+        total = (part * share).sum((1, 2), keepdim=True).clamp_min(1e-6)
+        usual = (flat * (part * share)).sum((1, 2), keepdim=True) / total
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
@@ -348,9 +334,8 @@ def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
     It is each pixel's mean over the places of the ball that it has shown, as far as paint cannot explain it: the mean
     of n places keeps 1/n of the paint's power. Where paint explains all, the disks come back as they are.
     """
-    side = 2 * PLACES + 1
+    side, found = 2 * PLACES + 1, False
     grey = disks.layers[:, :, 0].flatten(2).clone()
-    found = False
     for c in range(grey.shape[1]):
         view = perspective_view(disks.size_px, float(disks.distance_radii[:, c].median()))
         inside, normal = view.inside.reshape(-1), view.normal_view.float()

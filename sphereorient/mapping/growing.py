@@ -24,6 +24,7 @@ from sphereorient.mapping.iterations import (
     first_state,
     iterate,
     iterating,
+    lowest,
     map_height,
     optics_of,
 )
@@ -33,7 +34,6 @@ from sphereorient.pose.camera_view import Optics
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.pixels import Pixels, stacked
-from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch
 from sphereorient.sphere.texture_table import texture_table
 
@@ -165,9 +165,7 @@ class GrowingMap:
         return found if found is not None and found.trusted else None
 
     def iterate(self, *, size: bool = False) -> None:
-        """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
-        three times as long.
-        """
+        """Improve map, orientations and light once; `size`: and the ball's distance, in three times as long."""
         for _ in self._iteration(size=size):
             pass
 
@@ -179,7 +177,11 @@ class GrowingMap:
             settings = settings.model_copy(update={"blur_px": state.blur_px})
         if size and state.use.shape[1] == 1:
             state = _better_size(state, settings)
-        after, iteration = yield from iterating(state, settings, SEPARATE_ITERATIONS + min(k, LATER))
+        for found in iterating(state, settings, SEPARATE_ITERATIONS + min(k, LATER)):
+            if found is None:
+                yield
+        assert found is not None
+        after, iteration = found
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
         R_map_body = torch.eye(3, dtype=torch.float64) if self._learnt is None else self._learnt.R_map_body
@@ -204,8 +206,7 @@ class GrowingMap:
         rows = evenly_spread(torch.arange(learnt.shown, len(self)), MOST_NEW)
         fitter, level, R_aligned = appearance.fitter, appearance.fitter.optics.fine, self._R_aligned(learnt)[rows]
         new = self._of(rows, R_aligned, learnt.state)
-        held = self._found.centre.precision.expand(len(rows), 3, 3)
-        fit = fitter.fit(new.pixels, PoseStart(new.position_lab_mm, R_aligned, new.use, held), level, FITTED)
+        fit = fitter.fit(new.pixels, new.start(self._found.centre.precision), level, FITTED)
         good = ((fit.score > appearance.score_min) | ~new.use).all(1)
         new = replace(new, R_lab_body=torch.where(good[:, None, None], fit.R_lab_body, R_aligned))
         self._learnt = replace(
@@ -277,9 +278,7 @@ class GrowingMap:
         return self._found
 
     def paint(self) -> tuple[Tensor, Tensor]:
-        """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H) each, in the
-        body frame of the orientations handed over.
-        """
+        """Return the map without blur, NaN where unknown, and its counts, (H, 2 H), in the handed body frame."""
         assert self._learnt is not None
         texture, seen, _ = final_map(self._learnt.state, self._learnt.R_map_body.mT)
         return texture, seen
@@ -291,10 +290,7 @@ def _better_size(state: State, settings: MapSettings) -> State:
     """
     tried = [_at_distance(state, 1 + k * SIZE_STEP) for k in (-1, 0, 1)]
     held = [replace(iterate(one, settings, TRIED)[0], position_lab_mm=one.position_lab_mm) for one in tried]
-    low, here, high = (_left(one) for one in held)
-    bend = low - 2 * here + high
-    shift = 0.5 * (low - high) / bend if bend > 0 else (1.0 if high < low else -1.0)
-    return _at_distance(state, 1 + SIZE_STEP * min(max(shift, -1.0), 1.0))
+    return _at_distance(state, 1 + SIZE_STEP * lowest(*(_left(one) for one in held)))
 
 
 def _at_distance(state: State, factor: float) -> State:
@@ -307,10 +303,9 @@ def _at_distance(state: State, factor: float) -> State:
 
 def _left(state: State) -> float:
     """Return the mean square, grey levels, that light and map leave."""
-    seen, squares = zip(
-        *((at.weight > 0, at.residual.square().clamp_max(MOST_LEFT**2)) for at in state.linearised()), strict=True
-    )
-    return float((torch.cat(squares) * torch.cat(seen)).sum() / torch.cat(seen).sum())
+    parts = [(at.weight > 0, at.residual.square().clamp_max(MOST_LEFT**2)) for at in state.linearised()]
+    seen, squares = (torch.cat(part) for part in zip(*parts, strict=True))
+    return float((squares * seen).sum() / seen.sum())
 
 
 def _optics(state: State) -> tuple[Optics, float]:
@@ -324,12 +319,10 @@ def _optics(state: State) -> tuple[Optics, float]:
 
 
 def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool]:
-    """Return the appearance of the ball and its centre by a fit of the map's pictures, and whether the map is trusted:
-    explains them clearly better than at wrong orientations.
-    """
+    """Return the ball's appearance and centre by a fit of the map's pictures, and whether the map is trusted."""
     fitter = replace(state.fitter, optics=optics)
     X, use = state.position_lab_mm, state.use
-    fit = fitter.fit(state.pixels, PoseStart(X, state.R_lab_body, use), optics.fine, FITTED)
+    fit = fitter.fit(state.pixels, state.start(), optics.fine, FITTED)
     fitter = replace(fitter, widest_px=WIDER * float(fitter.disks_px(X).largest_px.max()))
     right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
     appearance = Appearance(
@@ -344,9 +337,8 @@ def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool
 
 def _wrong_score(fitter: Fitter, state: State) -> float:
     """Return the score that wrong orientations reach in one picture of ten."""
-    rows = evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES)
-    turns = so3.random_rotations(len(rows), generator=torch.Generator().manual_seed(0))
-    fine = fitter.optics.fine
-    begin = PoseStart(state.position_lab_mm[rows], turns, state.use[rows])
-    fit = fitter.fit(state.disks(rows), begin, fine, WRONG_ITERATIONS)
-    return float(fit.score[state.use[rows]].quantile(0.9))
+    some = state.where(evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES))
+    turns = so3.random_rotations(len(some.use), generator=torch.Generator().manual_seed(0))
+    begin = replace(some, R_lab_body=turns).start()
+    fit = fitter.fit(some.pixels, begin, fitter.optics.fine, WRONG_ITERATIONS)
+    return float(fit.score[some.use].quantile(0.9))

@@ -39,7 +39,7 @@ from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses
 from sphereorient.sphere.texture import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
@@ -295,15 +295,13 @@ def recovered(crops: Crops, state: State, chain: Tensor) -> State:
         return state
     lost = torch.nonzero(~good)[:, 0]
     R = interpolated(chain, torch.nonzero(good)[:, 0], state.R_lab_body[good])[lost]
-    X, use = state.position_lab_mm[lost], state.use[lost]
-    fitter = state.map_fitter()
+    again, fitter = replace(state.where(lost), R_lab_body=R), state.map_fitter()
     optics = fitter.optics
     steps = [(level, 1, RECOVERY_ITERATIONS) for level in (optics.coarse, optics.middle, optics.fine)]
-    fit = fitter.fit_through(steps, crops.pictures(state.frames[lost]), PoseStart(X, R, use, held=state.fixed))
-    R, X = fit.R_lab_body, X if state.fixed else fit.position_lab_mm
-    better = _scores(fit, use) > score[lost]
-    rows = (lost[better],)
-    R, X = state.R_lab_body.index_put(rows, R[better]), state.position_lab_mm.index_put(rows, X[better])
+    fit = fitter.fit_through(steps, crops.pictures(again.frames), again.start(held=state.fixed))
+    better = _scores(fit, again.use) > score[lost]
+    rows, X = (lost[better],), again.position_lab_mm if state.fixed else fit.position_lab_mm
+    R, X = state.R_lab_body.index_put(rows, fit.R_lab_body[better]), state.position_lab_mm.index_put(rows, X[better])
     return replace(state, R_lab_body=R, position_lab_mm=X)
 
 

@@ -30,10 +30,9 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
     found = torch.full(state.use.shape, torch.nan, dtype=torch.float64)
     if not len(rows):
         return found
-    held = torch.zeros(len(state.use), 1, dtype=torch.bool).index_fill(0, rows, True)
-    others, _ = with_map(replace(state, use=state.use & ~held))
+    others, _ = with_map(replace(state, use=state.use.index_fill(0, rows, False)))
     known = (map_weight(others) > 0).float()
-    one, _ = fitted(others.where(rows, state.use), ITERATIONS, crops)
+    one, _ = fitted(replace(others, use=state.use).where(rows), ITERATIONS, crops)
     X = crops.position_lab_mm.index_put((one.frames,), one.position_lab_mm)
     filmed = disks_of(replace(crops, position_lab_mm=X), one.frames, settings)
     for c in range(found.shape[1]):

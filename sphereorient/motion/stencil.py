@@ -34,9 +34,7 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Return which of the `neighbours_there` can be used in pairs k - j, k + j.
-    The weights of pairs have one parity: no lower power of time enters the result, whichever frames are missing.
-    """
+    """Return which of the `neighbours_there` pair up, k - j with k + j: their weights have one parity in time."""
     near = neighbours_there(there, segment, half)
     return near & near.flip(-1)
 

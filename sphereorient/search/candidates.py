@@ -98,9 +98,7 @@ class Candidates:
         )
 
     def padded(self, views: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return R_lab_body or R_view_body (N, C, 3, 3), scores and mask (N, C), C the largest count, at least 1.
-        Unused places hold the unit rotation, score 0 and mask False.
-        """
+        """Return R_lab_body or R_view_body (N, C, 3, 3), scores and mask (N, C); unit rotation and 0 if unused."""
         R = self.R_view_body if views else self.R_lab_body
         mask = torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
         rotations, score = torch.eye(3).to(R).repeat(*mask.shape, 1, 1), self.score.new_zeros(mask.shape)

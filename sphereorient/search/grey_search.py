@@ -103,9 +103,7 @@ class GreySearch(DiskSearch):
         return self.score(disks).amax(-1)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
-        All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
-        """
+        """Return the best templates of the best groups (F, M), best first, and which are peaks, (F, M) bool."""
         scores = torch._int_mm(self._normalised(disks), self.bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)

@@ -94,9 +94,7 @@ def fit_stretched(
 
 
 def _likeliest(log_x: Floats, noise_share: float) -> Statistic:
-    """Return the function that finds a and flatness (..., 2) from counts in bins of ln|x| (K,), and the sums of the
-    values and of their squares, (..., K + 2).
-    """
+    """Return the fit of a and flatness (..., 2) to counts by ln|x| (K,) and sums of x and x^2, (..., K + 2)."""
     nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
     steps = (0.0, STEP, -STEP)
     table, up, down = (log_stretched_exponential(np.exp(log_x + s)[:, None], nodes, noise_share) for s in steps)

@@ -17,9 +17,7 @@ FEWEST_SEGMENTS = 10  # of a lag; with fewer its error bar means little
 
 
 def places(frame: Rows, segment: Rows) -> Rows:
-    """Return the places of rows (M,) on one regular grid: `frame` of its segment, an empty place after each segment.
-    Frames increase within a segment; segments 0 .. S - 1 increase.
-    """
+    """Return the places of rows (M,), sorted by segment, on one regular grid; an empty place ends each segment."""
     lengths = frame[np.flatnonzero(np.append(np.diff(segment), 1))] + 2
     return np.asarray(frame + (np.cumsum(lengths) - lengths)[segment], np.int64)
 
