@@ -165,7 +165,10 @@ def triple_costs(
     """
     variance = cost.sigma_scale**2 * variance_rad2
     links, steps, width = _Links.of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
-    still = _still(cost, links, R_lab_body, variance)
+    stays = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
+    here = taken(variance, links.before, 1)[..., :, None]
+    rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
+    still = _log_ratio(cost, stays, rest).amax(-2)  # (..., N, C), of each candidate if one of the frame before stays
     chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
     parts = [_chunk(cost, links, variance, still, slice(at, min(at + chunk, steps))) for at in range(2, steps, chunk)]
     none = R_lab_body.new_zeros((*mask.shape[:-2], 0, *[mask.shape[-1]] * 3))
@@ -186,14 +189,6 @@ def _chunk(cost: SecondOrderCost, links: "_Links", variance: Tensor, still: Tens
     broken = torch.as_tensor(cost.break_probability)
     follows = torch.logaddexp(torch.log1p(-broken) + _log_ratio(cost, misfit, predicted), broken.log())
     return cost.candidate(follows, still[..., steps, None, None, :])
-
-
-def _still(cost: SecondOrderCost, links: "_Links", R_lab_body: Tensor, variance: Tensor) -> Tensor:
-    """Return the log ratio (..., N, C) of each candidate if one of the frame before stays."""
-    misfit = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
-    here = taken(variance, links.before, 1)[..., :, None]
-    rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
-    return _log_ratio(cost, misfit, rest).amax(-2)
 
 
 def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tensor:

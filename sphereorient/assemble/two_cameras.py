@@ -240,10 +240,8 @@ def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
     near, which = torch.where(mask, distance, torch.inf).min(-1)
     row = torch.arange(len(frames), device=frames.device)
     found = near <= limit
-    return Track(
-        R_lab_body=torch.where(found[:, None, None], R_all[row, which], torch.nan),
-        score=torch.where(found, score_all[row, which], torch.nan),
-    )
+    R = torch.where(found[:, None, None], R_all[row, which], torch.nan)
+    return Track(R_lab_body=R, score=torch.where(found, score_all[row, which], torch.nan))
 
 
 def _beside(frames: Tensor, agreed: Tensor, gap_frames_max: int) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
@@ -33,7 +34,16 @@ class Rig:
 
     cameras: Mapping[str, Camera]
     R_lab_plate: Tensor  # (P, 3, 3)
-    T_lab_plate_mm: Tensor  # (P, 3)
+    T_lab_plate_mm: Tensor  # (P, 3), NaN where unknown
+
+    @property
+    def posed(self) -> set[int]:
+        """Rows of the known poses."""
+        return set(torch.nonzero(torch.isfinite(self.T_lab_plate_mm).all(1))[:, 0].tolist())
+
+    def placed(self, row: int, points_plate_mm: NDArray[np.float64]) -> Tensor:
+        """Return the points (n, 3) of the plate in the lab, mm, in one of its poses."""
+        return torch.from_numpy(points_plate_mm) @ self.R_lab_plate[row].mT + self.T_lab_plate_mm[row]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

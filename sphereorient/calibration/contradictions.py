@@ -140,11 +140,9 @@ def with_contradictions(
     believed = track.believed.sum(1)
     outvoted = torch.from_numpy(elsewhere & (believed > elsewhere.sum(1))[:, None])
     wrong = torch.from_numpy(elsewhere.any(1)) & ~outvoted.any(1)
-    counted = replace(
-        seen,
-        centre_px=seen.centre_px.masked_fill(outvoted[..., None], torch.nan),
-        R_lab_body=seen.R_lab_body.masked_fill(outvoted[..., None, None], torch.nan),
-    )
+    centre_px, R = seen.centre_px.clone(), seen.R_lab_body.clone()
+    centre_px[outvoted], R[outvoted] = torch.nan, torch.nan
+    counted = replace(seen, centre_px=centre_px, R_lab_body=R)
     pairs = [_compared(track, counted, lasting_rad2, *two) for two in seen.pairs]
     for pair in pairs:
         wrong |= pair.turned | (pair.gaps.signed_px.abs() > limits.gap_px)

@@ -52,12 +52,8 @@ def _joined(first: LearntMap, other: LearntMap, R_other_first: Tensor) -> Learnt
     gain, offset = fit_levels(grey, first.texture.double())
     own, added = first.sigma.double().square().reciprocal(), (gain * sigma).square().reciprocal().nan_to_num()
     sums = own * first.texture.nan_to_num() + added * (gain * grey + offset).nan_to_num()
-    return replace(
-        first,
-        texture=(sums / (own + added)).float(),
-        sigma=(own + added).rsqrt().float(),
-        seen=first.seen + seen.nan_to_num().round().long(),
-    )
+    texture, count = (sums / (own + added)).float(), first.seen + seen.nan_to_num().round().long()
+    return replace(first, texture=texture, sigma=(own + added).rsqrt().float(), seen=count)
 
 
 def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison, float]:

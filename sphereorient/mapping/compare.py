@@ -74,9 +74,9 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
     finest = [texture_table(grey, math.radians(FINE_BLUR_DEG), SIDE) for grey, _ in maps]
     blurs = (FINE_BLUR_DEG, *reversed(BLURS_DEG), SEARCH_BLUR_DEG)
     tables = {blur: [table.blurred(math.radians(blur)) for table in finest] for blur in blurs}
-    shares = [share for _, share in maps]
-    place = fibonacci_directions(PLACES)
-    coarse = [_coarser(share) for share in shares]
+    shares, place = [share for _, share in maps], fibonacci_directions(PLACES)
+    rows = [min(len(share), SIDE) for share in shares]  # as many as the tables have: quick to look up
+    coarse = [F.adaptive_avg_pool2d(share[None], (n, 2 * n))[0] for share, n in zip(shares, rows, strict=True)]
     R = _best_rotation(tables, coarse, place) if turned else torch.eye(3, dtype=torch.float64)
     correlation, known = _correlations(tables[BLURS_DEG[-1]], coarse, place, R[None])
     score = float(correlation[0]) if float(known[0]) > 0 else math.nan
@@ -168,12 +168,6 @@ def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
     known = torch.isfinite(texture)
     middle = texture[known].mean() if known.any() else torch.tensor(0.5)
     return torch.where(known, texture, middle).float(), known.float()
-
-
-def _coarser(share: Tensor) -> Tensor:
-    """Return the known shares (h, 2 h) of a mask (H, 2 H) in as few texels as its tables have: quick to look up."""
-    rows = min(len(share), SIDE)
-    return F.adaptive_avg_pool2d(share[None, None], (rows, 2 * rows))[0, 0]
 
 
 def _best_rotation(tables: dict[float, list[TextureTable]], shares: list[Tensor], place: Tensor) -> Tensor:

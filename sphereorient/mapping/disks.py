@@ -39,7 +39,7 @@ OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its med
 # found badly, both scatter alike.
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
 PLACES = 2  # per radius: places that far apart have paint of their own
-BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen")  # of `Disks`
+BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen", "shown")  # of `Disks`
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 
@@ -206,20 +206,18 @@ class Disks:
     R_lab_view: Tensor  # (N, C, 3, 3) float32
     distance_radii: Tensor  # (N, C), of the camera from the centre
     seen: Tensor  # (N, C) bool
-    shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nothing does
+    shown: Tensor  # (N, C, S, S) float32, 0 where something hides the ball .. 1
 
     def __len__(self) -> int:
         return len(self.layers)
 
     def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> "Disks":
         """Select instants and cameras."""
-        shown = None if self.shown is None else self.shown[rows, cameras]
-        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in BY_INSTANT})
+        return replace(self, **{name: getattr(self, name)[rows, cameras] for name in BY_INSTANT})
 
     def weight(self, rows: Tensor | slice, camera: int) -> Tensor:
         """Return pixel weights (R, S * S) of some disks: 0 where not seen or hidden."""
-        counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)
-        return counts if self.shown is None else counts * self.shown[rows, camera].flatten(1)
+        return self.seen[rows, camera][:, None] * self.shown[rows, camera].flatten(1)
 
     def sampled(
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
@@ -249,20 +247,24 @@ class Disks:
         """Unit vectors from the ball to the cameras, (N, C, 3) float64."""
         return -self.R_lab_view[..., 2].double()
 
+    def sight_cosines(self, R_lab_body: Tensor, rows: Tensor) -> Tensor:
+        """Return the cosine between the nearest lines of sight in the body for all pairs of instants (K,), (K, K)."""
+        in_body = (R_lab_body[rows].mT[:, None] @ self.sight_lab[rows][..., None])[..., 0]
+        cosine = torch.einsum("acx,bdx->abcd", in_body, in_body)
+        both = self.seen[rows][:, None, :, None] & self.seen[rows][None, :, None, :]
+        return torch.where(both, cosine, -1.0).flatten(2).amax(2)
+
     @classmethod
     def joined(cls, parts: Sequence["Disks"]) -> "Disks":
         """Join instants of the same cameras."""
-        shown = [one.shown for one in parts if one.shown is not None]
         joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in BY_INSTANT}
-        return cls(share=parts[0].share, shown=torch.cat(shown) if shown else None, **joined)
+        return cls(share=parts[0].share, **joined)
 
 
 def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
     """Cut and normalise the disks of some frames (M,)."""
     size, count, cameras = settings.disk_px, len(frames), len(crops.views)
-    pictures = torch.zeros(count, cameras, size, size)
-    hidden = any(view.background.shown is not None for view in crops.views)
-    shown = torch.ones(count, cameras, size, size) if hidden else None
+    pictures, shown = torch.zeros(count, cameras, size, size), torch.ones(count, cameras, size, size)
     R, far = torch.empty(count, cameras, 3, 3).double(), torch.empty(count, cameras).double()
     X = crops.position_lab_mm[frames]
     for c, view in enumerate(crops.views):
@@ -279,7 +281,7 @@ def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
                 continue
             u, v, radius_px = float(middle[k, 0]), float(middle[k, 1]), float(limb[k])
             pictures[k, c] = torch.from_numpy(crop_disk(crop.grey, u - crop.left, v - crop.top, radius_px, size))
-            if shown is not None and view.background.shown is not None:
+            if view.background.shown is not None:
                 visible = crop_disk(view.background.shown.astype(np.uint8), u, v, radius_px, size)
                 shown[k, c] = torch.from_numpy(visible) > SHOWN_MIN
     return normalised_disks(pictures, R, far, crops.seen[frames], settings, shown)
@@ -299,8 +301,8 @@ def normalised_disks(
     size = pictures.shape[-1]
     share = rim_share(size)
     fine, wide = Blur(size, settings.detail), Blur(size, settings.window)
-    flat = pictures.reshape(-1, size, size).float()
-    if shown is not None:  # fill what is hidden with the ball's mean grey
+    flat, shown = pictures.reshape(-1, size, size).float(), torch.ones(pictures.shape) if shown is None else shown
+    if bool((shown < 1).any()):  # fill what is hidden with the ball's mean grey
         part = shown.reshape(-1, size, size)
         total = (part * share).sum((1, 2), keepdim=True).clamp_min(1e-6)
         usual = (flat * (part * share)).sum((1, 2), keepdim=True) / total
@@ -356,12 +358,8 @@ def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
 
 def reduced(disks: Disks, factor: int) -> Disks:
     """Return the disks with pictures reduced by a whole factor."""
-    return replace(
-        disks,
-        layers=_with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)),
-        share=rim_share(disks.size_px // factor),
-        shown=None if disks.shown is None else F.avg_pool2d(disks.shown, factor),
-    )
+    layers, shown = _with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)), F.avg_pool2d(disks.shown, factor)
+    return replace(disks, layers=layers, share=rim_share(disks.size_px // factor), shown=shown)
 
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:

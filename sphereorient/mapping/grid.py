@@ -62,9 +62,8 @@ class SplineTable(TextureTable):
         by_row = ((found * along[..., None, :]).sum(-1) * _spline_slope(row)).sum(-1)
         level = latitude.cos().clamp_min(POLE)
         east = torch.stack([-longitude.sin(), longitude.cos(), torch.zeros_like(level)], dim=1)
-        north = torch.stack(
-            [-latitude.sin() * longitude.cos(), -latitude.sin() * longitude.sin(), latitude.cos()], dim=1
-        )
+        south = -latitude.sin()
+        north = torch.stack([south * longitude.cos(), south * longitude.sin(), latitude.cos()], dim=1)
         slope = (height / math.pi) * ((by_column / level)[:, None] * east - by_row[:, None] * north)
         return (found.flatten(-2) * weight).sum(-1), slope
 

@@ -12,22 +12,11 @@ from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.follow.appearance import NO_BETTER, WIDER, Appearance
 from sphereorient.follow.fixed_centre import FixedCentre, centre_of
+from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import chained
 from sphereorient.mapping.disks import Crop, Crops, disks_of, evenly_spread, pixels_of
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.mapping.iterations import (
-    ROW,
-    SEPARATE_ITERATIONS,
-    State,
-    extended,
-    first_map,
-    first_state,
-    iterate,
-    iterating,
-    lowest,
-    map_height,
-    optics_of,
-)
+from sphereorient.mapping.iterations import State
 from sphereorient.mapping.learn import final_map, interpolated
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import Optics
@@ -96,8 +85,8 @@ class GrowingMap:
     """
 
     def __init__(self, place: Crops, settings: MapSettings) -> None:
-        rows = round(COARSER * map_height(place.views, settings) / ROW) * ROW
-        self._height = settings.height or max(ROW, rows)
+        rows = round(COARSER * iterations.map_height(place.views, settings) / iterations.ROW) * iterations.ROW
+        self._height = settings.height or max(iterations.ROW, rows)
         pixels = min(settings.pixels, MOST_PIXELS)
         self._settings = settings.model_copy(update={"height": self._height, "pixels": pixels})
         self._place, self._crops = place, replace(place, position_lab_mm=place.position_lab_mm[:0])
@@ -177,7 +166,7 @@ class GrowingMap:
             settings = settings.model_copy(update={"blur_px": state.blur_px})
         if size and state.use.shape[1] == 1:
             state = _better_size(state, settings)
-        for found in iterating(state, settings, SEPARATE_ITERATIONS + min(k, LATER)):
+        for found in iterations.iterating(state, settings, iterations.SEPARATE_ITERATIONS + min(k, LATER)):
             if found is None:
                 yield
         assert found is not None
@@ -211,7 +200,7 @@ class GrowingMap:
         new = replace(new, R_lab_body=torch.where(good[:, None, None], fit.R_lab_body, R_aligned))
         self._learnt = replace(
             learnt,
-            state=extended(learnt.state, new, learnt.tie, level.paint.unseen),
+            state=iterations.extended(learnt.state, new, learnt.tie, level.paint.unseen),
             shown=len(self),
             rows=torch.cat([learnt.rows, rows[good]]),
             R_lab_map=torch.cat([learnt.R_lab_map, fit.R_lab_body[good]]),
@@ -221,8 +210,8 @@ class GrowingMap:
         rows, learnt = evenly_spread(torch.arange(len(self)), MOST_FITTED), self._learnt
         if learnt is None:
             disks = disks_of(self._crops, rows, self._settings)
-            first = first_map(disks, self._R[rows], self._height)
-            state = first_state(self._crops, rows, self._R[rows], first, self._settings)
+            first = iterations.first_map(disks, self._R[rows], self._height)
+            state = iterations.first_state(self._crops, rows, self._R[rows], first, self._settings)
             return self._of(rows, self._R[rows], state)
         R = interpolated(self._R_aligned(learnt), learnt.rows, learnt.R_lab_map)
         return self._of(rows, R[rows], learnt.state)
@@ -289,8 +278,8 @@ def _better_size(state: State, settings: MapSettings) -> State:
     leave least: an outline that is too large by one part in a hundred makes all turns too small by that.
     """
     tried = [_at_distance(state, 1 + k * SIZE_STEP) for k in (-1, 0, 1)]
-    held = [replace(iterate(one, settings, TRIED)[0], position_lab_mm=one.position_lab_mm) for one in tried]
-    return _at_distance(state, 1 + SIZE_STEP * lowest(*(_left(one) for one in held)))
+    held = [replace(iterations.iterate(one, settings, TRIED)[0], position_lab_mm=one.position_lab_mm) for one in tried]
+    return _at_distance(state, 1 + SIZE_STEP * iterations.lowest(*(_left(one) for one in held)))
 
 
 def _at_distance(state: State, factor: float) -> State:
@@ -312,7 +301,8 @@ def _optics(state: State) -> tuple[Optics, float]:
     """Return the optics of the map, whose texels that no picture shows well are unseen, and the share of the others."""
     assert state.weight is not None
     unseen = state.weight < LEAST_WEIGHT * state.weight[state.weight > 0].median()
-    optics, areas = optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE), texel_areas(len(unseen))
+    optics = iterations.optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE)
+    areas = texel_areas(len(unseen))
     if bool(unseen.any()):
         optics.fine.paint.unseen = texture_table(unseen.float(), optics.fine.paint.blur_rad, UNSEEN_SIDE)
     return optics, float((areas * ~unseen).sum() / areas.sum())

@@ -13,22 +13,10 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
+from sphereorient.mapping import grid
 from sphereorient.mapping.compare import fit_levels
 from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
-from sphereorient.mapping.grid import (
-    ROUGH_SIDE,
-    NormalMatrix,
-    SplineTable,
-    coefficients_blur_rad,
-    map_sums,
-    map_table,
-    paint_tie,
-    sharpened,
-    solve_map,
-    stiffness,
-    texel_areas,
-    texel_sums,
-)
+from sphereorient.mapping.grid import NormalMatrix, SplineTable
 from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
@@ -101,7 +89,7 @@ class State:
     @property
     def tie(self) -> float:
         """The weight of the map's squared slope while poses are sought."""
-        return (LOOSE if self.expected is None else 1.0) * paint_tie(self.texture, self.blur_rad)
+        return (LOOSE if self.expected is None else 1.0) * grid.paint_tie(self.texture, self.blur_rad)
 
     def map_fitter(self) -> Fitter:
         """Return the fitter of poses to the present map."""
@@ -149,9 +137,9 @@ def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
     for c in range(disks.layers.shape[1]):
         normal, grey, weight = disks.sampled(slice(None), c, slant_power=2)
         body = (R_lab_body.mT.float() @ (disks.R_lab_view[:, c] @ normal)).mT
-        more, sums = map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
+        more, sums = grid.map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
         matrix, right = matrix + more, right + sums
-    even = solve_map(matrix, right, height, FIRST_SMOOTH * _typical(matrix.diagonal()))
+    even = grid.solve_map(matrix, right, height, FIRST_SMOOTH * _typical(matrix.diagonal()))
     return (0.5 + CONTRAST * even / even.std()).clamp(0, 1).float()
 
 
@@ -160,7 +148,7 @@ def first_state(
 ) -> State:
     """Return the initial state from orientations (n, 3, 3) of frames (n,) and a map; `extra_px`: added blur."""
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
-    table = optics_of(texture, crops.views, blur_px, ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
+    table = optics_of(texture, crops.views, blur_px, grid.ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
     fitter = first_fitter(crops.views, crops.radius_mm, table, blur_px)
     pixels, use = pixels_of(crops, fitter, frames, settings.pixels, extra_px), crops.seen[frames]
     X = crops.position_lab_mm[frames]
@@ -202,7 +190,7 @@ def iterating(state: State, settings: MapSettings, k: int) -> Iterator[tuple[Sta
 def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float, side: int = SIDE) -> Optics:
     """Return the optics of a map (H, 2 H) that has the blur of the pictures; `side` counts cells of its table."""
     widest = widest_px(views)
-    return Optics(map_table(blurred, 2 * blur_px / widest, side), blur_px, widest)
+    return Optics(grid.map_table(blurred, 2 * blur_px / widest, side), blur_px, widest)
 
 
 def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[State, FittedPoses]:
@@ -260,7 +248,7 @@ def _lit_in_the_lab(state: State) -> State:
 def _rescaled(state: State) -> State:
     """Scale the map to black 0 and white 1: pictures alone do not separate a dark light from a dark map."""
     values, order = state.texture.reshape(-1).sort()
-    share = texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
+    share = grid.texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
     light = state.fitter.light
@@ -290,15 +278,12 @@ def _with_joint_step(state: State, smoothest: float) -> State:
     """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
     parts = list(side_by_side(lambda some: linear_system(some.linearised_at(), height), state.batches()))
-    weight = sum((texel_sums(part.by_texel) for part in parts), np.zeros(2 * height * height))
+    weight = sum((grid.texel_sums(part.by_texel) for part in parts), np.zeros(2 * height * height))
     tie = max(smoothest * _typical(weight), state.tie)
     pose = joint_step(parts, state.use, _unexpected(state), tie, state.fitter.radius_mm, state.fixed)
     pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
-    return replace(
-        state,
-        position_lab_mm=state.position_lab_mm + pose[:, 3:],
-        R_lab_body=so3.nearest_rotation(so3.exp(pose[:, :3]) @ state.R_lab_body),
-    )
+    R = so3.nearest_rotation(so3.exp(pose[:, :3]) @ state.R_lab_body)
+    return replace(state, position_lab_mm=state.position_lab_mm + pose[:, 3:], R_lab_body=R)
 
 
 def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
@@ -306,7 +291,7 @@ def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
     normal, right, chi2 = _map_equations(state)
     tie = max(smoothest * _typical(normal.diagonal()), state.tie)
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
-    right -= tie * (stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
+    right -= tie * (grid.stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
     return _changed(state, normal, right, tie), chi2
 
 
@@ -331,7 +316,7 @@ def extended(state: State, new: State, tie: float, unseen: TextureTable | None) 
 def _changed(state: State, normal: NormalMatrix, right: NDArray[np.float64], tie: float) -> State:
     """Return the state with the change of its map that solves normal equations (T, T), (T,)."""
     height = len(state.texture)
-    texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
+    texture = state.texture + grid.solve_map(normal, right, height, tie, MAP_STEPS).float()
     weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight)
 
@@ -340,12 +325,12 @@ def sharp_map(state: State) -> Tensor:
     """Return the paint without the blur of the pictures, (H, 2 H) float64."""
     normal, right, _ = _map_equations(state)
     right += normal @ state.texture.double().numpy().ravel()
-    tie = paint_tie(state.texture, state.blur_rad)
+    tie = grid.paint_tie(state.texture, state.blur_rad)
     expected = torch.zeros_like(state.texture)
     if state.expected is not None:
         _, (gain, offset) = _as_filmed(state, state.expected)
         expected = gain * state.expected + offset
-    return sharpened(normal, right, state.blur_rad, tie, expected)
+    return grid.sharpened(normal, right, state.blur_rad, tie, expected)
 
 
 def _unexpected(state: State) -> Tensor:
@@ -359,7 +344,7 @@ def _unexpected(state: State) -> Tensor:
 def _as_filmed(state: State, paint: Tensor) -> tuple[Tensor, tuple[float, float]]:
     """Return the coefficients of paint (H, 2 H) as the pictures blur it, and gain and offset to the state's map."""
     height = len(paint)
-    table = texture_table(paint, coefficients_blur_rad(state.blur_rad, height))
+    table = texture_table(paint, grid.coefficients_blur_rad(state.blur_rad, height))
     filmed = table.sample(map_directions(height).reshape(-1, 3).float().T[None])[0].reshape(paint.shape)
     return filmed, fit_levels(filmed, state.texture)
 
@@ -380,7 +365,7 @@ def _map_equations(state: State) -> tuple[NormalMatrix, NDArray[np.float64], flo
 def map_weight(state: State) -> Tensor:
     """Return the sum of the pixels' weights at each texel, (H, 2 H) float64: its inverse variance by noise."""
     height = len(state.texture)
-    total = sum((texel_sums(at.by_texel(height)) for at in state.linearised()), np.zeros(2 * height * height))
+    total = sum((grid.texel_sums(at.by_texel(height)) for at in state.linearised()), np.zeros(2 * height * height))
     return torch.from_numpy(total.reshape(height, -1))
 
 

@@ -94,11 +94,8 @@ def linear_system(at: Linearisation, height: int) -> LinearSystem:
     gram = rows @ rows.mT + RIDGE * torch.eye(rows.shape[1], dtype=rows.dtype)
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
     # Near the limb the map is not learnt; it must not move the pose there.
-    by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over)
-    residual = at.residual * root
-    return LinearSystem(
-        by_texel=at.by_texel(height), by_pose=by_pose * root[:, None], by_light=basis, residual=residual
-    )
+    by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over) * root[:, None]
+    return LinearSystem(by_texel=at.by_texel(height), by_pose=by_pose, by_light=basis, residual=at.residual * root)
 
 
 def joint_step(

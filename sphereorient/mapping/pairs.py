@@ -1,6 +1,7 @@
 """Relative rotations of pairs of instants from pictures alone, and orientations from them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,12 @@ class RelativeRotations:
 
     def where(self, chosen: Tensor) -> "RelativeRotations":
         """Return some of the pairs."""
-        return RelativeRotations(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
+        return RelativeRotations(**{name: part[chosen] for name, part in vars(self).items()})
+
+    @classmethod
+    def joined(cls, parts: Sequence["RelativeRotations"]) -> "RelativeRotations":
+        """Join several records of pairs."""
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__})
 
     def residual(self, R_lab_body: Tensor) -> Tensor:
         """Return delta (E, 3), rad, between the pairs and orientations (N, 3, 3): R_ji = exp([delta]x) R(j) R(i)^T."""
@@ -66,12 +72,6 @@ class Closure:
         moved = attitude_change_rad(before, after)
         counts = {"pairs": pairs, "loops": loops, "closed": len(closed)}
         return cls(**counts, drift_before_rad=drift, drift_after_rad=left, moved_rad=moved)
-
-
-def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
-    """Join several records of pairs."""
-    names = RelativeRotations.__dataclass_fields__
-    return RelativeRotations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 def attitude_change_rad(before: Tensor, after: Tensor) -> float:
@@ -137,7 +137,7 @@ def refine_pairs(
         R, normal, score, overlap = so3.nearest_rotation(R.double()), normal.double(), score.double(), overlap.double()
         return RelativeRotations(first=i, second=j, R_ji=R, information=normal, score=score, overlap=overlap)
 
-    return all_rotations(list(side_by_side(refined, torch.split(torch.arange(len(first)), BATCH))))
+    return RelativeRotations.joined(list(side_by_side(refined, torch.split(torch.arange(len(first)), BATCH))))
 
 
 def _normal_equations(

@@ -12,24 +12,9 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.chain import (
-    EVERY,
-    ITERATIONS,
-    OVERLAP_MIN,
-    SMALLER,
-    PairwiseAttitudes,
-    check_turned,
-    sight_cosines,
-)
+from sphereorient.mapping.chain import EVERY, ITERATIONS, OVERLAP_MIN, SMALLER, PairwiseAttitudes, check_turned
 from sphereorient.mapping.disks import Disks, reduced
-from sphereorient.mapping.pairs import (
-    Closure,
-    RelativeRotations,
-    all_rotations,
-    refine_pairs,
-    search_views,
-    solve_graph,
-)
+from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs, search_views, solve_graph
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.search.candidates import distinct
 
@@ -154,7 +139,7 @@ def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, T
             placed = torch.where(other[:, None, None], R @ (R[j].mT @ R_ji @ R[i]), R)
             between, gained = _compared_at(evidence, placed, one[:, None] & other, JOIN_ITERATIONS)
             if float(gained.sum()) > SURE:
-                pairs = all_rotations([pairs, between.where(gained > 0)])
+                pairs = RelativeRotations.joined([pairs, between.where(gained > 0)])
                 label = torch.where(other, label[i], label)
                 R = _solved(placed, pairs, one | other)
     return label, R
@@ -164,7 +149,7 @@ def _compared_at(
     evidence: Evidence, R_lab_body: Tensor, wanted: Tensor, iterations: int
 ) -> tuple[RelativeRotations, Tensor]:
     """Compare pairs `wanted` (N, N) at given orientations; return rotations and log-odds (E,), low if far away."""
-    near = sight_cosines(evidence.disks, R_lab_body, torch.arange(len(R_lab_body)))
+    near = evidence.disks.sight_cosines(R_lab_body, torch.arange(len(R_lab_body)))
     first, second = torch.nonzero(wanted & (near > math.cos(math.radians(TILT_DEG)))).T
     about = R_lab_body[second] @ R_lab_body[first].mT
     pairs = refine_pairs(evidence.disks, first, second, about, iterations, EVERY)

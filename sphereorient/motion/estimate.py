@@ -105,9 +105,12 @@ def _settled(
     scale, limit = learnt.scale, settings.outlier_sigma**2
     path = replace(path, covariance=path.covariance * scale**2)
     farthest, tries, judgements = 0.0, 0, 0
+    wanted = np.zeros((9, SIZE))
+    wanted[VALUE, DELTA] = wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = np.eye(3)
+    wanted[CHANGE, 9:12] = learnt.prior.pole * np.eye(3)
     while True:
         chain = path.chain(learnt.prior)
-        states = smooth(chain, run_filter(chain), _wanted(learnt.prior.pole))
+        states = smooth(chain, run_filter(chain), wanted)
         path = path.moved(states.state, learnt.prior)
         step = float(np.abs(states.state[:, DELTA]).max()) / path.sigma
         farthest, tries = max(farthest, step), tries + 1
@@ -136,14 +139,6 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
     if (path.seen & ~(used & ~wrong)).sum() <= share * path.seen.sum():
         used &= ~wrong
     return used
-
-
-def _wanted(pole: float) -> Floats:
-    """Return the rows (9, SIZE) of value, rate and change in a state."""
-    wanted = np.zeros((9, SIZE))
-    wanted[VALUE, DELTA] = wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = np.eye(3)
-    wanted[CHANGE, 9:12] = pole * np.eye(3)
-    return wanted
 
 
 def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings) -> Estimate:

@@ -87,13 +87,8 @@ class SegmentTrack:
 
     def moved(self, state: Floats, prior: Prior) -> Self:
         """Return the path about the states (N, SIZE)."""
-        return replace(
-            self,
-            reference=self.stepped(self.reference, state[:, DELTA]),
-            mean=self.mean + state[0, MEAN],
-            rate=state[:, RATE].reshape(-1, ORDER, 3),
-            pole=prior.pole,
-        )
+        reference, rate = self.stepped(self.reference, state[:, DELTA]), state[:, RATE].reshape(-1, ORDER, 3)
+        return replace(self, reference=reference, mean=self.mean + state[0, MEAN], rate=rate, pole=prior.pole)
 
     def away(self) -> Floats:
         """Return the measurements as deviations (N, 3) from the reference; 0 where not measured."""

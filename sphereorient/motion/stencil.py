@@ -73,19 +73,16 @@ def gaussian_derivative(
     Raises SettingsError (an order other than 0, 1, 2, or a width that is not positive).
     Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
     """
-    kernel = gaussian_kernel(sigma_frames, order, truncate, x)
+    kernel = _with_exact_moments(*_gaussian(sigma_frames, order, truncate, x), order)
     return (windows(x.mT, len(kernel) // 2) * kernel).sum(-1).mT / dt_s**order
 
 
-def gaussian_kernel(
-    sigma_frames: float, order: Order, truncate: float = TRUNCATE, like: Tensor | None = None
-) -> Tensor:
+def gaussian_kernel(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> Tensor:
     """Return the weights (2 h + 1) of the frames k - h .. k + h in `gaussian_derivative` with dt_s = 1.
     Their norm is the gain of white noise: for sigma above 1.5 frames, orders 0, 1, 2: 0.531 sigma^-0.5,
     0.376 sigma^-1.5, 0.460 sigma^-2.5.
     """
-    like = torch.empty(0, dtype=torch.float64) if like is None else like
-    return _with_exact_moments(*_gaussian(sigma_frames, order, truncate, like), order)
+    return _with_exact_moments(*_gaussian(sigma_frames, order, truncate, torch.empty(0, dtype=torch.float64)), order)
 
 
 def gap_aware_stencil(

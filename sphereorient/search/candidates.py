@@ -185,9 +185,7 @@ def resized(disks: Tensor, size_px: int) -> Tensor:
     """Return disks (F, S, S) resampled to `size_px` pixels across."""
     if disks.shape[-1] == size_px:
         return disks
-    grey: Tensor = F.interpolate(
-        disks[:, None], (size_px, size_px), mode="bilinear", align_corners=False, antialias=True
-    )
+    grey: Tensor = F.interpolate(disks[:, None], (size_px,) * 2, mode="bilinear", align_corners=False, antialias=True)
     return grey[:, 0]
 
 

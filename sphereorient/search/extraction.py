@@ -69,10 +69,8 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
     threshold, _ = otsu(one_hot.sum((-2, -1)))
     vote = torch.where(grey > threshold[:, None, None], 1.0, -1.0)
     for share in settings.regions:
-        local = torch.where(
-            grey > _moving_threshold(one_hot, threshold, share, settings.region_contrast_min), 1.0, -1.0
-        )
-        vote = torch.where(vote * local > 0, vote, 0.0)
+        local = _moving_threshold(one_hot, threshold, share, settings.region_contrast_min)
+        vote = torch.where(vote * torch.where(grey > local, 1.0, -1.0) > 0, vote, 0.0)
     return vote * inside
 
 

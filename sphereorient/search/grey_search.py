@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from sphereorient import so3
 from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import LocalNormalisation
-from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.refine_rotation import detail_level, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, perspective_view
 from sphereorient.sphere.texture_table import texture_table
@@ -74,11 +74,6 @@ class GreySearch(DiskSearch):
         """Make the bank now, not when it is needed."""
         self.bank.size()
 
-    @property
-    def made(self) -> bool:
-        """Whether the bank is made."""
-        return "bank" in vars(self)
-
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
         grey = torch.as_tensor(disks).float()
@@ -118,9 +113,9 @@ class GreySearch(DiskSearch):
     def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
         """Refine the peaks of one disk; return its proposals, best first."""
         settings = self._settings
-        R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
+        R, score = refine_rotation(self._rough, disk, starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]
-        R, score = refine_rotation(self._fine, level_reference(self._fine, disk), R, settings.fine_steps)
+        R, score = refine_rotation(self._fine, disk, R, settings.fine_steps)
         chosen = self._distinct(R, score)
         chosen = chosen[score[chosen] >= settings.score_min]
         return Candidates.of_disk(so3.nearest_rotation(R[chosen].double()), score[chosen].double())

@@ -24,15 +24,9 @@ def crop_disk(
     left, right = _span(u_px, radius_px, frame.shape[1])
     top, bottom = _span(v_px, radius_px, frame.shape[0])
     window = frame[top:bottom, left:right].astype(np.float32)
-    return np.asarray(
-        cv2.remap(
-            window,
-            (offset[..., 0] + (u_px - left)).astype(np.float32),
-            (offset[..., 1] + (v_px - top)).astype(np.float32),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-    )
+    at = np.add(offset, [u_px - left, v_px - top]).astype(np.float32)
+    found = cv2.remap(window, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found)
 
 
 def _span(centre_px: float, radius_px: float, length: int) -> tuple[int, int]:

@@ -7,12 +7,8 @@ class SegmentSettings(BaseModel, frozen=True, extra="forbid"):
     """Which frames and segments of a track go into its statistics."""
 
     min_frames: int = Field(50, ge=2, description="segments with fewer frames are left out, as the paper does")
-    min_integral_times: float = Field(
-        0.25, ge=0, description="segments shorter than this many integral times are left out"
-    )
-    integral_time_s: float | None = Field(
-        None, gt=0, description="integral time, s; null: the flow's in experiment.yaml, else that of the velocity"
-    )
+    min_integral_times: float = Field(0.25, ge=0, description="shorter segments are left out, integral times")
+    integral_time_s: float | None = Field(None, gt=0, description="s; null: of experiment.yaml, or the velocity's")
     max_duration_s: float | None = Field(
         None,
         gt=0,

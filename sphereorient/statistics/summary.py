@@ -150,5 +150,5 @@ def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> di
     found = {}
     for quantity in ("alpha_lab",) if all(track.held for track in tracks) else noise.RATES:
         with suppress(TrackError):  # too few neighbouring frames: left out, and the page says so
-            found[quantity] = noise.multi_lag(list(tracks), quantity, settings=settings)
+            found[quantity] = noise.multi_lag(tracks, quantity, settings)
     return found
