@@ -242,8 +242,7 @@ def soft_track(
     temperature: float = 1.0,
 ) -> SoftTrack:
     """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
-    Raises ShapeError (the inputs differ in frames or candidates), SettingsError (`turn_rad` or the temperature is not
-    above 0).
+    Raises ShapeError (the inputs differ in frames or candidates), SettingsError (`turn_rad` or temperature up to 0).
 
     Args:
         R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.

@@ -37,8 +37,7 @@ class SoftPath:
 def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
-    """Find the cheapest path that visits one candidate in each step; of equal paths, the one with the lowest last
-    index.
+    """Find the cheapest path that visits one candidate in each step; of equal ones, that of the lowest last index.
     Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
     Raises ShapeError (costs and mask differ in shape).
     Source: Bellman 1957, Viterbi 1967.

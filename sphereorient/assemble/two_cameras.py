@@ -111,8 +111,7 @@ def _apart(first: Track, second: Track) -> Tensor:
 def _sigma(variance: Tensor, share: Tensor, tracks: Sequence[Track], calm: Tensor) -> Tensor:
     """Return the standard deviation per axis of the mean, (N,), rad.
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
-    degrees of freedom; its median over all pairs gives s^2 robustly. Spikes raise the variance, not d: their frames are
-    left out.
+    degrees of freedom; its median over all pairs gives s^2 robustly, without frames of spikes, which raise variance_i.
     """
     if len(tracks) < 2 or not len(calm):
         return torch.full_like(tracks[0].score, torch.nan)
@@ -146,8 +145,7 @@ class Repair:
 
 def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: AssembleSettings) -> Repair:
     """Repair the frames in which cameras disagree. Where more than half of three or more agree with one of them, the
-    others take their candidates nearest to that one, none (T = 0) beyond `repair_deg`. Other stretches are repaired
-    camera by camera, see `repair`.
+    others take their candidates nearest to that one, none (T = 0) beyond `repair_deg`. Others: see `repair`.
     """
     if len(paths) == 2:
         return repair((paths[0], paths[1]), (graphs[0], graphs[1]), settings)

@@ -222,8 +222,7 @@ def disk_centre_shift(
 ) -> Tensor:
     """Return centroid minus image of the centre (..., n, 2), px, for disks of a plate; differentiable in everything.
     Centres (..., n, 3), plate frame, mm, lie in planes z = const; X_lab = R_lab_plate X_plate + T_lab_plate (mm, any
-    leading shape); diameters (..., n), mm, 0 for a corner, whose shift is 0. NaN where part of a disk is not imaged;
-    blur does not move the centroid.
+    leading shape); diameters (..., n), mm, 0 for a corner, whose shift is 0. NaN where part of a disk is not imaged.
     Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
     """
     check_points("points_plate", points_plate, 3)

@@ -85,8 +85,7 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
 
 
 def majority(seen: Seen, limits: Limits = OUTLINES) -> tuple[int, ...]:
-    """Return the largest set of cameras of which each two agree; none where these are not more than half of all, or of
-    fewer than three cameras.
+    """Return the largest set of cameras of which each two agree, if these are more than half of three or more; or none.
     Of sets of one size that whose lines of sight and sizes agree best: where two cameras alone measure a direction, the
     size of the picture in another, which looks along it, decides.
     """

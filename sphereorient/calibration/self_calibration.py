@@ -89,8 +89,7 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
     """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them, by all
-    spheres in it. CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other
-    cameras.
+    spheres in it. CameraError for unreadable cameras or too few common frames; TrackError for a track of others.
     """
     cameras, tracks = load_cameras(cameras_path), list(Tracks.load(track_path).values())
     used = {name: camera for name, camera in cameras.items() if name in tracks[0].cameras} or cameras

@@ -83,8 +83,7 @@ def fit_map(
     """Learn the texture map, all orientations and the light from the crops of opened movies.
     `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
     `old`: a map (h, 2 h) of the ball as it was, which noise does not change; the body frame is not that of it.
-    Raises PaintError (too few frames, no rotation, no common patch, or different spheres), OutputError (`kept` cannot
-    be written).
+    Raises PaintError (too few frames, no rotation, no common patch, or different spheres), OutputError (for `kept`).
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
     before = None if kept is None else read_kept(kept)

@@ -18,8 +18,7 @@ def omega_from_orientations(
     A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt), weight m^2, optimal for white attitude noise. It damps f
     cycles per frame by sin(2 pi f m) / (2 pi f m). 2 max(m) |omega| dt must stay well below pi (not checked). The error
     comes from the scatter of the separations; NaN with fewer than two.
-    Raises ShapeError (R_lab_body does not end in (N, 3, 3)), SettingsError (no separation, one below 1, or one given
-    twice).
+    Raises ShapeError (R_lab_body does not end in (N, 3, 3)), SettingsError (no separation, one below 1, or twice).
     Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
 
     Args:
@@ -72,8 +71,7 @@ def mean_over_separations(
     turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted mean omega of S separations and its standard error, (..., N, 3), rad/s.
-    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; those not `usable` (..., N, S) are left
-    out.
+    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m, lab; those not `usable` (..., N, S) are left out.
     """
     # a turn that is not used may be half a turn, where log has no gradient
     turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))

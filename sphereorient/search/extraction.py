@@ -31,8 +31,7 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
 
 
 def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the threshold between the classes of histograms (..., B) of 0 .. 1, and the difference of their means,
-    (...).
+    """Return the threshold (...) of histograms (..., B) of 0 .. 1, and the difference of the classes' means, (...).
     The threshold is the middle of a plateau; the difference is 0 where all values lie in one bin.
     Source: Otsu 1979, eq. (18): the greatest variance between the classes.
     """

@@ -16,8 +16,7 @@ def crop_disk(
     frame: NDArray[np.generic], u_px: float, v_px: float, radius_px: float, size_px: int
 ) -> NDArray[np.float32]:
     """Return the square about a disk of a frame (H, W), resampled bilinearly to (S, S) float32 grey levels.
-    u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border the nearest pixel
-    repeats.
+    u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border, border pixels repeat.
     """
     offset = disk_offsets(size_px).numpy() * radius_px
     # The window first: a map over the whole frame would convert all of it to float.
