@@ -6,15 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from sphereorient import so3
+from sphereorient.assemble.beam import Bools, Floats, Ints
 from sphereorient.trajectory import runs_of
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 FITTED = 6  # frames from which a motion is extrapolated
 ORDER = 2  # of its polynomial
@@ -43,7 +40,7 @@ class _Motions:
     R_lab_body: Floats  # (K, N, 3, 3)
     time_s: Floats  # (N,)
 
-    def away(self, frames: Indices, row: int, to_row: int, to: int) -> Floats:
+    def away(self, frames: Ints, row: int, to_row: int, to: int) -> Floats:
         """Return move (mm) and turn (rad), (2,), of a row's pose off its prediction by frames, the nearest first."""
         t = self.time_s[frames] - self.time_s[frames[0]]
         scale = np.abs(t).max() or 1.0
@@ -60,8 +57,8 @@ class _Motions:
 
 
 def same_balls(
-    position_lab_mm: Floats, R_lab_body: Floats, seen: NDArray[np.bool_], time_s: Floats, breaks: Sequence[int]
-) -> tuple[Indices, Floats]:
+    position_lab_mm: Floats, R_lab_body: Floats, seen: Bools, time_s: Floats, breaks: Sequence[int]
+) -> tuple[Ints, Floats]:
     """Return which row is which ball, (K, N): that of each ball in each frame, and the probability that the ball has
     kept its name, (K, N), NaN where that was never in doubt.
     Pieces of rows, which end where the row may have changed to another ball, are linked by the errors of extrapolating
@@ -103,7 +100,7 @@ def same_balls(
     return _whole(order, taken), np.where(probability < CERTAIN, probability, np.nan)
 
 
-def _whole(order: Indices, taken: NDArray[np.bool_]) -> Indices:
+def _whole(order: Ints, taken: Bools) -> Ints:
     """Return an order in which rows without a ball belong to the balls without a row."""
     for frame in np.flatnonzero(~taken.all(0)):
         balls = np.flatnonzero(~taken[:, frame])
@@ -112,7 +109,7 @@ def _whole(order: Indices, taken: NDArray[np.bool_]) -> Indices:
     return order
 
 
-def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
+def _unbroken(seen: Bools, breaks: Sequence[int]) -> list[_Piece]:
     """Return the pieces between breaks in which a row has poses."""
     spans = list(pairwise(sorted({0, *breaks, seen.shape[1]})))
     return [
@@ -123,7 +120,7 @@ def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
     ]
 
 
-def _before(piece: _Piece, frame: int) -> Indices:
+def _before(piece: _Piece, frame: int) -> Ints:
     return np.arange(frame - 1, max(piece.first, frame - FITTED) - 1, -1)
 
 

@@ -36,10 +36,7 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
         0.3, gt=0, lt=0.5, description="probability that a false candidate stands where one stood before (glare, dirt)"
     )
     follow_probability: float = Field(
-        2.0e-3,
-        gt=0,
-        lt=0.5,
-        description="probability that a false candidate follows the motion (the twin of a symmetric texture map)",
+        2.0e-3, gt=0, lt=0.5, description="probability that a false candidate follows the motion (a symmetric map)"
     )
     evidence_doubt: float = Field(0.01, gt=0, lt=1, description="probability that the pictures show no right candidate")
     evidence_scale: float = Field(1.0, gt=0, description="factor on pictures' nats; below 1 where they claim too much")

@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration.comparison import Comparison, Sight, misfit
+from sphereorient.calibration.targets import Floats
 from sphereorient.cameras import Camera, Rays
 
-Floats = NDArray[np.float64]
 LATEST = 8  # frames by which a movie may be late
 PLAUSIBLE = 0.2  # largest deviation: relative, rad, 100 mm
 FIT: dict[str, Any] = {"loss": "soft_l1", "x_scale": 0.01, "max_nfev": 30}

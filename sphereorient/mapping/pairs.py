@@ -236,14 +236,11 @@ def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) 
 def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: Tensor) -> Tensor:
     """Solve residual = delta_j - R_ji delta_i for all pairs, (N, 3)."""
     count, i, j = len(R), pairs.first, pairs.second
-    carry = R[j] @ R[i].mT
-    rows, columns, values = [], [], []
-    axes = torch.arange(3)
+    carry, axes = R[j] @ R[i].mT, torch.arange(3)
     left = carry.mT @ weight
-    for a, b, block in ((i, i, left @ carry), (i, j, -left), (j, i, -weight @ carry), (j, j, weight)):
-        rows.append((3 * a[:, None, None] + axes[:, None]).expand(-1, 3, 3).reshape(-1))
-        columns.append((3 * b[:, None, None] + axes).expand(-1, 3, 3).reshape(-1))
-        values.append(block.reshape(-1))
+    blocks = torch.cat([left @ carry, -left, -weight @ carry, weight])
+    rows = (3 * torch.cat([i, i, j, j])[:, None, None] + axes[:, None]).expand_as(blocks)
+    columns = (3 * torch.cat([i, j, i, j])[:, None, None] + axes).expand_as(blocks)
     pulled = (weight @ residual[..., None])[..., 0]
     right = torch.zeros(count, 3, dtype=R.dtype).index_add(0, j, pulled)
     right = right.index_add(0, i, -(carry.mT @ pulled[..., None])[..., 0])
@@ -251,6 +248,7 @@ def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: T
     diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
     diagonal[:3] = 1e9
     every = torch.arange(3 * count)
-    entries = [torch.cat(part).numpy() for part in ([*values, diagonal], [*rows, every], [*columns, every])]
-    matrix = coo_matrix((entries[0], (entries[1], entries[2])), shape=(3 * count, 3 * count)).tocsc()
+    parts = (blocks, diagonal), (rows, every), (columns, every)
+    entries, at, to = (torch.cat([part.reshape(-1), own]).numpy() for part, own in parts)
+    matrix = coo_matrix((entries, (at, to)), shape=(3 * count, 3 * count)).tocsc()
     return torch.from_numpy(np.asarray(spsolve(matrix, right.reshape(-1).numpy())).reshape(count, 3))

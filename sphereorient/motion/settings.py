@@ -31,10 +31,7 @@ class MotionSettings(BaseModel, frozen=True, extra="forbid"):
     truncate: float = Field(3.0, gt=0, description="half width of these windows, sigmas; 3 holds 99.7 % of them")
     min_share: float = Field(0.55, gt=0, le=1, description="least measured share, else NaN; 0.55 passes two gaps")
     separations: tuple[int, ...] = Field(
-        (1, 2, 3, 4, 5),
-        min_length=1,
-        description="omega is averaged over the turns from frame k - m to k + m for these m, frames; the turn, "
-        "2 m omega / frame_rate, must stay well below 180 degrees",
+        (1, 2, 3, 4, 5), min_length=1, description="omega averages turns from k - m to k + m, each below 180 degrees"
     )
     min_separations: int = Field(3, ge=1, description="least measured separations, else NaN; 3 loses 3 frames at ends")
 
@@ -62,11 +59,7 @@ class SmoothSettings(BaseModel, frozen=True, extra="forbid"):
     least_scale: float = Field(0.5, gt=0, description="least factor on the measurements' sigmas")
     most_scale: float = Field(4.0, gt=0, description="largest factor on the measurements' sigmas")
     slow_share: float = Field(
-        0.25,
-        ge=0,
-        lt=1,
-        description="least share of the measurements' error variance that lasts over many frames; no smoother can tell "
-        "it from motion, so it is added to the smoothed covariances; more where two cameras' disagreement lasts longer",
+        0.25, ge=0, lt=1, description="least share of the error variance that lasts and no smoother sees; it is added"
     )
     outlier_sigma: float = Field(6.0, gt=0, description="a measurement farther from all others is left out, sigmas")
     outlier_share: float = Field(0.1, ge=0, le=0.5, description="largest share of a segment that may be left out")

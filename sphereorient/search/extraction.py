@@ -62,15 +62,20 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
     """
     check_disks(disks, *inside.shape)
     grey = stretch_contrast(disks, inside, settings.black_share, settings.white_share)
-    bin_of = (grey * BINS).long().clamp(0, BINS - 1)
-    member = grey.new_zeros(grey.shape[0], BINS, *grey.shape[1:])  # of each pixel in the histogram's bins
-    one_hot = member.scatter_(1, bin_of[:, None], 1.0) * inside
+    one_hot = _one_hot(grey, inside)
     threshold, _ = otsu(one_hot.sum((-2, -1)))
     vote = torch.where(grey > threshold[:, None, None], 1.0, -1.0)
     for share in settings.regions:
         local = _moving_threshold(one_hot, threshold, share, settings.region_contrast_min)
         vote = torch.where(vote * torch.where(grey > local, 1.0, -1.0) > 0, vote, 0.0)
     return vote * inside
+
+
+def _one_hot(grey: Tensor, inside: Tensor) -> Tensor:
+    """Return the membership of each pixel in the histogram's bins, (F, B, S, S); 0 outside the disk."""
+    bin_of = (grey * BINS).long().clamp(0, BINS - 1)
+    member = grey.new_zeros(grey.shape[0], BINS, *grey.shape[1:])
+    return member.scatter_(1, bin_of[:, None], 1.0) * inside
 
 
 def _moving_threshold(one_hot: Tensor, fallback: Tensor, share: float, contrast_min: float) -> Tensor:

@@ -10,15 +10,10 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
     black_share: float = Field(0.30, gt=0, lt=1, description="least share of the disk that becomes black; paper: b")
     white_share: float = Field(0.30, gt=0, lt=1, description="at least this share becomes white; the paper's w")
     regions: tuple[float, float] = Field(
-        (0.5, 0.3),
-        description="sides of the two moving regions of Otsu's method, in diameters: light changes over the first, "
-        "patches are as large as the second",
+        (0.5, 0.3), description="sides of Otsu's moving regions, diameters: as light changes, and as patches are large"
     )
     region_contrast_min: float = Field(
-        0.3,
-        ge=0,
-        le=1,
-        description="a region whose two classes differ less (0..1) shows one paint: the global one decides",
+        0.3, ge=0, le=1, description="a region whose classes differ less shows one paint: the global one decides"
     )
     disk_share: float = Field(1.0, gt=0.5, le=1, description="share of the radius that is compared; the paper: all")
     coarse_step_deg: float = Field(12.0, ge=4, le=30, description="step of the coarse Lattman grid; the paper's 12")
@@ -29,11 +24,7 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
     groups_max: int = Field(40, ge=1, description="a frame with more groups is a runaway: noise fits everywhere")
     fine_step_deg: float = Field(3.0, gt=0.5, le=12, description="step of the fine grid; the paper's 3")
     fine_radius_deg: float = Field(
-        12.0,
-        gt=0,
-        le=45,
-        description="reach of the fine grid about each possible orientation of a group; the coarse grid's covering "
-        "radius is 0.704 steps",
+        12.0, gt=0, le=45, description="reach of the fine grid; the coarse grid's covering radius is 0.704 steps"
     )
     renderer: Literal["table", "kornia"] = Field(
         "table", description="who makes the fine grid's templates: a table that the renderer fills, or the renderer"
@@ -52,10 +43,7 @@ class GreySearchSettings(BaseModel, frozen=True, extra="forbid"):
     detail: float = Field(0.1, gt=0, lt=0.5, description="finer detail is blurred away in the bank, radii")
     window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood of even light, radii (standard deviation)")
     clip: float = Field(
-        0.6,
-        gt=0.1,
-        description="differences from the neighbourhood beyond this many deviations of the disk are cut off: "
-        "reflections, places lit better than others",
+        0.6, gt=0.1, description="differences beyond this many deviations are cut off: reflections, uneven light"
     )
     peak_deg: float = Field(20.0, gt=0, lt=90, description="the bank's peaks are at least this far apart")
     peaks: int = Field(8, ge=1, le=32, description="best peaks from which a climb begins")
