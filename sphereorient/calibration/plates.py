@@ -84,8 +84,8 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
 
     views: dict[Picture, PlateView] = {}
     progress("pictures", 0, len(grey))
-    for view in side_by_side(see, range(len(grey))):
-        views[document.pictures[len(views)]] = view
+    for picture, view in zip(document.pictures, side_by_side(see, range(len(grey))), strict=True):
+        views[picture] = view
         progress("pictures", len(views), len(grey))
     return views
 

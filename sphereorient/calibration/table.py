@@ -49,10 +49,8 @@ def summary(result: Calibrated) -> list[str]:
 
 def repair_lines(result: Repaired) -> list[str]:
     """Return the changes of a self-calibration."""
-    lines = [
-        f"distance between the lines of sight to the sphere: {result.gap_before_mm:.4f} mm rms, "
-        f"now {result.gap_after_mm:.4f} mm ({result.frames} frames)"
-    ]
+    gaps = f"{result.gap_before_mm:.4f} mm rms, now {result.gap_after_mm:.4f} mm ({result.frames} frames)"
+    lines = [f"distance between the lines of sight to the sphere: {gaps}"]
     for name, change in result.moved.items():
         turn, move = math.degrees(float(change[:3].norm())), float(change[3:].norm())
         lines.append(f"{name}: rotated by {turn:.3f} degrees, T changed by {move:.2f} mm")

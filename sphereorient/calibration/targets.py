@@ -243,11 +243,6 @@ class PlateView:
     reason: str = ""  # one line, why the state is not `tied`
     placements: Ints = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (m, 3): see `placed`
 
-    def __post_init__(self) -> None:
-        n = len(self.index)
-        shapes = (self.points_plate_mm.shape, self.uv_px.shape, self.sigma_px.shape, self.diameter_mm.shape)
-        assert shapes == ((n, 3), (n, 2), (n,), (n,)), shapes
-
     def __len__(self) -> int:
         return len(self.index)
 
@@ -266,9 +261,9 @@ def seen(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats)
 
 def refused_view(name: str, expected: str, got: str, do: str) -> PlateView:
     """Return a `refused` view with the reason worded by `refusal`."""
-    none, reason = np.zeros(0), refusal(name, expected=expected, got=got, do=do)
-    empty = PlateView(np.zeros((0, 3)), np.zeros((0, 2)), none, none, np.zeros((0, 2), dtype=np.int64))
-    return replace(empty, state="refused", reason=reason)
+    none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
+    reason = refusal(name, expected=expected, got=got, do=do)
+    return PlateView(np.zeros((0, 3)), np.zeros((0, 2)), none, none, index, "refused", reason)
 
 
 def quarter_turned(index: Ints, quarters: int) -> Ints:

@@ -167,10 +167,4 @@ def _inverse_blocks(blocks: Tensor, damp: Tensor, fixed: bool) -> Callable[[Tens
         return lambda pose: (inverse @ pose[..., None])[..., 0]
     turns = torch.linalg.inv(blocks[:, :3, :3].double()).float()
     move = torch.linalg.inv(blocks[:, 3:, 3:].sum(0).double()).float()
-    count = len(blocks)
-
-    def solve(pose: Tensor) -> Tensor:
-        turned = (turns @ pose[:-3].reshape(count, 3, 1)).reshape(-1)
-        return torch.cat([turned, move @ pose[-3:]])
-
-    return solve
+    return lambda pose: torch.cat([(turns @ pose[:-3].reshape(-1, 3, 1)).reshape(-1), move @ pose[-3:]])

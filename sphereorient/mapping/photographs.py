@@ -26,7 +26,6 @@ PEAK_DEG = 18.0  # between distinct ones
 FINER = 2.7  # detail, window and pixels of the disks in the last comparison, where the pictures have it
 DISK_PX_MAX = 128
 CHANCE_PAIRS = 500  # pairs at random rotations, which show how well different patches correlate
-CHANCE_SEED = 0
 CHI2_MEDIAN = 0.4549  # of the square of a normal number
 JOIN_ITERATIONS = 4  # of the refinement of a pair between two sets
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
@@ -88,7 +87,7 @@ def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> Pairw
 
 def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:
     """Measure the correlation of different patches at random rotations."""
-    rng = torch.Generator().manual_seed(CHANCE_SEED)
+    rng = torch.Generator().manual_seed(0)
     first = torch.randint(len(disks), (CHANCE_PAIRS,), generator=rng)
     second = (first + 1 + torch.randint(len(disks) - 1, (CHANCE_PAIRS,), generator=rng)) % len(disks)
     pairs = refine_pairs(disks, first, second, so3.random_rotations(CHANCE_PAIRS, generator=rng), 0, EVERY)
