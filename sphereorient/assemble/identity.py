@@ -6,15 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from sphereorient import so3
+from sphereorient.assemble.beam import Bools, Floats, Ints
 from sphereorient.trajectory import runs_of
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 FITTED = 6  # frames from which a motion is extrapolated
 ORDER = 2  # of its polynomial
@@ -43,10 +40,8 @@ class _Motions:
     R_lab_body: Floats  # (K, N, 3, 3)
     time_s: Floats  # (N,)
 
-    def away(self, frames: Indices, row: int, to_row: int, to: int) -> Floats:
-        """Return how far the pose of a row in a frame is from where other frames, the nearest one first, predict it:
-        move (mm) and turn (rad), (2,).
-        """
+    def away(self, frames: Ints, row: int, to_row: int, to: int) -> Floats:
+        """Return move (mm) and turn (rad), (2,), of a row's pose off its prediction by frames, the nearest first."""
         t = self.time_s[frames] - self.time_s[frames[0]]
         scale = np.abs(t).max() or 1.0
         R0 = self.R_lab_body[row, frames[0]]
@@ -62,8 +57,8 @@ class _Motions:
 
 
 def same_balls(
-    position_lab_mm: Floats, R_lab_body: Floats, seen: NDArray[np.bool_], time_s: Floats, breaks: Sequence[int]
-) -> tuple[Indices, Floats]:
+    position_lab_mm: Floats, R_lab_body: Floats, seen: Bools, time_s: Floats, breaks: Sequence[int]
+) -> tuple[Ints, Floats]:
     """Return which row is which ball, (K, N): that of each ball in each frame, and the probability that the ball has
     kept its name, (K, N), NaN where that was never in doubt.
     Pieces of rows, which end where the row may have changed to another ball, are linked by the errors of extrapolating
@@ -88,17 +83,14 @@ def same_balls(
     order = np.tile(np.arange(rows)[:, None], (1, frames))
     probability = np.ones((rows, frames))
     taken = np.zeros((rows, frames), bool)
-    begun = set(range(len(pieces))) - set(after.values())
-    for start in sorted(begun):
-        chain, likely = [start], [1.0]
+    for start in sorted(set(range(len(pieces))) - set(after.values())):
+        chain, likely, own = [start], [1.0], pieces[start].row
         while chain[-1] in after:
             likely.append(likely[-1] * sure[chain[-1]])
             chain.append(after[chain[-1]])
         spans = [slice(pieces[k].first, pieces[k].last) for k in chain]
         free = [ball for ball in range(rows) if not any(taken[ball, span].any() for span in spans)]
-        if not free:  # more pieces at one time than balls: the last one goes where it was
-            free = [pieces[start].row]
-        own = pieces[start].row
+        free = free or [own]  # more pieces at one time than balls: the last one goes where it was
         ball = own if own in free else free[0]
         # A piece that follows none may be any ball that is not followed.
         first = 1.0 if pieces[start].first == 0 or len(free) == 1 else 1.0 / len(free)
@@ -108,7 +100,7 @@ def same_balls(
     return _whole(order, taken), np.where(probability < CERTAIN, probability, np.nan)
 
 
-def _whole(order: Indices, taken: NDArray[np.bool_]) -> Indices:
+def _whole(order: Ints, taken: Bools) -> Ints:
     """Return an order in which rows without a ball belong to the balls without a row."""
     for frame in np.flatnonzero(~taken.all(0)):
         balls = np.flatnonzero(~taken[:, frame])
@@ -117,7 +109,7 @@ def _whole(order: Indices, taken: NDArray[np.bool_]) -> Indices:
     return order
 
 
-def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
+def _unbroken(seen: Bools, breaks: Sequence[int]) -> list[_Piece]:
     """Return the pieces between breaks in which a row has poses."""
     spans = list(pairwise(sorted({0, *breaks, seen.shape[1]})))
     return [
@@ -128,22 +120,20 @@ def _unbroken(seen: NDArray[np.bool_], breaks: Sequence[int]) -> list[_Piece]:
     ]
 
 
-def _before(piece: _Piece, frame: int) -> Indices:
+def _before(piece: _Piece, frame: int) -> Ints:
     return np.arange(frame - 1, max(piece.first, frame - FITTED) - 1, -1)
 
 
 def _scale(motions: _Motions, pieces: Sequence[_Piece]) -> Floats:
     """Return gaps and the errors of extrapolations over them, per component, (n, 3): frames, mm, rad."""
     found = []
-    gap = 1
-    while gap <= FARTHEST:
+    for gap in (2**k for k in range(FARTHEST.bit_length())):
         windows = [(piece, frame) for piece in pieces for frame in range(piece.first + FITTED, piece.last - gap + 1)]
         if not windows:
             break
         some = [windows[k] for k in np.unique(np.linspace(0, len(windows) - 1, SAMPLES).astype(int))]
         away = [motions.away(_before(piece, frame), piece.row, piece.row, frame - 1 + gap) for piece, frame in some]
         found.append([gap, *(np.percentile(away, SHARE, axis=0) / OF_CHI)])
-        gap *= 2
     return np.array(found) if found else np.array([[1.0, np.inf, np.inf]])
 
 
@@ -184,17 +174,14 @@ def _links(motions: _Motions, pieces: Sequence[_Piece], scale: Floats) -> dict[t
 
 def _linked(count: int, links: dict[tuple[int, int], float]) -> dict[int, int]:
     """Return the piece that follows each piece that one does: the assignment of the least sum of chi2."""
-    if not links:
-        return {}
-    pairs = np.array(list(links))
-    ends, begins = pairs.T
+    ends, begins = np.array(list(links), dtype=np.int64).reshape(-1, 2).T
     every = np.arange(count)
     # A piece that none follows, and one that follows none, are linked to places that stand for that.
     row = np.concatenate([ends, every, count + every, count + begins])
     column = np.concatenate([begins, count + every, every, count + ends])
     tiny = 1e-9  # 0 means no link
     chi2 = np.minimum(np.array(list(links.values())), 1e9) + tiny
-    weight = np.concatenate([chi2, np.full(2 * count, NO_LINK / 2), np.full(len(pairs), tiny)])
+    weight = np.concatenate([chi2, np.full(2 * count, NO_LINK / 2), np.full(len(links), tiny)])
     matrix = coo_array((weight, (row, column)), shape=(2 * count, 2 * count)).tocsr()
     chosen = zip(*min_weight_full_bipartite_matching(matrix), strict=True)
     return {int(i): int(j) for i, j in chosen if i < count and j < count}

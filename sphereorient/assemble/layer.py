@@ -13,19 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient import so3
+from sphereorient.assemble import trellis
 from sphereorient.assemble.second_order import Chosen, physical_path
 from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
-from sphereorient.assemble.trellis import (
-    ShortestPath,
-    SoftPath,
-    edge_costs,
-    shortest_path,
-    soft_path,
-    taken,
-    turns_over_gaps,
-    visited_before,
-)
+from sphereorient.assemble.trellis import ShortestPath, SoftPath, soft_path, taken, visited_before
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 Values = Tensor | NDArray[np.floating]
@@ -125,8 +117,8 @@ class PathLayer(nn.Module):
         if self.order == 2 and self.soft is None:
             return self._histories(R, -score, variance, there, time)
         if self.order == 1:
-            edge = edge_costs(R, score, time, there)
-            return shortest_path(edge, there) if self.soft is None else soft_path(edge, there, self.soft)
+            edge = trellis.edge_costs(R, score, time, there)
+            return trellis.shortest_path(edge, there) if self.soft is None else soft_path(edge, there, self.soft)
         assert self.soft is not None
         edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
         return soft_path(edge, there, self.soft, node, triple)
@@ -173,7 +165,10 @@ def triple_costs(
     """
     variance = cost.sigma_scale**2 * variance_rad2
     links, steps, width = _Links.of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
-    still = _still(cost, links, R_lab_body, variance)
+    stays = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
+    here = taken(variance, links.before, 1)[..., :, None]
+    rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
+    still = _log_ratio(cost, stays, rest).amax(-2)  # (..., N, C), of each candidate if one of the frame before stays
     chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
     parts = [_chunk(cost, links, variance, still, slice(at, min(at + chunk, steps))) for at in range(2, steps, chunk)]
     none = R_lab_body.new_zeros((*mask.shape[:-2], 0, *[mask.shape[-1]] * 3))
@@ -194,14 +189,6 @@ def _chunk(cost: SecondOrderCost, links: "_Links", variance: Tensor, still: Tens
     broken = torch.as_tensor(cost.break_probability)
     follows = torch.logaddexp(torch.log1p(-broken) + _log_ratio(cost, misfit, predicted), broken.log())
     return cost.candidate(follows, still[..., steps, None, None, :])
-
-
-def _still(cost: SecondOrderCost, links: "_Links", R_lab_body: Tensor, variance: Tensor) -> Tensor:
-    """Return the log ratio (..., N, C) of each candidate if one of the frame before stays."""
-    misfit = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
-    here = taken(variance, links.before, 1)[..., :, None]
-    rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
-    return _log_ratio(cost, misfit, rest).amax(-2)
 
 
 def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tensor:
@@ -255,6 +242,7 @@ def soft_track(
     temperature: float = 1.0,
 ) -> SoftTrack:
     """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
+    Raises ShapeError (the inputs differ in frames or candidates), SettingsError (`turn_rad` or temperature up to 0).
 
     Args:
         R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
@@ -263,10 +251,6 @@ def soft_track(
         mask: (..., N, C) bool, True for a candidate.
         turn_rad: standard deviation of the rotation between neighbouring frames; grows with the frames of a gap.
         temperature: of the soft path, in units of the costs.
-
-    Raises:
-        ShapeError: the inputs differ in frames or candidates.
-        SettingsError: `turn_rad` or the temperature is not above 0.
     """
     check_tail("R_lab_body", R_lab_body, *mask.shape, 3, 3)
     check_tail("position_lab_mm", position_lab_mm, *mask.shape, 3)
@@ -288,16 +272,14 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
     R_lab_body (..., N, C, 3, 3) is finite everywhere; an edge starts at the last frame with candidates in the mask.
     """
     frames = torch.arange(mask.shape[-2], device=mask.device) - visited_before(mask)
-    return 0.5 * (turns_over_gaps(R_lab_body, mask) / (turn_rad * frames[..., 1:, None, None])).square()
+    return 0.5 * (trellis.turns_over_gaps(R_lab_body, mask) / (turn_rad * frames[..., 1:, None, None])).square()
 
 
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
     """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
     NaN does not count; marginals (..., N, C) are not negative; NaN where all are 0. The gradient is always finite.
+    Raises ShapeError (candidates and marginals differ in shape).
     Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
-
-    Raises:
-        ShapeError: candidates and marginals differ in shape.
     """
     check_tail("R_lab_body", R_lab_body, *marginals.shape[-1:], 3, 3)
     known = torch.where(R_lab_body.isnan(), 0.0, R_lab_body)

@@ -48,35 +48,20 @@ class Path(Track):
 
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
-    """Choose one candidate of each frame for each camera, by the least cost over the whole movie; time_s (N,)
-    increases.
+    """Return the path of each camera, as `assemble_path`."""
+    return {name: assemble_path(each, time_s, settings, name) for name, each in candidates.items()}
+
+
+def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSettings, name: str = "") -> Path:
+    """Choose one candidate of each frame of a camera, by the least cost over the whole movie; time_s (N,) increases.
     Frames without candidates of `quality_min` are skipped: the cost of the link over them is divided by its time.
+    Raises ShapeError (another number of frames than there are times).
     Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
-
-    Raises:
-        ShapeError: a camera has another number of frames than there are times.
     """
-    for name, each in candidates.items():
-        if len(each) != len(time_s):
-            do = "give every camera the experiment's frames"
-            expected, got = f"{len(time_s)} frames", f"{len(each)}"
-            raise ShapeError(refusal(f"candidates of {name!r}", expected=expected, got=got, do=do))
-    return {name: _path(graph_of(each, settings.quality_min), time_s, settings) for name, each in candidates.items()}
-
-
-def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSettings) -> Path:
-    """Choose one candidate per frame for a single camera; as `assemble_paths`."""
-    return assemble_paths({"": candidates}, time_s, settings)[""]
-
-
-def graph_of(candidates: Candidates, quality_min: float) -> Graph:
-    """Return the candidates of one camera that may be chosen: R (N, C, 3, 3), score (N, C) and mask (N, C)."""
-    R, score, mask = candidates.padded()
-    return R, score, mask & (score >= quality_min)
-
-
-def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
-    R_all, score_all, mask = graph
+    if len(candidates) != len(time_s):
+        expected, got, do = f"{len(time_s)} frames", f"{len(candidates)}", "give every camera the experiment's frames"
+        raise ShapeError(refusal(f"candidates of {name!r}", expected=expected, got=got, do=do))
+    R_all, score_all, mask = graph_of(candidates, settings.quality_min)
     choice = PathLayer(1, settings=settings)(R_all, score_all, time_s, mask=mask).choice
     there = choice >= 0
     R = torch.full((len(choice), 3, 3), torch.nan).to(R_all)
@@ -86,3 +71,9 @@ def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
     spike = find_spikes(xi, turn, settings)
     segment = number_segments(there, spike, settings.gap_frames_max)
     return Path(choice=choice, R_lab_body=R, score=score, xi=xi, spike=spike, segment=segment)
+
+
+def graph_of(candidates: Candidates, quality_min: float) -> Graph:
+    """Return the candidates of one camera that may be chosen: R (N, C, 3, 3), score (N, C) and mask (N, C)."""
+    R, score, mask = candidates.padded()
+    return R, score, mask & (score >= quality_min)

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.assemble.beam import BeamSearch, Histories
-from sphereorient.assemble.second_order_cost import SecondOrderCost
+from sphereorient.assemble.beam import BeamSearch, CandidateRows, Histories, Ints, rotated, rotation_between
+from sphereorient.assemble.second_order_cost import Floats, SecondOrderCost
 from sphereorient.assemble.segments import flags_where, number_segments
 from sphereorient.assemble.settings import PathSettings
-from sphereorient.assemble.states import CandidateRows, Floats, Ints, rotated, rotation_between
 from sphereorient.trajectory import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
@@ -65,8 +64,7 @@ def physical_path(
     Candidates R (N, C, 3, 3), nll (N, C) of the pictures, variance (N, C) per axis, mask (N, C); time_s (N,) increases.
     Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first frame with an orientation after a gap or a
     break, `SPIKE` where a rotation does not follow from the motion.
-    Source: textbook hidden Markov model of second order; unlike the paper's cost, it does not favour candidates at rest
-    (docs/errata.md A6).
+    Source: textbook hidden Markov model of second order; it does not favour rest as the paper does (docs/errata.md A6).
     """
     device = mask.device
     R, nll, variance, time = (part.detach().cpu().double() for part in (R_lab_body, nll, variance_rad2, time_s))

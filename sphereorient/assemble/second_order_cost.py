@@ -64,9 +64,11 @@ class SecondOrderCost:
         `misfit`, rad^2, is angle^2 or (2 sin(angle / 2))^2 to the expected rotation; `variance`, rad^2, is per axis.
         """
         lib, tail = _library(variance), self.tail
+        own: Any = torch if isinstance(tail, Tensor) else math
+        peak = own.lgamma((tail + 3) / 2) - own.lgamma(tail / 2) - 1.5 * own.log(tail * math.pi)
         within = lib.minimum(variance, lib.asarray(VARIANCE_MAX))
         fall = (tail + 3) / 2 * lib.log1p(misfit / (tail * within))
-        result: Values = math.log(TURNS_RAD3) + _log_peak(tail) - 1.5 * lib.log(within) - fall
+        result: Values = math.log(TURNS_RAD3) + peak - 1.5 * lib.log(within) - fall
         return result
 
     def predicted_variance(

@@ -29,11 +29,9 @@ def links(R_lab_body: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
 
 def moving(values: Tensor, window: int) -> Tensor:
     """Return windows centred on each of (N,) values, (N, window); NaN beyond the ends. Even windows grow by one."""
-    half = window // 2
-    if not len(values):
-        return values.new_zeros(0, 2 * half + 1)
-    padded = torch.nn.functional.pad(values, (half, half), value=torch.nan)
-    return padded.unfold(0, 2 * half + 1, 1)
+    half = window // 2  # padded by one more than needed: no values at all have no window
+    padded = torch.nn.functional.pad(values, (half, half + 1), value=torch.nan)
+    return padded.unfold(0, 2 * half + 1, 1)[: len(values)]
 
 
 def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:

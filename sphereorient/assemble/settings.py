@@ -6,21 +6,11 @@ class AssembleSettings(BaseModel, frozen=True, extra="forbid"):
 
     quality_min: float = Field(0.5, ge=0, le=1, description="least quality T of a candidate; the paper's 0.5")
     gap_frames_max: int = Field(4, ge=0, description="longest gap inside a segment, frames; the paper: under 5")
-    spike_window_frames: int = Field(
-        41, ge=5, description="window of the moving median of xi, frames: a few turns of the velocity"
-    )
-    spike_factor: float = Field(
-        6.0, gt=1, description="a spike is this many robust deviations (1.48 MAD) above the moving median of xi"
-    )
-    spike_min_deg: float = Field(
-        15.0, gt=0, description="a smaller rotation between frames is never a spike, not even of a sphere at rest"
-    )
-    repair_deg: float = Field(
-        30.0, gt=0, le=180, description="cameras that differ by more are repaired from each other; the paper's 30"
-    )
-    repair_margin: float = Field(
-        0.02, ge=0, description="difference of mean T that decides a repair; below it, continuity decides"
-    )
+    spike_window_frames: int = Field(41, ge=5, description="window of xi's median, frames: a few turns of velocity")
+    spike_factor: float = Field(6.0, gt=1, description="a spike is so many robust deviations (MAD) above xi's median")
+    spike_min_deg: float = Field(15.0, gt=0, description="a smaller rotation is no spike, even of a sphere at rest")
+    repair_deg: float = Field(30.0, gt=0, le=180, description="cameras that differ by more are repaired; paper: 30")
+    repair_margin: float = Field(0.02, ge=0, description="difference of mean T that decides a repair, else continuity")
     weight_window_frames: int = Field(
         51, ge=5, description="frames of the moving variance of xi that weighs the cameras; 50 know its ratio to 28 %"
     )
@@ -32,9 +22,7 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
     acceleration_rad_s2: float | None = Field(
         None, gt=0, description="scale of the angular acceleration per axis, rad/s^2; null estimates it from the movie"
     )
-    tail: float = Field(
-        4.0, gt=2, description="degrees of freedom of the Student-t of omega's change; fewer: sudden changes likelier"
-    )
+    tail: float = Field(4.0, gt=2, description="degrees of freedom of omega's change (Student-t); few: sudden changes")
     miss_probability: float = Field(
         0.01, gt=0, lt=1, description="probability that no candidate of a frame is right after a frame in which one was"
     )
@@ -48,29 +36,14 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
         0.3, gt=0, lt=0.5, description="probability that a false candidate stands where one stood before (glare, dirt)"
     )
     follow_probability: float = Field(
-        2.0e-3,
-        gt=0,
-        lt=0.5,
-        description="probability that a false candidate follows the motion (the twin of a symmetric texture map)",
+        2.0e-3, gt=0, lt=0.5, description="probability that a false candidate follows the motion (a symmetric map)"
     )
-    evidence_doubt: float = Field(
-        0.01, gt=0, lt=1, description="probability that the pictures do not show which candidate of a frame is right"
-    )
-    evidence_scale: float = Field(
-        1.0, gt=0, description="factor on the nats that the pictures claim; below 1 where they claim too much"
-    )
+    evidence_doubt: float = Field(0.01, gt=0, lt=1, description="probability that the pictures show no right candidate")
+    evidence_scale: float = Field(1.0, gt=0, description="factor on pictures' nats; below 1 where they claim too much")
     sigma_scale: float = Field(
         1.0, gt=0, description="factor on the sigmas that the orientations claim; above 1 where they claim too little"
     )
-    gap_frames_max: int = Field(
-        16, ge=0, description="longest gap inside a segment, usual frame intervals; a longer one begins another"
-    )
-    probability_min: float = Field(
-        0.9, ge=0, le=1, description="a chosen orientation that is less probable is flagged as ambiguous"
-    )
-    spike_factor: float = Field(
-        8.0, gt=1, description="a rotation this many standard deviations off the prediction of the motion is a spike"
-    )
-    spike_min_deg: float = Field(
-        10.0, gt=0, description="a rotation less than this off the prediction of the motion is never a spike"
-    )
+    gap_frames_max: int = Field(16, ge=0, description="longest gap inside a segment, usual frame intervals")
+    probability_min: float = Field(0.9, ge=0, le=1, description="a less probable orientation is flagged as ambiguous")
+    spike_factor: float = Field(8.0, gt=1, description="a rotation so many sigmas off the motion is a spike")
+    spike_min_deg: float = Field(10.0, gt=0, description="a rotation less far off the motion's prediction is no spike")

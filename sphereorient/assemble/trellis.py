@@ -37,9 +37,9 @@ class SoftPath:
 def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
-    """Find the cheapest path that visits one candidate in each step; of equal paths, the one with the lowest last
-    index.
+    """Find the cheapest path that visits one candidate in each step; of equal ones, that of the lowest last index.
     Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
+    Raises ShapeError (costs and mask differ in shape).
     Source: Bellman 1957, Viterbi 1967.
 
     Args:
@@ -47,15 +47,12 @@ def shortest_path(
         mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
         node_cost: (..., N, C), of a candidate by itself.
         triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the order second.
-
-    Raises:
-        ShapeError: costs and mask differ in shape.
     """
-    order = _checked_order(edge_cost, mask, node_cost, triple_cost)
+    order, like = _checked(edge_cost, mask, node_cost, triple_cost)
     if 0 in mask.shape[-2:]:
         none = mask.new_full(mask.shape[:-1], -1, dtype=torch.int64)
-        return ShortestPath(choice=none, cost=_like(edge_cost, triple_cost).new_zeros(mask.shape[:-2]))
-    start, edges = _laid_out(edge_cost, node_cost, triple_cost, mask)
+        return ShortestPath(choice=none, cost=like.new_zeros(mask.shape[:-2]))
+    start, edges = _laid_out(like, edge_cost, node_cost, triple_cost, mask)
     visited, width, older = mask.any(-1), mask.shape[-1], mask.shape[-1] ** (order - 1)
     total, origins = start, []
     for edge, here in _steps(edges.detach(), visited, order):  # a recursion: each step needs the one before
@@ -75,10 +72,8 @@ def shortest_path(
     choice = states[..., 1:] % width
     along = edges.flatten(-order - 1).gather(-1, (states[..., :-1] * width + choice)[..., None])[..., 0]
     blocked = total.flatten(-order).amin(-1) >= _wall(total) / 2
-    return ShortestPath(
-        choice=torch.where(visited & ~blocked[..., None], choice, -1),
-        cost=torch.where(blocked, torch.inf, torch.where(visited, along, 0.0).sum(-1)),
-    )
+    cost = torch.where(blocked, torch.inf, torch.where(visited, along, 0.0).sum(-1))
+    return ShortestPath(choice=torch.where(visited & ~blocked[..., None], choice, -1), cost=cost)
 
 
 def soft_path(
@@ -89,30 +84,24 @@ def soft_path(
     triple_cost: Tensor | None = None,
 ) -> SoftPath:
     """Weigh all paths by exp(-cost / temperature), temperature > 0; the other arguments are those of `shortest_path`.
+    Raises ShapeError (costs and mask differ in shape), SettingsError (the temperature is not above 0).
     Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
-
-    Raises:
-        ShapeError: costs and mask differ in shape.
-        SettingsError: the temperature is not above 0.
     """
-    order = _checked_order(edge_cost, mask, node_cost, triple_cost)
+    order, like = _checked(edge_cost, mask, node_cost, triple_cost)
     if not 0 < temperature < torch.inf:
         do = "for temperature 0 take the shortest path"
         raise SettingsError(refusal("temperature", expected="a number above 0", got=str(temperature), do=do))
-    like, width = _like(edge_cost, triple_cost), mask.shape[-1]
     if 0 in mask.shape[-2:]:
-        pairs = like.new_zeros((*mask.shape[:-2], max(mask.shape[-2] - 1, 0), width, width))
+        pairs = like.new_zeros((*mask.shape[:-2], max(mask.shape[-2] - 1, 0), *[mask.shape[-1]] * 2))
         return SoftPath(free_energy=pairs.sum((-3, -2, -1)), marginals=like.new_zeros(mask.shape), pair_marginals=pairs)
-    start, edges = _laid_out(edge_cost, node_cost, triple_cost, mask)
+    start, edges = _laid_out(like, edge_cost, node_cost, triple_cost, mask)
     free, links = _all_paths(start, edges, mask.any(-1), order, temperature)
-    links = links.sum(-3) if order == 2 else links
-    links = torch.where((free >= _wall(free) / 2)[..., None, None, None], 0.0, links)
+    blocked = free >= _wall(free) / 2
+    links = torch.where(blocked[..., None, None, None], 0.0, links.sum(-3) if order == 2 else links)
     second = (mask.any(-1).cumsum(-1) > 1)[..., None, None]  # no edge enters the first step visited
-    return SoftPath(
-        free_energy=torch.where(free >= _wall(free) / 2, torch.inf, free),
-        marginals=links.sum(-2),
-        pair_marginals=torch.where(second, links, 0.0)[..., 1:, :, :],
-    )
+    pairs = torch.where(second, links, 0.0)[..., 1:, :, :]
+    free_energy = torch.where(blocked, torch.inf, free)
+    return SoftPath(free_energy=free_energy, marginals=links.sum(-2), pair_marginals=pairs)
 
 
 def visited_before(mask: Tensor) -> Tensor:
@@ -157,12 +146,10 @@ def _steps(edges: Tensor, visited: Tensor, order: int) -> Iterator[tuple[Tensor,
 
 
 def _laid_out(
-    edge_cost: Tensor | None, node_cost: Tensor | None, triple_cost: Tensor | None, mask: Tensor
+    like: Tensor, edge_cost: Tensor | None, node_cost: Tensor | None, triple_cost: Tensor | None, mask: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return totals before the first step (..., *state) and edges (..., N, *state, C) from the step visited last.
-    Every path begins in place 0 (order 2: twice), at no cost.
-    """
-    like, (steps, width) = _like(edge_cost, triple_cost), mask.shape[-2:]
+    """Return totals before the first step (..., *state), 0 in place 0 only, and edges (..., N, *state, C) into each."""
+    steps, width = mask.shape[-2:]
     rank, last = mask.any(-1).cumsum(-1), visited_before(mask)
     first = torch.arange(width, device=mask.device) == 0
 
@@ -194,33 +181,28 @@ def _wall(like: Tensor) -> float:
     return float(torch.finfo(like.dtype).max ** 0.5)
 
 
-def _like(edge_cost: Tensor | None, triple_cost: Tensor | None) -> Tensor:
-    found = triple_cost if triple_cost is not None else edge_cost
-    if found is None:
+def _checked(
+    edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None, triple_cost: Tensor | None
+) -> tuple[int, Tensor]:
+    """Raise where costs do not fit the mask; return the order of the path, and costs of the dtype that counts."""
+    order, like = (1, edge_cost) if triple_cost is None else (2, triple_cost)
+    if like is None:
         raise ShapeError(refusal("edge_cost", expected="costs of edges or triples", got="none", do="pass one of them"))
-    return found
-
-
-def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None, triple_cost: Tensor | None) -> int:
-    """Raise where costs do not fit the mask; return the order of the path."""
-    _like(edge_cost, triple_cost)
     *batch, steps, width = mask.shape
     for name, cost, back in (("node_cost", node_cost, 0), ("edge_cost", edge_cost, 1), ("triple_cost", triple_cost, 2)):
         expected = (*batch, max(steps - back, 0), *[width] * (back + 1))
         if cost is not None and cost.shape != expected:
             got, do = str(tuple(cost.shape)), "compute the costs of all candidates of the mask"
             raise ShapeError(refusal(name, expected=f"shape {expected} for this mask", got=got, do=do))
-    return 1 if triple_cost is None else 2
+    return order, like
 
 
 def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the paper's cost d(A, B) (2 - T_A - T_B) / dt, rad/s, from each candidate (row) to each of the next step.
     Shapes: R_lab_body (..., N, C, 3, 3), score T (..., N, C), increasing time_s (..., N), result (..., N - 1, C, C).
     With a mask (..., N, C), each edge comes from the last step before it with candidates.
+    Raises ShapeError (the inputs differ in steps or candidates).
     Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
-
-    Raises:
-        ShapeError: the inputs differ in steps or candidates.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("score", score, *R_lab_body.shape[-4:-2])

@@ -42,21 +42,13 @@ def fuse(
     Stretches that differ by more than `repair_deg` are repaired, of more than two cameras by majority where there is
     one. Then each frame is the mean of all, weighted by the inverse moving variance of xi; their differences give the
     sigma, so that one camera alone has none. Flags: `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
+    Raises ExperimentError (no camera), ShapeError (paths, candidates and times differ in cameras or frames).
     Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
-
-    Raises:
-        ExperimentError: no camera.
-        ShapeError: paths, candidates and times differ in cameras or frames.
     """
     _check(paths, candidates, time_s)
-    names = list(paths)
-    tracks: list[Track] = list(paths.values())
-    present = torch.stack([track.present for track in tracks])
-    repaired, ambiguous = torch.zeros_like(present), torch.zeros_like(present[0])
-    if len(tracks) > 1:
-        graphs = [graph_of(candidates[name], settings.quality_min) for name in names]
-        mended = repair_all(list(paths.values()), graphs, settings)
-        tracks, repaired, ambiguous = list(mended.tracks), mended.repaired, mended.ambiguous
+    graphs = [graph_of(candidates[name], settings.quality_min) for name in paths]
+    mended = repair_all(list(paths.values()), graphs, settings)
+    tracks = mended.tracks
     present = torch.stack([track.present for track in tracks])
     linked = [links(track.R_lab_body, time_s) for track in tracks]
     variance = relative_variance([xi for xi, _ in linked], settings)
@@ -68,16 +60,16 @@ def fuse(
     R = _mean(tracks, share)
     spike = find_spikes(*links(R, time_s), settings)
     alone = present.sum(0) == 1 if len(tracks) > 1 else torch.ones_like(present[0])
-    bits = {Flag.ONE_CAMERA: alone, Flag.REPAIRED_FROM_OTHER_CAMERA: repaired.any(0)}
-    bits |= {Flag.AMBIGUOUS: ambiguous, Flag.SPIKE: spike}
+    bits = {Flag.ONE_CAMERA: alone, Flag.REPAIRED_FROM_OTHER_CAMERA: mended.repaired.any(0)}
+    bits |= {Flag.AMBIGUOUS: mended.ambiguous, Flag.SPIKE: spike}
     return Fused(
         R_lab_body=R,
         sigma_rad=_sigma(variance, share, tracks, calm),
         segment=number_segments(present.any(0), spike, settings.gap_frames_max),
         flags=flags_where(bits),
-        weight=dict(zip(names, share, strict=True)),
-        repaired=dict(zip(names, repaired, strict=True)),
-        R_lab_body_of={name: track.R_lab_body for name, track in zip(names, tracks, strict=True)},
+        weight=dict(zip(paths, share, strict=True)),
+        repaired=dict(zip(paths, mended.repaired, strict=True)),
+        R_lab_body_of={name: track.R_lab_body for name, track in zip(paths, tracks, strict=True)},
     )
 
 
@@ -119,12 +111,11 @@ def _apart(first: Track, second: Track) -> Tensor:
 def _sigma(variance: Tensor, share: Tensor, tracks: Sequence[Track], calm: Tensor) -> Tensor:
     """Return the standard deviation per axis of the mean, (N,), rad.
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
-    degrees of freedom; its median over all pairs gives s^2 robustly. Spikes raise the variance, not d: their frames are
-    left out.
+    degrees of freedom; its median over all pairs gives s^2 robustly, without frames of spikes, which raise variance_i.
     """
-    pairs = list(combinations(range(len(tracks)), 2))
-    if not pairs or not len(calm):
+    if len(tracks) < 2 or not len(calm):
         return torch.full_like(tracks[0].score, torch.nan)
+    pairs = combinations(range(len(tracks)), 2)
     ratio = torch.stack([_apart(tracks[k], tracks[m]).square() / (variance[k] + variance[m]) for k, m in pairs])
     quiet = torch.where(calm, ratio, torch.nan)
     scale = (quiet if torch.isfinite(quiet).any() else ratio).nanmedian() / CHI2_3_MEDIAN
@@ -154,8 +145,7 @@ class Repair:
 
 def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: AssembleSettings) -> Repair:
     """Repair the frames in which cameras disagree. Where more than half of three or more agree with one of them, the
-    others take their candidates nearest to that one, none (T = 0) beyond `repair_deg`. Other stretches are repaired
-    camera by camera, see `repair`.
+    others take their candidates nearest to that one, none (T = 0) beyond `repair_deg`. Others: see `repair`.
     """
     if len(paths) == 2:
         return repair((paths[0], paths[1]), (graphs[0], graphs[1]), settings)
@@ -185,11 +175,8 @@ def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: Assembl
 
 def _only(path: Path, track: Track, where: Tensor) -> Path:
     """Return a path with the orientations of a track in some frames, where (N,) bool, and none elsewhere."""
-    R, score = (
-        torch.where(where[:, None, None], track.R_lab_body, torch.nan),
-        torch.where(where, track.score, torch.nan),
-    )
-    return replace(path, R_lab_body=R, score=score)
+    R = torch.where(where[:, None, None], track.R_lab_body, torch.nan)
+    return replace(path, R_lab_body=R, score=torch.where(where, track.score, torch.nan))
 
 
 def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
@@ -204,17 +191,17 @@ def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: Asse
     apart, segment = _apart(*paths), torch.stack([path.segment for path in paths])
     agreed = apart <= limit
     result: list[Track] = list(paths)
-    decided: list[Track] = list(paths)  # the loser of a stretch has the leader's orientations
-    repaired, ambiguous = torch.zeros_like(torch.stack([agreed, agreed])), torch.zeros_like(agreed)
+    decided = [*result]  # the loser of a stretch has the leader's orientations
+    repaired, ambiguous = torch.zeros_like(segment, dtype=torch.bool), torch.zeros_like(agreed)
     for frames in _stretches(apart, segment, limit):
         followers = [_follow(paths[k], graphs[1 - k], frames, limit) for k in (0, 1)]
         merits = [float((paths[k].score[frames] + followers[k].score.nan_to_num(0.0)).mean() / 2) for k in (0, 1)]
         matched = any(bool(follower.present.any()) for follower in followers)
         guess = not matched or abs(merits[0] - merits[1]) < settings.repair_margin
-        leader = int(merits[1] > merits[0])
         if guess:
             beside = _beside(frames, torch.nonzero(agreed)[:, 0], settings.gap_frames_max)
-            leader = int(_roughest_turn(decided[1], beside) < _roughest_turn(decided[0], beside))
+            merits = [-_roughest_turn(track, beside) for track in decided]
+        leader = int(merits[1] > merits[0])
         loser = 1 - leader
         agreed[frames], ambiguous[frames] = True, guess
         decided[loser] = decided[loser].with_part(frames, paths[leader].part(frames))
@@ -251,10 +238,8 @@ def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
     near, which = torch.where(mask, distance, torch.inf).min(-1)
     row = torch.arange(len(frames), device=frames.device)
     found = near <= limit
-    return Track(
-        R_lab_body=torch.where(found[:, None, None], R_all[row, which], torch.nan),
-        score=torch.where(found, score_all[row, which], torch.nan),
-    )
+    R = torch.where(found[:, None, None], R_all[row, which], torch.nan)
+    return Track(R_lab_body=R, score=torch.where(found, score_all[row, which], torch.nan))
 
 
 def _beside(frames: Tensor, agreed: Tensor, gap_frames_max: int) -> Tensor:

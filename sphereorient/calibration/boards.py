@@ -8,7 +8,15 @@ from scipy.spatial import cKDTree
 from sphereorient.calibration import targets
 from sphereorient.calibration.dots import Dots, as_grey, find_dots
 from sphereorient.calibration.lattice import index_dots
-from sphereorient.calibration.targets import Floats, Ints, PlateView, indices, quarter_turned, refused_view, seen
+from sphereorient.calibration.targets import (
+    CalibrationTarget,
+    Floats,
+    Ints,
+    PlateView,
+    quarter_turned,
+    refused_view,
+    seen,
+)
 from sphereorient.errors import refusal
 
 CORNER_SIGMA_PX = 0.05  # of a corner; tests measure 0.03 to 0.07 on drawn boards
@@ -18,10 +26,7 @@ SHARP = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_AC
 
 
 def see_plate(
-    picture: NDArray[np.generic],
-    plate: targets.CalibrationTarget,
-    name: str = "plate picture",
-    clicked: Floats | None = None,
+    picture: NDArray[np.generic], plate: CalibrationTarget, name: str = "plate picture", clicked: Floats | None = None
 ) -> PlateView:
     """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable.
     `clicked`: about where the fiducials of a plate of dots are, see `index_dots`.
@@ -47,21 +52,18 @@ def _chessboard(picture: NDArray[np.generic], board: targets.Chessboard, name: s
     uv_px = _refined(grey, corners.reshape(-1, 2).astype(np.float64))
     index = _seen_from_front(_row_by_row(board.columns, board.rows), uv_px)
     turns = _turns(board.extent)
-    standard = [p for p in turns if _lower_left_is_dark(grey, quarter_turned(index, int(p[0])) + p[1:], uv_px)]
+    dark = [_lower_left_is_dark(grey, quarter_turned(index, int(p[0])) + p[1:], uv_px) for p in turns]
     view = seen(board, index, uv_px, np.full(len(uv_px), CORNER_SIGMA_PX))
-    return _placed_one_of(standard or turns, view, board, name)
+    return _placed_one_of(turns[dark] if any(dark) else turns, view, board, name)
 
 
 def _charuco(picture: NDArray[np.generic], board: targets.CharucoBoard, name: str) -> PlateView:
     """Find the corners of a ChArUco board or a part of it."""
     detector, grey = cv2.aruco.CharucoDetector(board.opencv()), _eight_bits(picture)
     corners, ids, _, markers = detector.detectBoard(grey)
-    count = 0 if ids is None else len(ids)
-    across, up = board.columns - 1, board.rows - 1
-    index = np.zeros((0, 2), dtype=np.int64)
-    if count:
-        numbers = np.asarray(ids).reshape(-1).astype(np.int64)
-        index = np.stack([numbers % across, up - 1 - numbers // across], axis=1)
+    numbers = np.array([] if ids is None else ids, dtype=np.int64).reshape(-1)
+    count, across = len(numbers), board.columns - 1
+    index = np.stack([numbers % across, board.rows - 2 - numbers // across], axis=1)
     if count < LEAST_CORNERS or (np.ptp(index, axis=0) < 1).any():
         expected = f"{LEAST_CORNERS} corners or more of a {board.columns} x {board.rows} ChArUco board"
         got = f"{count} corners, {0 if markers is None else len(markers)} markers of {board.dictionary}"
@@ -86,15 +88,14 @@ def _circles(picture: NDArray[np.generic], grid: targets.CircleGrid, name: str) 
     index = _row_by_row(grid.columns, grid.rows)
     if grid.asymmetric:  # OpenCV's own points: the top row is not shifted
         index[:, 0] = 2 * index[:, 0] + (grid.rows - 1 - index[:, 1]) % 2
-    turns = _turns(grid.extent)[:1] if grid.asymmetric else _turns(grid.extent)
     view = seen(grid, _seen_from_front(index, uv_px), uv_px, dots.sigma_px[order])
-    return _placed_one_of(turns, view, grid, name)
+    return _placed_one_of(_turns(grid.extent)[: 1 if grid.asymmetric else None], view, grid, name)
 
 
-def _placed_one_of(turns: list[Ints], view: PlateView, plate: targets.CalibrationTarget, name: str) -> PlateView:
+def _placed_one_of(turns: Ints, view: PlateView, plate: CalibrationTarget, name: str) -> PlateView:
     expected, got = "a plate that looks the same from one side only", f"{len(turns)} possible rotations"
     do = "tie it through the other camera, or use a plate with marks"
-    return view.settled(plate, np.stack(turns), refusal(name, expected=expected, got=got, do=do))
+    return view.settled(plate, turns, refusal(name, expected=expected, got=got, do=do))
 
 
 def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -120,8 +121,7 @@ def _row_by_row(columns: int, rows: int) -> Ints:
 
 
 def _homography(index: Floats | Ints, uv_px: Floats) -> Floats:
-    homography, _ = cv2.findHomography(index.astype(np.float64), uv_px, 0)
-    return np.asarray(homography, dtype=np.float64)
+    return np.asarray(cv2.findHomography(index.astype(np.float64), uv_px, 0)[0], dtype=np.float64)
 
 
 def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
@@ -134,19 +134,17 @@ def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
     return np.stack([index[:, 0], index[:, 1].max() - index[:, 1]], axis=1)
 
 
-def _turns(extent: tuple[int, int]) -> list[Ints]:
-    """Return the placements (3,) that map a grid with indices 0 .. extent onto itself."""
+def _turns(extent: tuple[int, int]) -> Ints:
+    """Return the placements (m, 3) that map a grid with indices 0 .. extent onto itself."""
     across, up = extent
-    turns = [(0, 0, 0), (2, across, up)]
-    if across == up:
-        turns += [(1, up, 0), (3, 0, across)]
-    return [np.array(t, dtype=np.int64) for t in turns]
+    of_square = [(1, up, 0), (3, 0, across)] if across == up else []
+    return np.array([(0, 0, 0), (2, across, up), *of_square], dtype=np.int64)
 
 
 def _lower_left_is_dark(grey: NDArray[np.uint8], index: Ints, uv_px: Floats) -> bool:
     homography = _homography(index, uv_px)
     across, up = index.max(axis=0)
-    i, j = indices((0, 0), (across - 1, up - 1)).T
+    i, j = targets.indices((0, 0), (across - 1, up - 1)).T
     middle = np.column_stack([i + 0.5, j + 0.5, np.ones(len(i))]) @ homography.T
     u, v = np.rint(middle[:, :2] / middle[:, 2:]).astype(int).T
     value = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(np.float64)

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
@@ -33,7 +34,16 @@ class Rig:
 
     cameras: Mapping[str, Camera]
     R_lab_plate: Tensor  # (P, 3, 3)
-    T_lab_plate_mm: Tensor  # (P, 3)
+    T_lab_plate_mm: Tensor  # (P, 3), NaN where unknown
+
+    @property
+    def posed(self) -> set[int]:
+        """Rows of the known poses."""
+        return set(torch.nonzero(torch.isfinite(self.T_lab_plate_mm).all(1))[:, 0].tolist())
+
+    def placed(self, row: int, points_plate_mm: NDArray[np.float64]) -> Tensor:
+        """Return the points (n, 3) of the plate in the lab, mm, in one of its poses."""
+        return torch.from_numpy(points_plate_mm) @ self.R_lab_plate[row].mT + self.T_lab_plate_mm[row]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -212,8 +222,7 @@ def disk_centre_shift(
 ) -> Tensor:
     """Return centroid minus image of the centre (..., n, 2), px, for disks of a plate; differentiable in everything.
     Centres (..., n, 3), plate frame, mm, lie in planes z = const; X_lab = R_lab_plate X_plate + T_lab_plate (mm, any
-    leading shape); diameters (..., n), mm, 0 for a corner, whose shift is 0. NaN where part of a disk is not imaged;
-    blur does not move the centroid.
+    leading shape); diameters (..., n), mm, 0 for a corner, whose shift is 0. NaN where part of a disk is not imaged.
     Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
     """
     check_points("points_plate", points_plate, 3)

@@ -33,6 +33,11 @@ class PictureReport:
     reason: str  # why it was not used; empty where it was
 
     @property
+    def lost(self) -> int:
+        """Number of outliers."""
+        return int((~self.used).sum())
+
+    @property
     def rms_px(self) -> float:
         """Rms distance between measured and expected points without outliers; NaN without points."""
         return _rms_px([self])
@@ -79,22 +84,18 @@ def _doubt(result: Calibrated, name: str) -> Doubt:
     pictures = [one for one in result.pictures if one.picture.camera == name and not one.reason]
     rms, share = result.rms_px(name), _shared(pictures)
     structure, noise = rms * math.sqrt(share), rms * math.sqrt(1 - share)
-    points, lost = (sum(part) for part in zip(*((len(one.used), _lost(one)) for one in pictures), strict=True))
-    worst = max(pictures, key=lambda one: _lost(one) / len(one.used))
-    dropped = lost > DROPPED * points or _lost(worst) > DROPPED_HERE * len(worst.used)
+    points, lost = sum(len(one.used) for one in pictures), sum(one.lost for one in pictures)
+    worst = max(pictures, key=lambda one: one.lost / len(one.used))
+    dropped = lost > DROPPED * points or worst.lost > DROPPED_HERE * len(worst.used)
     structured = structure > FINE_PX and share > SHARED + 2 / math.sqrt(points)  # of noise, sigma is 0.5 / sqrt(points)
     words = []
     if structured:
         words.append(f"neighbouring points miss alike, by {structure:.3f} px rms beside {noise:.3f} px of noise")
     if dropped:
-        most = f"{_lost(worst)} of {len(worst.used)} in {worst.picture.path.name}"
+        most = f"{worst.lost} of {len(worst.used)} in {worst.picture.path.name}"
         words.append(f"{lost} of {points} points were dropped, {most}")
     words += _lens_words(result.cameras[name])
     return Doubt(words=tuple(words), structured=structured, hopeless=structured and structure > noise and dropped)
-
-
-def _lost(one: PictureReport) -> int:
-    return int((~one.used).sum())
 
 
 def _shared(pictures: Sequence[PictureReport]) -> float:

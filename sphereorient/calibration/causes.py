@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration.comparison import Comparison, Sight, misfit
+from sphereorient.calibration.targets import Floats
 from sphereorient.cameras import Camera, Rays
 
-Floats = NDArray[np.float64]
 LATEST = 8  # frames by which a movie may be late
 PLAUSIBLE = 0.2  # largest deviation: relative, rad, 100 mm
 FIT: dict[str, Any] = {"loss": "soft_l1", "x_scale": 0.01, "max_nfev": 30}
@@ -38,9 +37,7 @@ class Cause:
 def other_readings(
     cameras: Mapping[str, Camera], centre_px: Tensor, R_view_body: Tensor, flips: Sequence[str] = tuple(FLIPS)
 ) -> Iterator[tuple[Cause, Tensor, Tensor]]:
-    """Yield causes with centres (N, C, 2), px, and attitudes (N, C, 3, 3) as they are if two movies are swapped, or one
-    is flipped.
-    """
+    """Yield causes, centres (N, C, 2), px, and attitudes (N, C, 3, 3) with two movies swapped, or one flipped."""
     names, sizes = list(cameras), [camera.image_size for camera in cameras.values()]
     for k, m in combinations(range(len(names)), 2):
         if sizes[k] == sizes[m]:

@@ -98,12 +98,9 @@ def _meet(a: Rays, b: Rays) -> tuple[Tensor, Tensor, Tensor]:
 
 def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
     """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
-    sigma_deg = math.degrees(float(so3.trace(covariance_rad2).sqrt().nanmedian()))
-    return Limits(
-        gap_px=GAP_PX,
-        turn_deg=max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg if math.isfinite(sigma_deg) else 0.0),
-        size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())),
-    )
+    sigma_deg = math.degrees(float(so3.trace(covariance_rad2).sqrt().nanmedian().nan_to_num(posinf=0.0)))
+    turn_deg = max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg)
+    return Limits(gap_px=GAP_PX, turn_deg=turn_deg, size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())))
 
 
 class Comparison:
@@ -138,10 +135,8 @@ class Comparison:
         """Return what the cameras say of centres (N, C, 2), px, and attitudes (N, C, 3, 3); None: those seen."""
         pixels = (self.centre_px if centre_px is None else centre_px).unbind(1)
         attitudes = (self.R_view_body if R_view_body is None else R_view_body).unbind(1)
-        return [
-            (camera.rays(pixel), R_lab_view(camera, pixel) @ R)
-            for camera, pixel, R in zip(self.cameras, pixels, attitudes, strict=True)
-        ]
+        each = zip(self.cameras, pixels, attitudes, strict=True)
+        return [(camera.rays(pixel), R_lab_view(camera, pixel) @ R) for camera, pixel, R in each]
 
     def __call__(
         self, sights: Sequence[Sight], larger: Tensor | float = 0.0, sized: bool = True, wider: Tensor | float = 0.0

@@ -56,9 +56,7 @@ class Consistency:
 
 
 def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
-    """Compare the cameras in pairs; where they contradict each other, find the likeliest causes.
-    The cause that leaves least is the likeliest.
-    """
+    """Compare the cameras in pairs; where they contradict each other, find the causes that leave least."""
     compare = Comparison(seen, limits)
     found = compare(compare.sights())
     count = int(torch.isfinite(found[..., 0]).sum(1).amax()) if len(found) else 0
@@ -87,8 +85,7 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
 
 
 def majority(seen: Seen, limits: Limits = OUTLINES) -> tuple[int, ...]:
-    """Return the largest set of cameras of which each two agree; none where these are not more than half of all, or of
-    fewer than three cameras.
+    """Return the largest set of cameras of which each two agree, if these are more than half of three or more; or none.
     Of sets of one size that whose lines of sight and sizes agree best: where two cameras alone measure a direction, the
     size of the picture in another, which looks along it, decides.
     """
@@ -142,11 +139,9 @@ def with_contradictions(
     believed = track.believed.sum(1)
     outvoted = torch.from_numpy(elsewhere & (believed > elsewhere.sum(1))[:, None])
     wrong = torch.from_numpy(elsewhere.any(1)) & ~outvoted.any(1)
-    counted = replace(
-        seen,
-        centre_px=seen.centre_px.masked_fill(outvoted[..., None], torch.nan),
-        R_lab_body=seen.R_lab_body.masked_fill(outvoted[..., None, None], torch.nan),
-    )
+    centre_px, R = seen.centre_px.clone(), seen.R_lab_body.clone()
+    centre_px[outvoted], R[outvoted] = torch.nan, torch.nan
+    counted = replace(seen, centre_px=centre_px, R_lab_body=R)
     pairs = [_compared(track, counted, lasting_rad2, *two) for two in seen.pairs]
     for pair in pairs:
         wrong |= pair.turned | (pair.gaps.signed_px.abs() > limits.gap_px)

@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.targets import FIDUCIALS, CalibrationTarget, DotPlate, missing_keys, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.checks import camera_error, check_known, named
+from sphereorient.cameras.checks import camera_error, check_known, check_rotation, named
 from sphereorient.cameras.io.cameras_yaml import Entry, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError
@@ -145,10 +145,8 @@ def _number(path: Path, k: int, row: dict[str, str], name: str) -> float:
 
 def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[str, Port]:
     ports = {}
+    check_known(keys.ports, cameras, f"{path}, ports")
     for name, entry in keys.ports.items():
-        if name not in cameras:
-            do = f"name one of {', '.join(cameras)}"
-            raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
         with named(f"{path}, ports, {name}"):
             ports[name] = entry.port()
     where = f"{path}, fit_ports"
@@ -177,9 +175,7 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> It
             if name in entry.clicked:
                 clicked = checked_clicks(entry.clicked[name], keys.image_size, f"{where}, clicked, {name}")
             yield Picture(camera=name, row=row, path=path.parent / file, clicked_px=clicked)
-        for name in set(entry.clicked) - set(files):
-            do = "name one of them, or remove the points"
-            raise camera_error(f"{where}, clicked", f"one of {', '.join(files)}", short(name), do)
+        check_known(entry.clicked, files, f"{where}, clicked")
 
 
 def checked_clicks(points: Any, image_size: tuple[int, int], where: str) -> NDArray[np.float64]:
@@ -207,9 +203,6 @@ def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> di
         got = f"pose {known.pose}, without a picture"
         raise camera_error(where, "a pose with a picture", got, "name a pose that was filmed")
     R, T = (torch.tensor(part, dtype=torch.float64) for part in (known.R_lab_plate, known.T_lab_plate))
-    off = float((R @ R.mT - torch.eye(3, dtype=torch.float64)).abs().max())
-    if off > ROTATION_TOLERANCE or float(torch.linalg.det(R)) < 0:
-        got = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are {off:.2g} from it"
-        do = "write the plate's x, y and z axis in the lab as its columns"
-        raise camera_error(f"{where}, R_lab_plate", "a rotation", got, do)
+    do = "write the plate's x, y and z axis in the lab as its columns"
+    check_rotation(f"{where}, R_lab_plate", R, ROTATION_TOLERANCE, do)
     return {numbers.index(known.pose): (so3.nearest_rotation(R), T)}

@@ -39,14 +39,11 @@ class PlateSeen:
 
 
 def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
-    """Return the pictures of a folder by pose, then camera: cam1_07.png is pose 7 of cam1; 07.png of the only one.
-    CameraError for a folder without such names.
-    """
+    """Return pictures by pose, then camera: cam1_07.png, or 07.png of the only one; CameraError without such names."""
     poses: dict[int, dict[str, str]] = defaultdict(dict)
-    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS)
     for path in files:
-        found = NUMBERED.match(path.stem)
-        if found is not None:
+        if found := NUMBERED.match(path.stem):
             poses[int(found["pose"])][found["camera"] or "cam1"] = path.name
     if not poses:
         got = f"{len(files)} pictures, none with a number" if files else "no pictures"
@@ -59,13 +56,11 @@ def look_at_plate(path: Path) -> PlateSeen:
     """Find the dots of a picture, dark or bright ones; CameraError where it cannot be decoded."""
     picture = read_plate_picture(path)
     size = picture.shape[1], picture.shape[0]
-    best, dark = None, True
+    best, dark, most = None, True, LEAST_DOTS
     for polarity in (True, False):
-        lattice = find_lattice(find_dots(picture, dark=polarity))
-        if lattice is not None and len(lattice.index) > (LEAST_DOTS if best is None else len(best.index)):
-            best, dark = lattice, polarity
-        if best is not None and len(best.index) > CERTAIN:
-            break
+        lattice = find_lattice(find_dots(picture, dark=polarity)) if most <= CERTAIN else None
+        if lattice is not None and len(lattice.index) > most:
+            best, dark, most = lattice, polarity, len(lattice.index)
     if best is None:
         return PlateSeen(size=size)
     usual = float(np.median(best.width))
@@ -112,7 +107,8 @@ def calibration_keys(
         raise camera_error(str(folder), "pictures of one size, px", got, do)
     with_dots = [one for one in seen if one.columns]
     cameras = sorted({name for of_pose in pictures.values() for name in of_pose})
-    widths = _widths(with_dots)
+    each = {name: np.array([getattr(one, part) for one in with_dots]) for name, part in DIAMETERS.items()}
+    widths = {name: float(np.nanmedian(some)) for name, some in each.items() if np.isfinite(some).any()}
     entries = [{"pose": pose} | {name: f"{where}{file}" for name, file in of.items()} for pose, of in pictures.items()]
     wall = {"normal": [0, -1, 0], "offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
     axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -162,18 +158,8 @@ def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: i
     ]
 
 
-def _widths(seen: Sequence[PlateSeen]) -> dict[str, float]:
-    """Return the median widths of usual and larger dots, in pitches, by key, of those that were seen."""
-    widths = {name: [getattr(one, part) for one in seen] for name, part in DIAMETERS.items()}
-    return {name: float(np.nanmedian(some)) for name, some in widths.items() if np.isfinite(some).any()}
-
-
 def with_diameters(keys: Sequence[DraftKey], widths: Mapping[str, float]) -> list[DraftKey]:
     """Return keys with the diameters of the dots in mm, from `widths` in pitches, once the pitch is known."""
     pitch = next((key.value for key in keys if key.name == "plate.pitch"), None)
-    if not isinstance(pitch, int | float):
-        return list(keys)
-    return [
-        replace(key, value=round(widths[key.name] * pitch, 4)) if key.value is ... and key.name in widths else key
-        for key in keys
-    ]
+    known = {name: round(width * pitch, 4) for name, width in widths.items()} if isinstance(pitch, int | float) else {}
+    return [replace(key, value=known.get(key.name, ...)) if key.value is ... else key for key in keys]

@@ -47,19 +47,20 @@ def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor
 
 
 def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
-    """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid."""
-    port, (pitch_u, pitch_v) = document.ports.get(name), document.keys.pixel_pitch
-    if document.keys.model == "pinhole" and pitch_u != pitch_v:
-        got, do = f"pixel_pitch {pitch_u:g}, {pitch_v:g}", "choose model: tsai or brown"
-        raise camera_error("model: pinhole", "square pixels", got, do)
+    """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid.
+    The keys of the model tell which focal length it has; distortion begins with their defaults.
+    """
+    port, (pitch_u, pitch_v), kind = document.ports.get(name), document.keys.pixel_pitch, MODELS[document.keys.model]
     start = start if port is None else _in_air(start, port)
-    models: dict[str, dict[str, Any]] = {
-        "pinhole": {"f_px": start.f_px},
-        "tsai": {"f_mm": start.f_px * pitch_v, "pixel_pitch_mm": (pitch_u, pitch_v), "sx": 1.0, "kappa1": 0.0},
-        "brown": {"f_px": torch.stack([start.f_px * pitch_v / pitch_u, start.f_px]), "k": (0.0,) * 3, "p": (0.0, 0.0)},
-    }
-    fields = models[document.keys.model]
-    lens = MODELS[document.keys.model](**fields, **{name: getattr(start, name) for name in SAME})
+    fields: dict[str, Any] = {key.field: (key.default,) * len(key.parts) or key.default for key in kind.KEYS}
+    square = any(key.field == "f_px" and key.place is None for key in kind.KEYS)
+    if square and pitch_u != pitch_v:
+        got, do = f"pixel_pitch {pitch_u:g}, {pitch_v:g}", "choose model: tsai or brown"
+        raise camera_error(f"model: {kind.MODEL}", "square pixels", got, do)
+    f_px = start.f_px if square else torch.stack([start.f_px * pitch_v / pitch_u, start.f_px])
+    focal = {"f_px": f_px, "f_mm": start.f_px * pitch_v, "pixel_pitch_mm": (pitch_u, pitch_v)}
+    fields |= {field: value for field, value in focal.items() if field in fields}
+    lens = kind(**fields | {field: getattr(start, field) for field in SAME})
     return lens if port is None else PortCamera(camera=lens, port=port)
 
 

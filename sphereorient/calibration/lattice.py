@@ -216,8 +216,7 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture", clicked
     """Identify the dots of a picture on the plate by trying quarter turns and shifts; `name` appears in the reason.
     The larger dots must be exactly the visible fiducials. One placement: `tied`; several: `floating`; none: `refused`.
     `clicked` (2 or 3, 2), px: about where the fiducials are, in the plate's order. They place the lattice instead of
-    the larger dots: `tied`, or `refused` where they contradict the plate. Dots that are not as wide as those of their
-    places are dropped.
+    the larger dots: `tied`, or `refused` where they contradict the plate. Dots of the wrong width are dropped.
     """
     lattice = find_lattice(dots)
     if lattice is None or len(lattice.index) < LEAST_DOTS:

@@ -17,7 +17,7 @@ from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubt
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
-from sphereorient.cameras import ParameterCovariance, Port, PortCamera, TsaiCamera, centre_lab_mm, in_air
+from sphereorient.cameras import ParameterCovariance, Port, PortCamera, centre_lab_mm, in_air
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
@@ -51,7 +51,7 @@ def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: P
     _check_seen(document, views)
     progress("fit", 0, 1)
     rig = _first_rig(document, tied)
-    tied = {picture: view for picture, view in tied.items() if _has_pose(rig, picture)}
+    tied = {picture: view for picture, view in tied.items() if picture.row in rig.posed}
     fitted = adjust(_problem(document, rig, tied))
     found = {} if document.points else tie_floating(document, fitted.rig, views)
     if found:
@@ -84,16 +84,14 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
 
     views: dict[Picture, PlateView] = {}
     progress("pictures", 0, len(grey))
-    for view in side_by_side(see, range(len(grey))):
-        views[document.pictures[len(views)]] = view
+    for picture, view in zip(document.pictures, side_by_side(see, range(len(grey))), strict=True):
+        views[picture] = view
         progress("pictures", len(views), len(grey))
     return views
 
 
 def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Return the grey levels (H, W) of a picture of a plate; CameraError for a file that is no picture or too large, or
-    not of `image_size` (W, H).
-    """
+    """Return a picture's grey levels (H, W); CameraError if it is none, too large, or not of `image_size` (W, H)."""
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
     # Do not decode a file that claims more pixels than any camera has.
@@ -126,15 +124,8 @@ def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
     return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
 
 
-def _has_pose(rig: Rig, picture: Picture) -> bool:
-    return bool(torch.isfinite(rig.T_lab_plate_mm[picture.row]).all())
-
-
 def _by_camera(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> dict[str, dict[int, PlateView]]:
-    return {
-        name: {picture.row: view for picture, view in tied.items() if picture.camera == name}
-        for name in document.cameras
-    }
+    return {name: {one.row: view for one, view in tied.items() if one.camera == name} for name in document.cameras}
 
 
 def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, PlateView]) -> Problem:
@@ -152,7 +143,7 @@ def tie_floating(
 ) -> dict[Picture, PlateView]:
     """Tie views without fiducials through cameras that saw the same pose, if exactly one placement fits."""
     assert document.plate is not None
-    known = {picture.row for picture, view in views.items() if view.state == "tied" and _has_pose(rig, picture)}
+    known = {picture.row for picture, view in views.items() if view.state == "tied" and picture.row in rig.posed}
     tied = {}
     for picture, view in views.items():
         if view.state != "floating" or picture.row not in known:
@@ -168,16 +159,15 @@ def tie_floating(
 
 
 def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
-    R, T = rig.R_lab_plate[picture.row], rig.T_lab_plate_mm[picture.row]
-    expected = rig.cameras[picture.camera].project(torch.from_numpy(view.points_plate_mm) @ R.mT + T)
-    return float(np.nan_to_num(np.median(np.linalg.norm(view.uv_px - expected.numpy(), axis=1)), nan=np.inf))
+    expected = rig.cameras[picture.camera].project(rig.placed(picture.row, view.points_plate_mm)).numpy()
+    return float(np.nan_to_num(np.median(np.linalg.norm(view.uv_px - expected, axis=1)), nan=np.inf))
 
 
 def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
     loose = []
     for name, camera in fitted.rig.cameras.items():
         lens = in_air(camera)
-        focal = float((lens.f_mm if isinstance(lens, TsaiCamera) else lens.f_px).max())
+        focal = float(getattr(lens, lens.KEYS[0].field).max())  # the first key of all models that are calibrated
         scale = {"f": focal, "T_": float(camera.T_cam_lab_mm.norm())}
         limits = {begin: share * scale.get(begin, camera.image_size[0]) for begin, share in LOOSE_SHARE.items()} | LOOSE
         for parameter, sigma in (camera.covariance.sigmas if camera.covariance else {}).items():

@@ -61,17 +61,16 @@ class CameraCheck:
 
 def observations_of(tracks: Iterable[Trajectory], cameras: Mapping[str, Camera]) -> Seen:
     """Return what each camera alone measures of spheres, track after track; TrackError for an unknown camera."""
-    centres, attitudes = [], []
+    parts = []
     for track in tracks:
         check_known(cameras, track.cameras, "track, camera", TrackError)
         each = [track.cameras[name] for name in cameras]
-        seen = torch.from_numpy(np.stack([np.isin(one.reason, OBSERVED) for one in each], 1))
+        missing = torch.from_numpy(~np.stack([np.isin(one.reason, OBSERVED) for one in each], 1))
         centre_px, R = (torch.from_numpy(np.stack([getattr(one, part) for one in each], 1)) for part in PARTS)
-        centres.append(torch.where(seen[..., None], centre_px, torch.nan))
-        attitudes.append(torch.where(seen[..., None, None], R, torch.nan))
-    centre_px = torch.cat(centres)
-    sizes = torch.full(centre_px.shape[:2], torch.nan, dtype=torch.float64)
-    return Seen(cameras=cameras, centre_px=centre_px, radius_px=sizes, R_lab_body=torch.cat(attitudes))
+        centre_px[missing], R[missing] = torch.nan, torch.nan
+        parts.append((centre_px, R))
+    centre_px, R = (torch.cat(part) for part in zip(*parts, strict=True))
+    return Seen(cameras=cameras, centre_px=centre_px, radius_px=centre_px[..., 0] * torch.nan, R_lab_body=R)
 
 
 def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[CameraCheck]:
@@ -81,18 +80,16 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
         gaps = seen.gaps(pair)
         both = torch.isfinite(gaps.signed_mm)
         if bool(both.any()):
-            middle, names = gaps.position_lab_mm[both], [list(cameras)[k] for k in pair]
-            there = torch.stack([cameras[name].project(middle) for name in names], 1)
-            miss_px = (there - seen.centre_px[both][:, pair]).norm(dim=-1).amax(1)
-            gap_mm = gaps.signed_mm[both].abs()
-            checks.append(CameraCheck(names=(names[0], names[1]), gap_mm=gap_mm.numpy(), miss_px=miss_px.numpy()))
+            one, other = (list(cameras)[k] for k in pair)
+            there = torch.stack([cameras[name].project(gaps.position_lab_mm[both]) for name in (one, other)], 1)
+            miss_px = (there - seen.centre_px[both][:, pair]).norm(dim=-1).amax(1).numpy()
+            checks.append(CameraCheck(names=(one, other), gap_mm=gaps.signed_mm[both].abs().numpy(), miss_px=miss_px))
     return checks
 
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
     """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them, by all
-    spheres in it. CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other
-    cameras.
+    spheres in it. CameraError for unreadable cameras or too few common frames; TrackError for a track of others.
     """
     cameras, tracks = load_cameras(cameras_path), list(Tracks.load(track_path).values())
     used = {name: camera for name, camera in cameras.items() if name in tracks[0].cameras} or cameras
@@ -152,10 +149,8 @@ class _Pair:
             raise camera_error("track", expected, f"{count}", do)
         self.loose = cameras[loose]
         rays = [cameras[k].rays(pixels[both, k]) for k, both in each.items()]
-        self.ray = Rays(
-            origin_lab_mm=torch.cat([ray.origin_lab_mm for ray in rays]),
-            direction_lab=torch.cat([ray.direction_lab for ray in rays]),
-        )
+        names = ("origin_lab_mm", "direction_lab")
+        self.ray = Rays(**{name: torch.cat([getattr(ray, name) for ray in rays]) for name in names})
         self.centre_px = torch.cat([pixels[both, loose] for both in each.values()])
         self.R_still = torch.cat([seen.R_lab_body[both, k] for k, both in each.items()])
         # The body's orientation relative to the camera, independent of the camera's pose in the lab.

@@ -1,10 +1,11 @@
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, combinations
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from sphereorient.calibration.solve import slopes_along
 from sphereorient.cameras import Camera, ParameterCovariance, R_cam_view
@@ -18,18 +19,11 @@ GRAZING_ROUNDS = 4  # each reduces the error by the factor radius over distance
 DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position interpolates the smooth effect
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Systematic:
-    """Covariances of the errors that all N frames share."""
-
-    position_mm2: Tensor  # (N, 3, 3), lab
-    orientation_rad2: Tensor  # (N, 3, 3), of delta in R_true = exp([delta]x) R, lab
-
-
 def systematic_errors(
     cameras: Mapping[str, Camera], covariance: ParameterCovariance, position_lab_mm: Tensor, radius_mm: float
-) -> Systematic:
-    """Propagate the cameras' covariance to position (N, 3), lab, mm, and orientation; NaN where the position is.
+) -> tuple[Tensor, Tensor]:
+    """Return the covariances (N, 3, 3) of the errors that all frames share, by the cameras' covariance: of the position
+    (N, 3), lab, mm^2, NaN where that is, and of delta in R_true = exp([delta]x) R, lab, rad^2.
     Parameters are named camera.parameter. A small camera error acts on cap and limb like a small change of pose.
     Source: first-order propagation of errors; least squares of the pose with fixed design.
     """
@@ -44,7 +38,7 @@ def systematic_errors(
         effect = (_quadratic(positions, some) @ law).unflatten(1, effect.shape[1:])
     whole = position_lab_mm.new_full((len(known), 6, 6), torch.nan, dtype=torch.float64)
     whole[known] = effect @ covariance.matrix @ effect.mT
-    return Systematic(position_mm2=whole[:, 3:, 3:], orientation_rad2=whole[:, :3, :3])
+    return whole[:, 3:, 3:], whole[:, :3, :3]
 
 
 def _quadratic(positions: Tensor, usual: Tensor) -> Tensor:
@@ -74,7 +68,7 @@ def _pose_by_parameters(
 
 def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
     """Return the derivatives of cap and limb pixels by pose (N, M, 6) and parameters (N, M, P), px."""
-    towards = torch.nn.functional.normalize(camera.rays(camera.project(positions)).direction_lab, dim=-1)
+    towards = normalize(camera.rays(camera.project(positions)).direction_lab, dim=-1)
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(towards @ camera.R_cam_lab.mT)
     cap = torch.cat([_ring(share, PER_RING, k * torch.pi / PER_RING) for k, share in enumerate(CAP_RINGS)])
     paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (cap, _ring(1.0, LIMB_POINTS)))
@@ -92,7 +86,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
     lever = torch.linalg.cross(axes.expand(*arms.shape[:2], 3, 3), arms[..., None, :].expand(*arms.shape[:2], 3, 3))
     by_turn = by_place @ lever.mT
     by_turn[:, count:] = 0.0
-    outward = torch.nn.functional.normalize(camera.project(points) - camera.project(positions)[:, None], dim=-1)
+    outward = normalize(camera.project(points) - camera.project(positions)[:, None], dim=-1)
 
     def visible(slopes: Tensor) -> Tensor:
         along = (outward[:, count:, :, None] * slopes[:, count:]).sum(2)  # motion along the limb is invisible
@@ -103,12 +97,10 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
 
 def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
     """Return arms (N, M, 3), lab, mm, to the tangent points of lines of sight; only these move with the limb."""
-    outward = torch.nn.functional.normalize(arms, dim=-1)
+    outward = normalize(arms, dim=-1)
     for _ in range(GRAZING_ROUNDS):
         along = camera.rays(camera.project(positions[:, None] + arms)).direction_lab
-        arms = radius_mm * torch.nn.functional.normalize(
-            outward - (outward * along).sum(-1, keepdim=True) * along, dim=-1
-        )
+        arms = radius_mm * normalize(outward - (outward * along).sum(-1, keepdim=True) * along, dim=-1)
     return arms
 
 
@@ -131,6 +123,6 @@ def with_systematic_errors(
     for some in chain.from_iterable(combinations(cameras, count) for count in range(1, len(cameras) + 1)):
         rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
         if bool(rows.any()):
-            left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
-            place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
+            own = {name: cameras[name] for name in some}
+            place[rows], turn[rows] = systematic_errors(own, covariance, position[rows], radius_mm)
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())

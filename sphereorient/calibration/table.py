@@ -32,10 +32,9 @@ def pictures_table(result: Calibrated) -> Table:
     numbers = (Column(name, justify="right") for name in ("points", "outliers", "rms px"))
     table = Table("pose", "camera", "picture", *numbers, "not used because", title="pictures")
     for one in sorted(result.pictures, key=lambda one: (one.pose, one.picture.camera)):
-        outliers = "" if one.reason else str(int((~one.used).sum()))
-        rms = "" if one.reason else f"{one.rms_px:.3f}"
+        found = ("", "") if one.reason else (f"{one.lost}", f"{one.rms_px:.3f}")
         where = str(one.pose), one.picture.camera, one.picture.path.name
-        table.add_row(*where, str(len(one.view)), outliers, rms, one.reason)
+        table.add_row(*where, str(len(one.view)), *found, one.reason)
     return table
 
 
@@ -50,10 +49,8 @@ def summary(result: Calibrated) -> list[str]:
 
 def repair_lines(result: Repaired) -> list[str]:
     """Return the changes of a self-calibration."""
-    lines = [
-        f"distance between the lines of sight to the sphere: {result.gap_before_mm:.4f} mm rms, "
-        f"now {result.gap_after_mm:.4f} mm ({result.frames} frames)"
-    ]
+    gaps = f"{result.gap_before_mm:.4f} mm rms, now {result.gap_after_mm:.4f} mm ({result.frames} frames)"
+    lines = [f"distance between the lines of sight to the sphere: {gaps}"]
     for name, change in result.moved.items():
         turn, move = math.degrees(float(change[:3].norm())), float(change[3:].norm())
         lines.append(f"{name}: rotated by {turn:.3f} degrees, T changed by {move:.2f} mm")
@@ -64,14 +61,12 @@ def repair_lines(result: Repaired) -> list[str]:
 
 def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
     """Return how well each pair of cameras fits together."""
-    lines = []
-    for check in checks:
-        (gap, miss), (gap95, miss95) = check.percentile(50), check.percentile(95)
-        lines.append(
-            f"{' and '.join(check.names)}: lines of sight miss each other by {gap:.4f} mm (median), {gap95:.4f} mm "
-            f"(95 %); pictures by {miss:.3f} px, {miss95:.3f} px; {len(check.gap_mm)} frames"
-        )
-    return lines
+    each = ((check, *check.percentile(50), *check.percentile(95)) for check in checks)
+    return [
+        f"{' and '.join(check.names)}: lines of sight miss each other by {gap:.4f} mm (median), {gap95:.4f} mm (95 %); "
+        f"pictures by {miss:.3f} px, {miss95:.3f} px; {len(check.gap_mm)} frames"
+        for check, gap, miss, gap95, miss95 in each
+    ]
 
 
 def contradiction_lines(track: Trajectory) -> list[str]:
@@ -94,9 +89,8 @@ def _values(camera: Camera) -> dict[str, float]:
     """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
     known = () if camera.covariance is None else camera.covariance.names
     lens = in_air(camera)
-    found: dict[str, Tensor] = {}
-    for name, (field, place) in lens.parameter_fields().items():
-        found[name] = getattr(lens, field)[... if place is None else place]
+    fields = lens.parameter_fields().items()
+    found: dict[str, Tensor] = {name: getattr(lens, field)[... if k is None else k] for name, (field, k) in fields}
     found |= dict(zip(TRANSLATION, camera.T_cam_lab_mm, strict=True))
     if isinstance(camera, PortCamera):
         found |= {name: getattr(camera.port, field) for name, field in PORT_NUMBERS.items()}

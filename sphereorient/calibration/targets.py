@@ -66,13 +66,11 @@ class DotPlate(CalibrationTarget):
     def __post_init__(self) -> None:
         super().__post_init__()
         largest = 2 * self.pitch_mm - self.dot_diameter_mm
+        got = f"dots of {self.dot_diameter_mm:g} and {self.fiducial_diameter_mm:g} mm at pitch {self.pitch_mm:g}"
         if not self.dot_diameter_mm < self.pitch_mm or not self.fiducial_diameter_mm < largest:
-            got = f"diameters {self.dot_diameter_mm:g} and {self.fiducial_diameter_mm:g} at pitch {self.pitch_mm:g}"
             raise camera_error("plate", "dots that do not touch", got, "measure the plate")
         if self.fiducial_diameter_mm < 1.15 * self.dot_diameter_mm:
-            got = f"fiducials {self.fiducial_diameter_mm:g} mm, dots {self.dot_diameter_mm:g} mm"
-            expected = "fiducials larger than the dots by 15 % or more"
-            raise camera_error("plate", expected, got, "measure the plate")
+            raise camera_error("plate", "fiducials larger than the dots by 15 % or more", got, "measure the plate")
         marks = self.fiducials
         pairs = isinstance(marks, list | tuple) and all(isinstance(at, list | tuple) and len(at) == 2 for at in marks)
         axes = pairs and len(marks) == 3 and all(_is_whole(i) and abs(i) <= MOST for at in marks for i in at)
@@ -127,9 +125,7 @@ class Chessboard(CalibrationTarget):
 
 @dataclass(frozen=True, kw_only=True)
 class CharucoBoard(CalibrationTarget):
-    """A chessboard of columns x rows squares with markers in the bright ones; a visible part is enough.
-    Index (0, 0) is the lower left inner corner as OpenCV draws it.
-    """
+    """A chessboard of columns x rows squares with markers; a part is enough; (0, 0): OpenCV's lower left corner."""
 
     marker_mm: float  # side of a marker
     dictionary: str = "DICT_4X4_50"  # OpenCV's name
@@ -196,22 +192,25 @@ def target_keys(kind: Kind) -> dict[str, tuple[str, bool]]:
     return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
 
 
+def _kind_of(entry: Any) -> Kind | None:
+    kind = entry.get("type") if isinstance(entry, Mapping) else None
+    return KINDS.get(kind) if isinstance(kind, str) else None
+
+
 def missing_keys(entry: Any) -> list[str]:
     """Return the keys that the parsed `plate` of calibration.yaml needs and has not; none for an unknown type."""
-    kind = entry.get("type") if isinstance(entry, Mapping) else None
-    if not isinstance(kind, str) or kind not in KINDS:
-        return []
-    return [key for key, (_, needed) in target_keys(KINDS[kind]).items() if needed and key not in entry]
+    keys = target_keys(kind) if (kind := _kind_of(entry)) else {}
+    return [key for key, (_, needed) in keys.items() if needed and key not in entry]
 
 
 def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> CalibrationTarget:
     """Build the target from the parsed `plate` of calibration.yaml; CameraError, naming the key, if impossible."""
-    kind = entry.get("type") if isinstance(entry, Mapping) else None
-    if not isinstance(kind, str) or kind not in KINDS:
-        expected, got = f"a mapping with `type` one of {', '.join(KINDS)}", entry if kind is None else kind
+    kind = _kind_of(entry)
+    if kind is None:
+        expected = f"a mapping with `type` one of {', '.join(KINDS)}"
+        got = entry["type"] if isinstance(entry, Mapping) and "type" in entry else entry
         raise _refused(name, expected, got, "write the type of the plate")
-    keys = target_keys(KINDS[kind])
-    missing = missing_keys(entry)
+    keys, missing = target_keys(kind), missing_keys(entry)
     unknown = [str(key)[:40] for key in entry if key != "type" and key not in keys][:5]
     if missing or unknown:
         faults = {"no": missing, "unknown": unknown}
@@ -223,7 +222,7 @@ def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> Calib
             raise _refused(f"{name}, dots", "dark or bright", entry["dots"], "write the brightness of the dots")
         values["dark"] = entry["dots"] == "dark"
     try:
-        return KINDS[kind](**values)
+        return kind(**values)
     except CameraError as error:
         raise CameraError(f"{name.removesuffix('plate')}{error}") from None
 
@@ -244,11 +243,6 @@ class PlateView:
     reason: str = ""  # one line, why the state is not `tied`
     placements: Ints = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (m, 3): see `placed`
 
-    def __post_init__(self) -> None:
-        n = len(self.index)
-        shapes = (self.points_plate_mm.shape, self.uv_px.shape, self.sigma_px.shape, self.diameter_mm.shape)
-        assert shapes == ((n, 3), (n, 2), (n,), (n,)), shapes
-
     def __len__(self) -> int:
         return len(self.index)
 
@@ -267,9 +261,9 @@ def seen(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats)
 
 def refused_view(name: str, expected: str, got: str, do: str) -> PlateView:
     """Return a `refused` view with the reason worded by `refusal`."""
-    none, reason = np.zeros(0), refusal(name, expected=expected, got=got, do=do)
-    empty = PlateView(np.zeros((0, 3)), np.zeros((0, 2)), none, none, np.zeros((0, 2), dtype=np.int64))
-    return replace(empty, state="refused", reason=reason)
+    none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
+    reason = refusal(name, expected=expected, got=got, do=do)
+    return PlateView(np.zeros((0, 3)), np.zeros((0, 2)), none, none, index, "refused", reason)
 
 
 def quarter_turned(index: Ints, quarters: int) -> Ints:
@@ -281,17 +275,8 @@ def quarter_turned(index: Ints, quarters: int) -> Ints:
 
 def placed(view: PlateView, plate: CalibrationTarget, placement: Ints | Sequence[int]) -> PlateView:
     """Return a floating view as `tied` by a placement (3,): quarter turns, shift along columns, shift along rows."""
-    quarters, shift_i, shift_j = (int(p) for p in placement)
-    index = quarter_turned(view.index, quarters) + np.array([shift_i, shift_j])
-    return replace(
-        view,
-        index=index,
-        points_plate_mm=plate.points(index),
-        diameter_mm=plate.diameters(index),
-        state="tied",
-        reason="",
-        placements=np.zeros((0, 3), dtype=np.int64),
-    )
+    quarters, *shift = (int(p) for p in placement)
+    return seen(plate, quarter_turned(view.index, quarters) + np.array(shift), view.uv_px, view.sigma_px)
 
 
 def indices(first: Sequence[int] | Ints, last: Sequence[int] | Ints) -> Ints:

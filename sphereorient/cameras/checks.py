@@ -8,6 +8,7 @@ from sphereorient.errors import CameraError, ShapeError, SphereOrientError, chec
 from sphereorient.files.yaml_file import refuse_unknown, short
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
+WRITE_R = "write R_cam_lab row by row with at least 7 digits, x right, y down, z forward"
 LARGEST = 1e30  # of any parameter: results must stay finite
 MAX_SIDE_PX = 65_536  # of a picture: twice what any camera has
 
@@ -38,14 +39,13 @@ def check_image_size(name: str, size: Sequence[int]) -> None:
         raise camera_error(name, f"at most {MAX_SIDE_PX} px a side", short(tuple(size)), do)
 
 
-def check_rotation(name: str, R: Tensor) -> None:
-    """Refuse a (3, 3) matrix that is not orthonormal to ROTATION_TOLERANCE, or a reflection (CameraError)."""
+def check_rotation(name: str, R: Tensor, most: float = ROTATION_TOLERANCE, do: str = WRITE_R) -> None:
+    """Refuse a (3, 3) matrix that is not orthonormal, to `most`, or a reflection (CameraError)."""
     R = R.detach()
     error = float((R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max())
     det = float(torch.linalg.det(R))
-    if error > ROTATION_TOLERANCE or det < 0:
-        expected = f"a rotation, |R R^T - I| below {ROTATION_TOLERANCE:g} and det 1"
-        do = "write R_cam_lab row by row with at least 7 digits, x right, y down, z forward"
+    if error > most or det < 0:
+        expected = f"a rotation, |R R^T - I| below {most:g} and det 1"
         raise camera_error(name, expected, f"|R R^T - I| = {error:.2g}, det = {det:.6g}", do)
 
 

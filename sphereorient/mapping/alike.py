@@ -36,10 +36,10 @@ def shared_maps(learnt: Mapping[str, LearntMap]) -> dict[str, SharedMap]:
             joined = _joined(found[first].learnt, one, R)
             own = replace(one, R_lab_body=one.R_lab_body @ R)
             found[name] = SharedMap(learnt=own, first=first, correlation=compared.correlation)
-            for same in [other for other in found if found[other].first == first]:
-                own = found[same].learnt
-                own = replace(own, texture=joined.texture, seen=joined.seen, sigma=joined.sigma)
-                found[same] = replace(found[same], learnt=own)
+            for same, its in found.items():
+                if its.first == first:
+                    own = replace(its.learnt, texture=joined.texture, seen=joined.seen, sigma=joined.sigma)
+                    found[same] = replace(its, learnt=own)
             break
     return found
 
@@ -52,12 +52,8 @@ def _joined(first: LearntMap, other: LearntMap, R_other_first: Tensor) -> Learnt
     gain, offset = fit_levels(grey, first.texture.double())
     own, added = first.sigma.double().square().reciprocal(), (gain * sigma).square().reciprocal().nan_to_num()
     sums = own * first.texture.nan_to_num() + added * (gain * grey + offset).nan_to_num()
-    return replace(
-        first,
-        texture=(sums / (own + added)).float(),
-        sigma=(own + added).rsqrt().float(),
-        seen=first.seen + seen.nan_to_num().round().long(),
-    )
+    texture, count = (sums / (own + added)).float(), first.seen + seen.nan_to_num().round().long()
+    return replace(first, texture=texture, sigma=(own + added).rsqrt().float(), seen=count)
 
 
 def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison, float]:

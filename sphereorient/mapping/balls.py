@@ -34,8 +34,7 @@ Floats = NDArray[np.float64]
 class _Instant:
     """What all cameras see in one frame."""
 
-    disks: Sequence[Sequence[Outline]]  # C
-    crops: Sequence[Sequence[Crop]]  # of these disks
+    crops: Sequence[Sequence[Crop]]  # of the disks of C cameras
     matches: Sequence[Match]
     position_lab_mm: Floats  # (M, 3), of the matches
 
@@ -45,35 +44,30 @@ def take_crops_of_all(
 ) -> dict[str, Crops]:
     """Crop each of several moving spheres in every frame, by name. Names of spheres of one size are given by chance,
     and kept: a sphere is the one that is where it is expected. Only disks that no other one touches are used.
-
-    Raises:
-        ExperimentError: a sphere without a diameter, or one that is said to stay in its place.
-        PaintError: no frame shows as many spheres as are named, each by itself.
+    Raises ExperimentError (a sphere without a diameter, or one that is said to stay in its place), PaintError (no frame
+    shows as many spheres as are named, each by itself).
     """
     names, streams = recording.experiment.names, recording.streams
     scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]
     sizes_px = [[scene[name].diameter_px for name in names] for scene in scenes]
     radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}
-    movies = [
-        screened_frames(stream, scene[names[0]].background) for stream, scene in zip(streams, scenes, strict=True)
-    ]
+    each = list(zip(streams, scenes, strict=True))
+    movies = [screened_frames(stream, scene[names[0]].background) for stream, scene in each]
     instants = []
     for k, shots in enumerate(zip(*movies, strict=True)):
         disks: list[list[Outline]] = []
+        crops: list[list[Crop]] = []
         for shot, size_px in zip(shots, sizes_px, strict=True):
             usable = shot.usable and shot.background is not None
             disks.append(find_disks(shot.picture, shot.background, size_px, locating) if usable else [])
-        crops = [
-            [cut_crop(shot.picture, one.u_px, one.v_px, one.radius_px) for one in seen]
-            for shot, seen in zip(shots, disks, strict=True)
-        ]
+            crops.append([cut_crop(shot.picture, one.u_px, one.v_px, one.radius_px) for one in disks[-1]])
         instants.append(_instant(disks, crops, recording.cameras, 2 * min(radius_mm.values())))
         progress("balls", k + 1, 0)
     chosen = _linked(instants, scenes, radius_mm)
     places = [_places(chosen[:, n], instants) for n in range(len(names))]
     found = {}
     for n, name in enumerate(names):
-        views = [CameraView.of(one.name, one.camera, scene[name]) for one, scene in zip(streams, scenes, strict=True)]
+        views = [CameraView.of(one.name, one.camera, scene[name]) for one, scene in each]
         own_first = [places[n], *(place for m, place in enumerate(places) if m != n)]
         found[name] = _crops_of(name, chosen[:, n], instants, views, radius_mm, own_first)
     return found
@@ -88,7 +82,7 @@ def _instant(
     least = min(2, len(cameras))  # a distance by the size of one disk is not enough to know who it is
     matches = [one for one in match_disks(disks, list(cameras.values())) if one.number >= least]
     X = places_of(matches, cameras, diameter_mm).position_lab_mm.numpy() if matches else np.zeros((0, 3))
-    return _Instant(disks=disks, crops=crops, matches=matches, position_lab_mm=X)
+    return _Instant(crops=crops, matches=matches, position_lab_mm=X)
 
 
 def _linked(
@@ -104,18 +98,16 @@ def _linked(
         for k in frames:
             at = instants[k]
             cost = _misfit(at, k, past, sizes, np.array(list(radius_mm.values())))
-            chosen[k] = _assigned(cost, at.matches)
-            for n, match in enumerate(chosen[k].tolist()):
-                if match >= 0:
-                    past[n] = [*past[n][-1:], (k, at.position_lab_mm[match])]
+            chosen[k] = -1
+            for n, match in assigned(cost - FARTHEST, at.matches):
+                chosen[k, n] = match
+                past[n] = [*past[n][-1:], (k, at.position_lab_mm[match])]
     return chosen
 
 
 def _first(instants: Sequence[_Instant], count: int) -> int:
-    """Return the frame in which as many spheres as are named are seen by most cameras, and in which the fewest other
-    matches are possible.
-    """
-    best, ranks = -1, [(0, 0)]
+    """Return the frame in which most cameras see as many spheres as are named, with the fewest other matches."""
+    ranks = {}
     for k, at in enumerate(instants):
         apart: list[Match] = []
         for one in at.matches:  # those of most cameras come first
@@ -125,14 +117,11 @@ def _first(instants: Sequence[_Instant], count: int) -> int:
             continue
         least = apart[count - 1].number
         others = sum(one.number >= least for one in at.matches) - count
-        rank = sum(one.number for one in apart[:count]), -others
-        if best < 0 or rank > max(ranks):
-            best = k
-        ranks.append(rank)
-    if best < 0:
+        ranks[k] = sum(one.number for one in apart[:count]), -others
+    if not ranks:
         do = "name as many balls as the movies show, or learn each map from a movie of one ball"
         raise PaintError(refusal("movies", expected=f"{count} balls in a frame", got="none that shows them", do=do))
-    return best
+    return max(ranks, key=lambda k: ranks[k])
 
 
 def _misfit(
@@ -145,12 +134,9 @@ def _misfit(
             if one is not None:
                 cost[:, m] += ((one.radius_px / sizes[:, c] - 1) / SIZE_SIGMA) ** 2 / match.number
     for n, seen in enumerate(past):
-        if not seen or not len(at.matches):
+        if not seen or (gap := abs(frame - seen[-1][0])) > FORGOTTEN:
             continue
-        last, X = seen[-1]
-        gap = abs(frame - last)
-        if gap > FORGOTTEN:
-            continue
+        X = seen[-1][1]
         for (before, X_before), (now, X_now) in pairwise(seen):
             X = X_now + (frame - now) / (now - before) * (X_now - X_before)
         sigma = AWAY * radius_mm[n] * gap * (1 if len(seen) > 1 else 3)
@@ -158,14 +144,6 @@ def _misfit(
     # Of two matches of one sphere the one of more cameras counts.
     cost += np.array([len(one.chosen) - one.number + one.chi2 / max(2 * one.number - 3, 1) for one in at.matches])
     return cost
-
-
-def _assigned(cost: Floats, matches: Sequence[Match]) -> NDArray[np.int64]:
-    """Return the match (K,) of each sphere, -1: none, of least chi2 together; no disk is in two of them."""
-    found = np.full(len(cost), -1)
-    for n, match in assigned(cost - FARTHEST, matches):
-        found[n] = match
-    return found
 
 
 def _places(chosen: NDArray[np.int64], instants: Sequence[_Instant]) -> Floats:
@@ -207,9 +185,10 @@ def _crops_of(
 
 def _free(view: CameraView, places: Sequence[Tensor], radii_mm: Sequence[float]) -> Tensor:
     """Return in which frames the disk of the first sphere lies in the picture as a whole, and no other touches it."""
-    middle = [view.camera.project(place) for place in places]
-    radius = [view.radius_px(place, size) for place, size in zip(places, radii_mm, strict=True)]
-    free: Tensor = view.shows_whole(middle[0], radius[0])
-    for other, size in zip(middle[1:], radius[1:], strict=True):
-        free = free & ((middle[0] - other).norm(dim=-1) > FREE * (radius[0] + size))
+    (middle, radius), *others = (
+        (view.camera.project(place), view.radius_px(place, size)) for place, size in zip(places, radii_mm, strict=True)
+    )
+    free: Tensor = view.shows_whole(middle, radius)
+    for other, size in others:
+        free = free & ((middle - other).norm(dim=-1) > FREE * (radius + size))
     return free

@@ -10,14 +10,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.disks import Disks, evenly_spread, reduced, too_few, without_static
-from sphereorient.mapping.pairs import (
-    Closure,
-    RelativeRotations,
-    all_rotations,
-    refine_pairs,
-    search_pairs,
-    solve_graph,
-)
+from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs, search_pairs, solve_graph
 from sphereorient.mapping.settings import MapSettings
 
 SEARCH_STEP_DEG = 8.0
@@ -45,9 +38,7 @@ class PairwiseAttitudes:
 
 def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
     """Find the orientations of N instants from disks, each seen by at least one camera.
-
-    Raises:
-        PaintError: the sphere does not rotate, the cameras see different rotations, or no patch is seen twice.
+    Raises PaintError (the sphere does not rotate, the cameras see different rotations, or no patch is seen twice).
     """
     if len(disks) < 2:
         raise too_few(len(disks))
@@ -85,7 +76,7 @@ def _chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, Relativ
             i = torch.arange(count - step)
             pairs = refine_pairs(disks, i, i + step, R[i + step] @ R[i].mT, ITERATIONS, EVERY)
             parts.append(pairs.where(pairs.score > settings.score_min))
-    pairs = all_rotations(parts)
+    pairs = RelativeRotations.joined(parts)
     return solve_graph(R, pairs, SCALE_RAD)[0], pairs
 
 
@@ -111,7 +102,7 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
         got = f"none among {len(first)} pairs of frames"
         do = "film until the ball has shown its sides again, or use more frames"
         raise PaintError(refusal("movies", expected="patches of the ball that are seen twice", got=got, do=do))
-    R, residual = solve_graph(R_lab_body, all_rotations([pairs, good]), SCALE_RAD)
+    R, residual = solve_graph(R_lab_body, RelativeRotations.joined([pairs, good]), SCALE_RAD)
     closed = good.where(residual[len(pairs) :].norm(dim=-1) < 3 * SCALE_RAD)
     closure = Closure.of(closed, R_lab_body, R, pairs=len(pairs), loops=len(first))
     return PairwiseAttitudes(rows=torch.arange(len(R)), R_lab_body=R, closure=closure)
@@ -128,18 +119,10 @@ def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:
 def _candidates(disks: Disks, R_lab_body: Tensor, settings: MapSettings) -> tuple[Tensor, Tensor]:
     """Return distant pairs of keyframes that should share a patch; of too many, evenly spread ones."""
     keys = _keyframes(R_lab_body, math.radians(settings.keyframe_deg))
-    near = sight_cosines(disks, R_lab_body, keys)
+    near = disks.sight_cosines(R_lab_body, keys)
     a, b = torch.triu_indices(len(keys), len(keys), offset=2)
     chosen = evenly_spread(torch.nonzero(near[a, b] > NEAR)[:, 0], settings.loop_pairs)
     return keys[a[chosen]], keys[b[chosen]]
-
-
-def sight_cosines(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:
-    """Return the cosine between the nearest lines of sight in the body for all pairs of instants (K,), (K, K)."""
-    in_body = (R_lab_body[rows].mT[:, None] @ disks.sight_lab[rows][..., None])[..., 0]
-    cosine = torch.einsum("acx,bdx->abcd", in_body, in_body)
-    both = disks.seen[rows][:, None, :, None] & disks.seen[rows][None, :, None, :]
-    return torch.where(both, cosine, -1.0).flatten(2).amax(2)
 
 
 def _check_one_ball(disks: Disks, R_lab_body: Tensor) -> None:

@@ -52,9 +52,8 @@ class MapComparison:
     @property
     def length_rad(self) -> Tensor:
         """Length of the measured displacements, rad, (n,)."""
-        length = self.moved_rad.norm(dim=-1)
-        known: Tensor = length[torch.isfinite(length)]
-        return known
+        length: Tensor = self.moved_rad[torch.isfinite(self.moved_rad).all(1)].norm(dim=-1)
+        return length
 
     @property
     def rms_rad(self) -> float:
@@ -75,9 +74,9 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
     finest = [texture_table(grey, math.radians(FINE_BLUR_DEG), SIDE) for grey, _ in maps]
     blurs = (FINE_BLUR_DEG, *reversed(BLURS_DEG), SEARCH_BLUR_DEG)
     tables = {blur: [table.blurred(math.radians(blur)) for table in finest] for blur in blurs}
-    shares = [share for _, share in maps]
-    place = fibonacci_directions(PLACES)
-    coarse = [_coarser(share) for share in shares]
+    shares, place = [share for _, share in maps], fibonacci_directions(PLACES)
+    rows = [min(len(share), SIDE) for share in shares]  # as many as the tables have: quick to look up
+    coarse = [F.adaptive_avg_pool2d(share[None], (n, 2 * n))[0] for share, n in zip(shares, rows, strict=True)]
     R = _best_rotation(tables, coarse, place) if turned else torch.eye(3, dtype=torch.float64)
     correlation, known = _correlations(tables[BLURS_DEG[-1]], coarse, place, R[None])
     score = float(correlation[0]) if float(known[0]) > 0 else math.nan
@@ -134,18 +133,16 @@ def texture_change(new: Tensor, old: Tensor) -> Tensor:
     gain, offset = fit_levels(old, new)
     grey = old * gain + offset
     known = torch.isfinite(grey)
-    lowest, highest = (torch.where(known, grey, fill).reshape(-1) for fill in (torch.inf, -torch.inf))
-    direction = map_directions(len(old)).reshape(-1, 3)
+    lowest, highest = (torch.where(known, grey, fill) for fill in (torch.inf, -torch.inf))
+    direction = map_directions(len(old))
     east, north = compass(direction)
-    filled = torch.where(known, grey, 0.5)
+    filled = torch.where(known, grey, 0.5).double()
     for k in range(REACHES):
         angle, far = 2 * math.pi * k / REACHES, math.radians(RADIUS_DEG) * (1 if k % 2 else 0.5)
         near = F.normalize(direction + far * (math.cos(angle) * east + math.sin(angle) * north), dim=-1)
-        value = sample_texture(filled.double(), near).to(grey.dtype)
+        value = sample_texture(filled, near).to(grey.dtype)
         lowest, highest = torch.minimum(lowest, value), torch.maximum(highest, value)
-    flat = new.reshape(-1)
-    change = flat - torch.minimum(torch.maximum(flat, lowest), highest)
-    return torch.where(known.reshape(-1), change, torch.nan).reshape(new.shape)
+    return torch.where(known, new - torch.minimum(torch.maximum(new, lowest), highest), torch.nan)
 
 
 def without_changed(comparison: MapComparison, change: Tensor, most: float) -> MapComparison:
@@ -173,12 +170,6 @@ def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(known, texture, middle).float(), known.float()
 
 
-def _coarser(share: Tensor) -> Tensor:
-    """Return the known shares (h, 2 h) of a mask (H, 2 H) in as few texels as its tables have: quick to look up."""
-    rows = min(len(share), SIDE)
-    return F.adaptive_avg_pool2d(share[None, None], (rows, 2 * rows))[0, 0]
-
-
 def _best_rotation(tables: dict[float, list[TextureTable]], shares: list[Tensor], place: Tensor) -> Tensor:
     grid = so3.lattman_grid(math.radians(SEARCH_DEG)).double()
     few = fibonacci_directions(SEARCH_PLACES)
@@ -198,14 +189,12 @@ def _common_turn(direction: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
     east, north = compass(direction)
     # turn x d to the east is turn . (d x east), and d x east is north; to the north it is -turn . east.
     columns = torch.stack([north, -east], dim=1)
-    known = torch.isfinite(moved).all(1)
-    turn = torch.zeros(3, dtype=torch.float64)
-    for _ in range(TURN_ITERATIONS):
+    known, turn = torch.isfinite(moved).all(1), torch.zeros(3, dtype=torch.float64)
+    for _ in range(TURN_ITERATIONS if known.any() else 0):
         left = moved[known] - columns[known] @ turn
         length = left.norm(dim=-1)
-        weight = 1 / (1 + (length / (2 * length.median().clamp_min(1e-6))) ** 2) if len(length) else length
-        normal = torch.einsum("n,nki,nkj->ij", weight, columns[known], columns[known]) + 1e-9 * torch.eye(3).double()
-        turn = turn + torch.linalg.solve(normal, torch.einsum("n,nki,nk->i", weight, columns[known], left))
+        weight = 1 / (1 + (length / (2 * length.median().clamp_min(1e-6))) ** 2)
+        turn = turn + _weighted_fit(columns[known].flatten(0, 1), weight.repeat_interleave(2), left.flatten())
     return turn, moved - columns @ turn
 
 
@@ -222,8 +211,9 @@ def _correlations(tables: list[TextureTable], shares: list[Tensor], place: Tenso
     return weighted_correlation(a, b, weight).nan_to_num(0.0), weight.sum(1).clamp_min(1e-9) / len(place)
 
 
-def weighted_correlation(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
-    """Return the correlations (M,) of values (M, P) with others, by weights (M, P); NaN without contrast."""
+def weighted_correlation(a: Tensor, b: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Return the correlations (M,) of values (M, P), weights (M, P) or None: equal; NaN without contrast."""
+    weight = torch.ones_like(a) if weight is None else weight
     total = weight.sum(1).clamp_min(1e-9)
     a, b = (x - ((weight * x).sum(1) / total)[:, None] for x in (a, b))
     power = (weight * a * a).sum(1) * (weight * b * b).sum(1)
@@ -299,7 +289,8 @@ def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: P
     own = (by_shift.double() @ by_shift.double().mT) / len(offset)
     weaker = torch.linalg.eigvalsh(own)[:, 0]
     sure = (weaker > ONE_WAY * own.diagonal(dim1=1, dim2=2).sum(-1)) & (reference.std(1) > CONTRAST_MIN)
-    sure &= (_correlation(grey, reference) > FOUND_MIN) & (shift.norm(dim=-1) < math.radians(PATCH_REACH_DEG))
+    sure &= weighted_correlation(grey, reference) > FOUND_MIN
+    sure &= shift.norm(dim=-1) < math.radians(PATCH_REACH_DEG)
     sure &= (shift - start).norm(dim=-1) < math.radians(ROUGH_DEG)  # else the refinement has left its peak
     return shift, sure & ~_contradicted(patches.direction, shift, sure)
 
@@ -324,7 +315,7 @@ def _searched(tables: list[TextureTable], patches: Patches) -> Tensor:
     at = torch.arange(-steps, steps + 1, dtype=torch.float64) * math.radians(ROUGH_DEG)
     tried = torch.stack(torch.meshgrid(at, at, indexing="ij"), dim=-1).reshape(-1, 2)
     greys = (_sampled(tables[0], patches, offset, shift.expand(count, 2))[0] for shift in tried)
-    return tried[torch.stack([_correlation(grey, reference) for grey in greys]).argmax(0)]
+    return tried[torch.stack([weighted_correlation(grey, reference) for grey in greys]).nan_to_num(-1).argmax(0)]
 
 
 def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
@@ -337,8 +328,3 @@ def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tenso
         for k, axis in enumerate(compass(patches.direction))
     ]
     return value, torch.stack(columns, dim=1).float()
-
-
-def _correlation(a: Tensor, b: Tensor) -> Tensor:
-    a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
-    return (a * b).sum(1) / ((a * a).sum(1) * (b * b).sum(1)).clamp_min(1e-12).sqrt()

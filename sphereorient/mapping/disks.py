@@ -39,7 +39,7 @@ OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its med
 # found badly, both scatter alike.
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
 PLACES = 2  # per radius: places that far apart have paint of their own
-BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen")  # of `Disks`
+BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen", "shown")  # of `Disks`
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 
@@ -136,20 +136,25 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
 def _fixed_scene(
     recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings
 ) -> tuple[Outline, CameraScene]:
-    """Return outline and scene of a ball that stays in its place: what changes in the pictures is the ball."""
+    """Return outline and scene of a fixed ball; PaintError if outlines scatter far more in place than in size."""
     pictures = stream.spread(4 * settings.background_frames)
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     outline, background = fixed_ball(pictures, locating, empty, stream.shown)
     scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
     each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
-    _check_still([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], stream.name)
+    seen = torch.tensor([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], dtype=torch.float64)
+    if len(seen) >= OUTLINES_MIN:
+        middle = seen.median(0).values
+        u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()
+        wander = math.hypot(u, v)
+        if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
+            got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: false`, and the diameter"
+            raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
     return outline, scene
 
 
 def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSettings) -> Crops:
-    """Return an empty record with the views and the one position (1, 3) of a ball that stays in its place; raise as
-    `take_crops` does.
-    """
+    """Return an empty record with the views and the one position (1, 3) of a fixed ball; raise as `take_crops`."""
     views, sightings = [], {}
     for stream in recording.streams:
         outline, scene = _fixed_scene(recording, stream, settings, locating)
@@ -161,24 +166,9 @@ def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSet
     return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=none, radius_mm=radius_mm, fixed=True)
 
 
-def _check_still(outlines: list[tuple[float, float, float]], name: str) -> None:
-    """Raise PaintError if a fixed ball's outlines (u, v, radius), px, scatter far more in place than in size."""
-    if len(outlines) < OUTLINES_MIN:
-        return
-    seen = torch.tensor(outlines, dtype=torch.float64)
-    middle = seen.median(0).values
-    u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()
-    wander = math.hypot(u, v)
-    if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
-        got, do = f"one that wanders by {wander:.1f} px in {name}", "write `fixed: false`, and the diameter"
-        raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
-
-
 def evenly_spread(rows: Tensor, count: int) -> Tensor:
     """Return at most `count` of the rows, evenly spread, ends included."""
-    if len(rows) <= count:
-        return rows
-    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
+    return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long()]
 
 
 def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
@@ -191,24 +181,20 @@ def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Cr
 
 def cut_out(place: Crops, pictures: Sequence[Picture]) -> list[Crop]:
     """Cut a ball in a known place, position (1, 3), out of a picture of each camera."""
-    X = place.position_lab_mm
-    found = []
+    X, found = place.position_lab_mm, []
     for view, picture in zip(place.views, pictures, strict=True):
-        (u, v), radius_px = view.camera.project(X)[0].tolist(), float(view.radius_px(X, place.radius_mm))
-        found.append(cut_crop(picture, u, v, radius_px))
+        u, v = view.camera.project(X)[0].tolist()
+        found.append(cut_crop(picture, u, v, float(view.radius_px(X, place.radius_mm))))
     return found
 
 
 def pixels_of(crops: Crops, fitter: Fitter, frames: Tensor, wanted: int, extra_px: float = 0.0) -> Pixels:
     """Return about `wanted` pixels of each disk, after a blur of the picture by `extra_px`."""
-    level = replace(fitter.optics.fine, extra_px=extra_px)
-    X = crops.position_lab_mm[frames]
+    level, X = replace(fitter.optics.fine, extra_px=extra_px), crops.position_lab_mm[frames]
     radius_px = float(fitter.disks_px(X).largest_px.max())
-    parts = []
-    for k in range(len(frames)):
-        whole = fitter.pixels(crops.pictures(frames[k : k + 1]), X[k : k + 1], level, radius_px)
-        parts.append(whole.thinned(max(1, round(whole.grey.shape[1] / wanted))))
-    return stacked(parts)
+    each = zip(torch.split(frames, 1), torch.split(X, 1), strict=True)
+    wholes = (fitter.pixels(crops.pictures(frame), place, level, radius_px) for frame, place in each)
+    return stacked([whole.thinned(max(1, round(whole.grey.shape[1] / wanted))) for whole in wholes])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,20 +206,18 @@ class Disks:
     R_lab_view: Tensor  # (N, C, 3, 3) float32
     distance_radii: Tensor  # (N, C), of the camera from the centre
     seen: Tensor  # (N, C) bool
-    shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nothing does
+    shown: Tensor  # (N, C, S, S) float32, 0 where something hides the ball .. 1
 
     def __len__(self) -> int:
         return len(self.layers)
 
     def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> "Disks":
         """Select instants and cameras."""
-        shown = None if self.shown is None else self.shown[rows, cameras]
-        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in BY_INSTANT})
+        return replace(self, **{name: getattr(self, name)[rows, cameras] for name in BY_INSTANT})
 
     def weight(self, rows: Tensor | slice, camera: int) -> Tensor:
         """Return pixel weights (R, S * S) of some disks: 0 where not seen or hidden."""
-        counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)
-        return counts if self.shown is None else counts * self.shown[rows, camera].flatten(1)
+        return self.seen[rows, camera][:, None] * self.shown[rows, camera].flatten(1)
 
     def sampled(
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
@@ -263,20 +247,24 @@ class Disks:
         """Unit vectors from the ball to the cameras, (N, C, 3) float64."""
         return -self.R_lab_view[..., 2].double()
 
+    def sight_cosines(self, R_lab_body: Tensor, rows: Tensor) -> Tensor:
+        """Return the cosine between the nearest lines of sight in the body for all pairs of instants (K,), (K, K)."""
+        in_body = (R_lab_body[rows].mT[:, None] @ self.sight_lab[rows][..., None])[..., 0]
+        cosine = torch.einsum("acx,bdx->abcd", in_body, in_body)
+        both = self.seen[rows][:, None, :, None] & self.seen[rows][None, :, None, :]
+        return torch.where(both, cosine, -1.0).flatten(2).amax(2)
+
     @classmethod
     def joined(cls, parts: Sequence["Disks"]) -> "Disks":
         """Join instants of the same cameras."""
-        shown = [one.shown for one in parts if one.shown is not None]
         joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in BY_INSTANT}
-        return cls(share=parts[0].share, shown=torch.cat(shown) if shown else None, **joined)
+        return cls(share=parts[0].share, **joined)
 
 
 def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
     """Cut and normalise the disks of some frames (M,)."""
     size, count, cameras = settings.disk_px, len(frames), len(crops.views)
-    pictures = torch.zeros(count, cameras, size, size)
-    hidden = any(view.background.shown is not None for view in crops.views)
-    shown = torch.ones(count, cameras, size, size) if hidden else None
+    pictures, shown = torch.zeros(count, cameras, size, size), torch.ones(count, cameras, size, size)
     R, far = torch.empty(count, cameras, 3, 3).double(), torch.empty(count, cameras).double()
     X = crops.position_lab_mm[frames]
     for c, view in enumerate(crops.views):
@@ -293,7 +281,7 @@ def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
                 continue
             u, v, radius_px = float(middle[k, 0]), float(middle[k, 1]), float(limb[k])
             pictures[k, c] = torch.from_numpy(crop_disk(crop.grey, u - crop.left, v - crop.top, radius_px, size))
-            if shown is not None and view.background.shown is not None:
+            if view.background.shown is not None:
                 visible = crop_disk(view.background.shown.astype(np.uint8), u, v, radius_px, size)
                 shown[k, c] = torch.from_numpy(visible) > SHOWN_MIN
     return normalised_disks(pictures, R, far, crops.seen[frames], settings, shown)
@@ -313,11 +301,11 @@ def normalised_disks(
     size = pictures.shape[-1]
     share = rim_share(size)
     fine, wide = Blur(size, settings.detail), Blur(size, settings.window)
-    flat = pictures.reshape(-1, size, size).float()
-    if shown is not None:  # fill what is hidden with the ball's mean grey
+    flat, shown = pictures.reshape(-1, size, size).float(), torch.ones(pictures.shape) if shown is None else shown
+    if bool((shown < 1).any()):  # fill what is hidden with the ball's mean grey
         part = shown.reshape(-1, size, size)
-        inside = part * share
-        usual = (flat * inside).sum((1, 2), keepdim=True) / inside.sum((1, 2), keepdim=True).clamp_min(1e-6)
+        total = (part * share).sum((1, 2), keepdim=True).clamp_min(1e-6)
+        usual = (flat * (part * share)).sum((1, 2), keepdim=True) / total
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
@@ -348,9 +336,8 @@ def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
     It is each pixel's mean over the places of the ball that it has shown, as far as paint cannot explain it: the mean
     of n places keeps 1/n of the paint's power. Where paint explains all, the disks come back as they are.
     """
-    side = 2 * PLACES + 1
+    side, found = 2 * PLACES + 1, False
     grey = disks.layers[:, :, 0].flatten(2).clone()
-    found = False
     for c in range(grey.shape[1]):
         view = perspective_view(disks.size_px, float(disks.distance_radii[:, c].median()))
         inside, normal = view.inside.reshape(-1), view.normal_view.float()
@@ -371,12 +358,8 @@ def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
 
 def reduced(disks: Disks, factor: int) -> Disks:
     """Return the disks with pictures reduced by a whole factor."""
-    return replace(
-        disks,
-        layers=_with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)),
-        share=rim_share(disks.size_px // factor),
-        shown=None if disks.shown is None else F.avg_pool2d(disks.shown, factor),
-    )
+    layers, shown = _with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)), F.avg_pool2d(disks.shown, factor)
+    return replace(disks, layers=layers, share=rim_share(disks.size_px // factor), shown=shown)
 
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:

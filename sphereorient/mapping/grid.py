@@ -25,8 +25,7 @@ Array = NDArray[Any]
 def _spline_slope(place: Tensor) -> Tensor:
     t = place - place.floor()
     s = 1 - t
-    slopes = [-s * s, t * (3 * t - 4), s * (4 - 3 * s), t * t]
-    return torch.stack(slopes, dim=-1) / 2
+    return torch.stack([-s * s, t * (3 * t - 4), s * (4 - 3 * s), t * t], dim=-1) / 2
 
 
 def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
@@ -63,9 +62,8 @@ class SplineTable(TextureTable):
         by_row = ((found * along[..., None, :]).sum(-1) * _spline_slope(row)).sum(-1)
         level = latitude.cos().clamp_min(POLE)
         east = torch.stack([-longitude.sin(), longitude.cos(), torch.zeros_like(level)], dim=1)
-        north = torch.stack(
-            [-latitude.sin() * longitude.cos(), -latitude.sin() * longitude.sin(), latitude.cos()], dim=1
-        )
+        south = -latitude.sin()
+        north = torch.stack([south * longitude.cos(), south * longitude.sin(), latitude.cos()], dim=1)
         slope = (height / math.pi) * ((by_column / level)[:, None] * east - by_row[:, None] * north)
         return (found.flatten(-2) * weight).sum(-1), slope
 
@@ -101,11 +99,9 @@ def stiffness(height: int) -> csr_matrix:
     latitude = math.pi / 2 - step * (np.arange(height) + 0.5)
     along = np.repeat((1 / np.cos(latitude))[:, None], width, 1)  # (length dlat) / (distance dlon cos lat)
     between = np.cos(0.5 * (latitude[1:] + latitude[:-1]))  # (length dlon cos lat) / (distance dlat)
-    pairs = [
-        (number, np.roll(number, -1, 1), along),
-        (number[:-1], number[1:], np.repeat(between[:, None], width, 1)),
-    ]
-    a, b, w = (np.concatenate([np.ravel(pair[k]) for pair in pairs]) for k in range(3))
+    upwards = number[:-1], number[1:], np.repeat(between[:, None], width, 1)
+    pairs = zip((number, np.roll(number, -1, 1), along), upwards, strict=True)
+    a, b, w = (np.concatenate([part.ravel() for part in both]) for both in pairs)
     rows, columns = np.concatenate([a, b, a, b]), np.concatenate([a, b, b, a])
     return coo_matrix((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(number.size, number.size)).tocsr()
 
@@ -136,13 +132,17 @@ def map_sums(
     direction_body: Tensor, value: Tensor, weight: Tensor, height: int
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
     """Return a map's normal equations (T, T), (T,) from samples: directions (S, 3), values and weights (S,)."""
-    place, share = texel_weights(direction_body.double(), height)
-    texels = 2 * height * height
     root = weight.double().clamp_min(0).sqrt()
-    entries = (share * root[:, None]).reshape(-1).numpy()
-    start = np.arange(0, len(entries) + 1, READS)
-    reads = csr_matrix((entries, place.reshape(-1).numpy(), start), shape=(len(value), texels))
+    reads = _reading(direction_body.double(), root[:, None], height)
     return (reads.T @ reads).tocsr(), np.asarray(reads.T @ (root * value.double()).numpy())
+
+
+def _reading(direction_body: Tensor, factor: Tensor | float, height: int) -> csr_matrix:
+    """Return the matrix (M, T) from a map's coefficients to its values in directions (M, 3), times a factor (M, 1)."""
+    place, weight = texel_weights(direction_body, height)
+    start = np.arange(0, place.numel() + 1, READS)
+    entries = (weight * factor).reshape(-1).numpy(), place.reshape(-1).numpy(), start
+    return csr_matrix(entries, shape=(len(place), 2 * height * height))
 
 
 def solve_map(
@@ -187,12 +187,9 @@ def conjugate_gradients(
 def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_matrix:
     """Return the matrix (M, T) from a map's coefficients to its blurred values in directions (M, 3) float64."""
     right, up = tangents(direction_body)
-    start = np.arange(0, len(direction_body) * READS + 1, READS)
     total = csr_matrix((len(direction_body), 2 * height * height))
     for a, b, share in SQUARE_25:
-        place, weight = texel_weights(direction_body + blur_rad * (a * right + b * up), height)
-        entries = (share * weight).reshape(-1).numpy()
-        total = total + csr_matrix((entries, place.reshape(-1).numpy(), start), shape=total.shape)
+        total = total + _reading(direction_body + blur_rad * (a * right + b * up), share, height)
     return total
 
 

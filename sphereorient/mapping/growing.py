@@ -12,28 +12,17 @@ from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.follow.appearance import NO_BETTER, WIDER, Appearance
 from sphereorient.follow.fixed_centre import FixedCentre, centre_of
+from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import chained
 from sphereorient.mapping.disks import Crop, Crops, disks_of, evenly_spread, pixels_of
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.mapping.iterations import (
-    ROW,
-    SEPARATE_ITERATIONS,
-    State,
-    extended,
-    first_map,
-    first_state,
-    iterate,
-    iterating,
-    map_height,
-    optics_of,
-)
+from sphereorient.mapping.iterations import State
 from sphereorient.mapping.learn import final_map, interpolated
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import Optics
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.pixels import Pixels, stacked
-from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch
 from sphereorient.sphere.texture_table import texture_table
 
@@ -96,8 +85,8 @@ class GrowingMap:
     """
 
     def __init__(self, place: Crops, settings: MapSettings) -> None:
-        rows = round(COARSER * map_height(place.views, settings) / ROW) * ROW
-        self._height = settings.height or max(ROW, rows)
+        rows = round(COARSER * iterations.map_height(place.views, settings) / iterations.ROW) * iterations.ROW
+        self._height = settings.height or max(iterations.ROW, rows)
         pixels = min(settings.pixels, MOST_PIXELS)
         self._settings = settings.model_copy(update={"height": self._height, "pixels": pixels})
         self._place, self._crops = place, replace(place, position_lab_mm=place.position_lab_mm[:0])
@@ -165,9 +154,7 @@ class GrowingMap:
         return found if found is not None and found.trusted else None
 
     def iterate(self, *, size: bool = False) -> None:
-        """Improve map, orientations and light once, with all frames; `size`: and the distance of the ball, which takes
-        three times as long.
-        """
+        """Improve map, orientations and light once; `size`: and the ball's distance, in three times as long."""
         for _ in self._iteration(size=size):
             pass
 
@@ -179,7 +166,11 @@ class GrowingMap:
             settings = settings.model_copy(update={"blur_px": state.blur_px})
         if size and state.use.shape[1] == 1:
             state = _better_size(state, settings)
-        after, iteration = yield from iterating(state, settings, SEPARATE_ITERATIONS + min(k, LATER))
+        for found in iterations.iterating(state, settings, iterations.SEPARATE_ITERATIONS + min(k, LATER)):
+            if found is None:
+                yield
+        assert found is not None
+        after, iteration = found
         if k < HELD_ITERATIONS:
             after = replace(after, position_lab_mm=state.position_lab_mm)
         R_map_body = torch.eye(3, dtype=torch.float64) if self._learnt is None else self._learnt.R_map_body
@@ -204,13 +195,12 @@ class GrowingMap:
         rows = evenly_spread(torch.arange(learnt.shown, len(self)), MOST_NEW)
         fitter, level, R_aligned = appearance.fitter, appearance.fitter.optics.fine, self._R_aligned(learnt)[rows]
         new = self._of(rows, R_aligned, learnt.state)
-        held = self._found.centre.precision.expand(len(rows), 3, 3)
-        fit = fitter.fit(new.pixels, PoseStart(new.position_lab_mm, R_aligned, new.use, held), level, FITTED)
+        fit = fitter.fit(new.pixels, new.start(self._found.centre.precision), level, FITTED)
         good = ((fit.score > appearance.score_min) | ~new.use).all(1)
         new = replace(new, R_lab_body=torch.where(good[:, None, None], fit.R_lab_body, R_aligned))
         self._learnt = replace(
             learnt,
-            state=extended(learnt.state, new, learnt.tie, level.paint.unseen),
+            state=iterations.extended(learnt.state, new, learnt.tie, level.paint.unseen),
             shown=len(self),
             rows=torch.cat([learnt.rows, rows[good]]),
             R_lab_map=torch.cat([learnt.R_lab_map, fit.R_lab_body[good]]),
@@ -220,8 +210,8 @@ class GrowingMap:
         rows, learnt = evenly_spread(torch.arange(len(self)), MOST_FITTED), self._learnt
         if learnt is None:
             disks = disks_of(self._crops, rows, self._settings)
-            first = first_map(disks, self._R[rows], self._height)
-            state = first_state(self._crops, rows, self._R[rows], first, self._settings)
+            first = iterations.first_map(disks, self._R[rows], self._height)
+            state = iterations.first_state(self._crops, rows, self._R[rows], first, self._settings)
             return self._of(rows, self._R[rows], state)
         R = interpolated(self._R_aligned(learnt), learnt.rows, learnt.R_lab_map)
         return self._of(rows, R[rows], learnt.state)
@@ -277,9 +267,7 @@ class GrowingMap:
         return self._found
 
     def paint(self) -> tuple[Tensor, Tensor]:
-        """Return the map without the blur of the pictures, NaN where unknown, and its counts, (H, 2 H) each, in the
-        body frame of the orientations handed over.
-        """
+        """Return the map without blur, NaN where unknown, and its counts, (H, 2 H), in the handed body frame."""
         assert self._learnt is not None
         texture, seen, _ = final_map(self._learnt.state, self._learnt.R_map_body.mT)
         return texture, seen
@@ -290,11 +278,8 @@ def _better_size(state: State, settings: MapSettings) -> State:
     leave least: an outline that is too large by one part in a hundred makes all turns too small by that.
     """
     tried = [_at_distance(state, 1 + k * SIZE_STEP) for k in (-1, 0, 1)]
-    held = [replace(iterate(one, settings, TRIED)[0], position_lab_mm=one.position_lab_mm) for one in tried]
-    low, here, high = (_left(one) for one in held)
-    bend = low - 2 * here + high
-    shift = 0.5 * (low - high) / bend if bend > 0 else (1.0 if high < low else -1.0)
-    return _at_distance(state, 1 + SIZE_STEP * min(max(shift, -1.0), 1.0))
+    held = [replace(iterations.iterate(one, settings, TRIED)[0], position_lab_mm=one.position_lab_mm) for one in tried]
+    return _at_distance(state, 1 + SIZE_STEP * iterations.lowest(*(_left(one) for one in held)))
 
 
 def _at_distance(state: State, factor: float) -> State:
@@ -307,29 +292,27 @@ def _at_distance(state: State, factor: float) -> State:
 
 def _left(state: State) -> float:
     """Return the mean square, grey levels, that light and map leave."""
-    seen, squares = zip(
-        *((at.weight > 0, at.residual.square().clamp_max(MOST_LEFT**2)) for at in state.linearised()), strict=True
-    )
-    return float((torch.cat(squares) * torch.cat(seen)).sum() / torch.cat(seen).sum())
+    parts = [(at.weight > 0, at.residual.square().clamp_max(MOST_LEFT**2)) for at in state.linearised()]
+    seen, squares = (torch.cat(part) for part in zip(*parts, strict=True))
+    return float((squares * seen).sum() / seen.sum())
 
 
 def _optics(state: State) -> tuple[Optics, float]:
     """Return the optics of the map, whose texels that no picture shows well are unseen, and the share of the others."""
     assert state.weight is not None
     unseen = state.weight < LEAST_WEIGHT * state.weight[state.weight > 0].median()
-    optics, areas = optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE), texel_areas(len(unseen))
+    optics = iterations.optics_of(state.texture, state.fitter.views, state.blur_px, TABLE_SIDE)
+    areas = texel_areas(len(unseen))
     if bool(unseen.any()):
         optics.fine.paint.unseen = texture_table(unseen.float(), optics.fine.paint.blur_rad, UNSEEN_SIDE)
     return optics, float((areas * ~unseen).sum() / areas.sum())
 
 
 def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool]:
-    """Return the appearance of the ball and its centre by a fit of the map's pictures, and whether the map is trusted:
-    explains them clearly better than at wrong orientations.
-    """
+    """Return the ball's appearance and centre by a fit of the map's pictures, and whether the map is trusted."""
     fitter = replace(state.fitter, optics=optics)
     X, use = state.position_lab_mm, state.use
-    fit = fitter.fit(state.pixels, PoseStart(X, state.R_lab_body, use), optics.fine, FITTED)
+    fit = fitter.fit(state.pixels, state.start(), optics.fine, FITTED)
     fitter = replace(fitter, widest_px=WIDER * float(fitter.disks_px(X).largest_px.max()))
     right, wrong = float(fit.score[use].median()), _wrong_score(fitter, state)
     appearance = Appearance(
@@ -344,9 +327,8 @@ def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool
 
 def _wrong_score(fitter: Fitter, state: State) -> float:
     """Return the score that wrong orientations reach in one picture of ten."""
-    rows = evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES)
-    turns = so3.random_rotations(len(rows), generator=torch.Generator().manual_seed(0))
-    fine = fitter.optics.fine
-    begin = PoseStart(state.position_lab_mm[rows], turns, state.use[rows])
-    fit = fitter.fit(state.disks(rows), begin, fine, WRONG_ITERATIONS)
-    return float(fit.score[state.use[rows]].quantile(0.9))
+    some = state.where(evenly_spread(torch.arange(len(state.use)), WRONG_FRAMES).repeat(WRONG_POSES))
+    turns = so3.random_rotations(len(some.use), generator=torch.Generator().manual_seed(0))
+    begin = replace(some, R_lab_body=turns).start()
+    fit = fitter.fit(some.pixels, begin, fitter.optics.fine, WRONG_ITERATIONS)
+    return float(fit.score[some.use].quantile(0.9))

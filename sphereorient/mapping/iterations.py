@@ -1,7 +1,7 @@
 """The iterations of mapping: orientations, light and map in turn, and then poses and map together."""
 
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,23 +13,11 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
+from sphereorient.mapping import grid
 from sphereorient.mapping.compare import fit_levels
 from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
-from sphereorient.mapping.grid import (
-    ROUGH_SIDE,
-    NormalMatrix,
-    SplineTable,
-    coefficients_blur_rad,
-    map_sums,
-    map_table,
-    paint_tie,
-    sharpened,
-    solve_map,
-    stiffness,
-    texel_areas,
-    texel_sums,
-)
-from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, linear_system, linearise
+from sphereorient.mapping.grid import NormalMatrix, SplineTable
+from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics, widest_px
@@ -101,36 +89,37 @@ class State:
     @property
     def tie(self) -> float:
         """The weight of the map's squared slope while poses are sought."""
-        return (LOOSE if self.expected is None else 1.0) * paint_tie(self.texture, self.blur_rad)
+        return (LOOSE if self.expected is None else 1.0) * grid.paint_tie(self.texture, self.blur_rad)
 
     def map_fitter(self) -> Fitter:
         """Return the fitter of poses to the present map."""
         return replace(self.fitter, optics=optics_of(self.texture, self.fitter.views, self.blur_px))
 
-    def batches(self) -> Iterator[tuple[Tensor, Pixels]]:
-        """Yield rows of instants and their pixels, some at a time."""
-        for rows in torch.split(torch.arange(len(self.use)), BATCH):
-            yield rows, self.disks(rows)
+    def batches(self) -> "Iterator[State]":
+        """Yield the instants, some at a time."""
+        return (self.where(rows) for rows in torch.split(torch.arange(len(self.use)), BATCH))
 
-    def disks(self, rows: Tensor) -> Pixels:
-        """Return the pixels of some instants."""
-        cameras = self.use.shape[1]
-        return self.pixels.where((cameras * rows[:, None] + torch.arange(cameras)).reshape(-1))
+    def where(self, rows: Tensor) -> "State":
+        """Return some instants."""
+        parts = {name: getattr(self, name)[rows] for name in ("frames", "use", "position_lab_mm", "R_lab_body")}
+        cameras = torch.arange(self.use.shape[1])
+        pixels = self.pixels.where((len(cameras) * rows[:, None] + cameras).reshape(-1))
+        return replace(self, pixels=pixels, **parts)
 
-    def where(self, rows: Tensor, use: Tensor) -> "State":
-        """Return some instants, seen as in `use` (n, C)."""
-        frames, X, R = self.frames[rows], self.position_lab_mm[rows], self.R_lab_body[rows]
-        return replace(self, frames=frames, pixels=self.disks(rows), use=use[rows], position_lab_mm=X, R_lab_body=R)
+    def start(self, precision: Tensor | None = None, held: bool = False) -> PoseStart:
+        """Return the poses as the start of a fit; `precision` (3, 3): of all positions, 1/mm^2."""
+        known = None if precision is None else precision.expand(len(self.use), 3, 3)
+        return PoseStart(self.position_lab_mm, self.R_lab_body, self.use, known, held=held)
 
     def linearised(self) -> Iterator[Linearisation]:
-        """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
-        return side_by_side(lambda batch: self.linearised_at(*batch, self.blur_px), self.batches())
+        """Yield the linearisation of all disks in batches."""
+        return side_by_side(lambda some: some.linearised_at(), self.batches())
 
-    def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
-        """Linearise the disks of some instants for the blur `blur_px`."""
-        X, R = self.position_lab_mm[rows], self.R_lab_body[rows]
-        at = linearise(self.fitter, SplineTable(self.texture, 0.0), pixels, X, R, blur_px)
-        return replace(at, weight=at.weight * self.use[rows].reshape(-1, 1))
+    def linearised_at(self) -> Linearisation:
+        """Linearise all disks at once; unseen ones have weight 0."""
+        X, R, paint = self.position_lab_mm, self.R_lab_body, SplineTable(self.texture, 0.0)
+        at = linearise(self.fitter, paint, self.pixels, X, R, self.blur_px)
+        return replace(at, weight=at.weight * self.use.reshape(-1, 1))
 
 
 def map_height(views: Sequence[CameraView], settings: MapSettings) -> int:
@@ -148,9 +137,9 @@ def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
     for c in range(disks.layers.shape[1]):
         normal, grey, weight = disks.sampled(slice(None), c, slant_power=2)
         body = (R_lab_body.mT.float() @ (disks.R_lab_view[:, c] @ normal)).mT
-        more, sums = map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
+        more, sums = grid.map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
         matrix, right = matrix + more, right + sums
-    even = solve_map(matrix, right, height, FIRST_SMOOTH * _typical(matrix.diagonal()))
+    even = grid.solve_map(matrix, right, height, FIRST_SMOOTH * _typical(matrix.diagonal()))
     return (0.5 + CONTRAST * even / even.std()).clamp(0, 1).float()
 
 
@@ -159,7 +148,7 @@ def first_state(
 ) -> State:
     """Return the initial state from orientations (n, 3, 3) of frames (n,) and a map; `extra_px`: added blur."""
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
-    table = optics_of(texture, crops.views, blur_px, ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
+    table = optics_of(texture, crops.views, blur_px, grid.ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
     fitter = first_fitter(crops.views, crops.radius_mm, table, blur_px)
     pixels, use = pixels_of(crops, fitter, frames, settings.pixels, extra_px), crops.seen[frames]
     X = crops.position_lab_mm[frames]
@@ -169,16 +158,13 @@ def first_state(
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
     """Improve orientations, light and map once; k counts the iterations from 0."""
-    steps = iterating(state, settings, k)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value[0], end.value[1]
+    *_, found = iterating(state, settings, k)
+    assert found is not None
+    return found
 
 
-def iterating(state: State, settings: MapSettings, k: int) -> Generator[None, None, tuple[State, Iteration]]:
-    """Do what `iterate` does, and return the same, with pauses in which something else may be computed."""
+def iterating(state: State, settings: MapSettings, k: int) -> Iterator[tuple[State, Iteration] | None]:
+    """Yield what `iterate` returns, after pauses (None) in which something else may be computed."""
     before = state.R_lab_body
     smoothest = SMOOTHEST * 0.5**k
     if k < SEPARATE_ITERATIONS:
@@ -187,23 +173,24 @@ def iterating(state: State, settings: MapSettings, k: int) -> Generator[None, No
         state = _with_light(state)
     elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and not state.fitter.light.linear):
         state = _lit_in_the_lab(state)
-    yield
+    yield None
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smoothest)
-        yield
+        yield None
     state, chi2 = with_map(state, smoothest)
     if k < LIGHT_ITERATIONS + LAB_ITERATIONS:
         state = _rescaled(state)
-    yield
+    yield None
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
         state = replace(state, blur_px=_better_blur(state))
-    return state, Iteration(moved_rad=attitude_change_rad(before, state.R_lab_body), misfit=chi2, blur_px=state.blur_px)
+    moved_rad = attitude_change_rad(before, state.R_lab_body)
+    yield state, Iteration(moved_rad=moved_rad, misfit=chi2, blur_px=state.blur_px)
 
 
 def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float, side: int = SIDE) -> Optics:
     """Return the optics of a map (H, 2 H) that has the blur of the pictures; `side` counts cells of its table."""
     widest = widest_px(views)
-    return Optics(map_table(blurred, 2 * blur_px / widest, side), blur_px, widest)
+    return Optics(grid.map_table(blurred, 2 * blur_px / widest, side), blur_px, widest)
 
 
 def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[State, FittedPoses]:
@@ -212,13 +199,11 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
     fine = fitter.optics.fine
     held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed and crops is not None else None
 
-    def one(batch: tuple[Tensor, Pixels]) -> FittedPoses:
-        rows, pixels = batch
-        X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
+    def one(some: State) -> FittedPoses:
+        pixels = some.pixels
         if crops is not None:
-            pixels = fitter.pixels(crops.pictures(state.frames[rows]), X, fine)
-        precision = None if held is None else held.expand(len(rows), 3, 3)
-        return fitter.fit(pixels, PoseStart(X, R, use, precision), fine, iterations)
+            pixels = fitter.pixels(crops.pictures(some.frames), some.position_lab_mm, fine)
+        return fitter.fit(pixels, some.start(held), fine, iterations)
 
     parts = list(side_by_side(one, state.batches()))
     fit = FittedPoses(**{name: torch.cat([getattr(part, name) for part in parts]) for name in POSE_PARTS})
@@ -234,11 +219,12 @@ def _with_light(state: State) -> State:
     right = torch.zeros(cameras, 2 * basis, dtype=torch.float64)
     greys: list[tuple[Tensor, ...]] = []
     some = slice(None, None, NOISE_EVERY)
-    for (rows, pixels), at in zip(state.batches(), state.linearised(), strict=True):
+    for batch, at in zip(state.batches(), state.linearised(), strict=True):
+        pixels = batch.pixels
         more_normal, more_right = light_sums(light_columns(at.view), at.view, pixels, at.precision)
         normal += more_normal.reshape(-1, cameras, *normal.shape[1:]).sum(0)
         right += more_right.reshape(-1, cameras, 2 * basis).sum(0)
-        inside = pixels.inside & ~pixels.clipped & state.use[rows].reshape(-1, 1)
+        inside = pixels.inside & ~pixels.clipped & batch.use.reshape(-1, 1)
         greys.append(tuple(part[:, some] for part in (pixels.grey - at.residual, at.residual, inside)))
     difference, black = solved_light(normal, right).chunk(2, dim=-1)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
@@ -250,22 +236,19 @@ def _with_light(state: State) -> State:
 
 def _lit_in_the_lab(state: State) -> State:
     """Return the state with one light in the lab for all cameras, where that explains held-out instants better."""
-    rows = evenly_spread(torch.arange(len(state.use)), LAB_FRAMES)
-    fitter = state.map_fitter()
-    X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
-    pixels = state.disks(rows)
-    fit = fitter.fit(pixels, PoseStart(X, R, use), fitter.optics.fine, 1)
+    some, fitter = state.where(evenly_spread(torch.arange(len(state.use)), LAB_FRAMES)), state.map_fitter()
+    fit = fitter.fit(some.pixels, some.start(), fitter.optics.fine, 1)
     if fitter.light.linear:
-        lit = lit_in_the_lab(fitter, pixels, fit, use)[0]
+        lit = lit_in_the_lab(fitter, some.pixels, fit, some.use)[0]
     else:  # known to be better
-        lit = fitter.with_light_of(pixels, fit, use)
+        lit = fitter.with_light_of(some.pixels, fit, some.use)
     return replace(state, fitter=replace(state.fitter, light=lit.light))
 
 
 def _rescaled(state: State) -> State:
     """Scale the map to black 0 and white 1: pictures alone do not separate a dark light from a dark map."""
     values, order = state.texture.reshape(-1).sort()
-    share = texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
+    share = grid.texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
     light = state.fitter.light
@@ -276,46 +259,39 @@ def _rescaled(state: State) -> State:
 
 def _better_blur(state: State) -> float:
     """Return the blur, px, near the present one with which limb and slanted texture fit best."""
-    rows = evenly_spread(torch.arange(len(state.use)), BLUR_FRAMES)
-    pixels = state.disks(rows)
-    expected = state.linearised_at(rows, pixels, state.blur_px)
-    chi2 = []
-    for k in (-1, 0, 1):
-        at = state.linearised_at(rows, pixels, state.blur_px * BLUR_RATIO**k)
-        chi2.append(float((expected.weight * (at.residual.square() / expected.variance).clamp_max(OUTLIER2)).sum()))
-    bend = chi2[0] - 2 * chi2[1] + chi2[2]
-    shift = 0.5 * (chi2[0] - chi2[2]) / bend if bend > 0 else (1.0 if chi2[2] < chi2[0] else -1.0)
-    best = float(state.blur_px * BLUR_RATIO ** min(max(shift, -1.0), 1.0))
-    return min(max(best, BLUR_PX[0]), BLUR_PX[1])
+    some = state.where(evenly_spread(torch.arange(len(state.use)), BLUR_FRAMES))
+    expected = some.linearised_at()
+    tried = (replace(some, blur_px=some.blur_px * BLUR_RATIO**k).linearised_at() for k in (-1, 0, 1))
+    squares = ((at.residual.square() / expected.variance).clamp_max(OUTLIER2) for at in tried)
+    step = lowest(*(float((expected.weight * each).sum()) for each in squares))
+    return float(np.clip(state.blur_px * BLUR_RATIO**step, *BLUR_PX))
+
+
+def lowest(before: float, here: float, after: float) -> float:
+    """Return where a parabola through values at -1, 0 and 1 is lowest, within these."""
+    bend = before - 2 * here + after
+    shift = 0.5 * (before - after) / bend if bend > 0 else (1.0 if after < before else -1.0)
+    return min(max(shift, -1.0), 1.0)
 
 
 def _with_joint_step(state: State, smoothest: float) -> State:
     """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
-
-    def system(batch: tuple[Tensor, Pixels]) -> LinearSystem:
-        return linear_system(state.linearised_at(*batch, state.blur_px), height)
-
-    parts = list(side_by_side(system, state.batches()))
-    weight = sum((texel_sums(part.by_texel) for part in parts), np.zeros(2 * height * height))
+    parts = list(side_by_side(lambda some: linear_system(some.linearised_at(), height), state.batches()))
+    weight = sum((grid.texel_sums(part.by_texel) for part in parts), np.zeros(2 * height * height))
     tie = max(smoothest * _typical(weight), state.tie)
     pose = joint_step(parts, state.use, _unexpected(state), tie, state.fitter.radius_mm, state.fixed)
     pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
-    return replace(
-        state,
-        position_lab_mm=state.position_lab_mm + pose[:, 3:],
-        R_lab_body=so3.nearest_rotation(so3.exp(pose[:, :3]) @ state.R_lab_body),
-    )
+    R = so3.nearest_rotation(so3.exp(pose[:, :3]) @ state.R_lab_body)
+    return replace(state, position_lab_mm=state.position_lab_mm + pose[:, 3:], R_lab_body=R)
 
 
 def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
-    """Return the state with its best map at the present poses, and chi2 per pixel before.
-    `smoothest`: least weight of its squared slope, over that of a typical texel.
-    """
+    """Return the state with its best map, and chi2 per pixel before; `smoothest`: least tie over a typical texel's."""
     normal, right, chi2 = _map_equations(state)
     tie = max(smoothest * _typical(normal.diagonal()), state.tie)
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
-    right -= tie * (stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
+    right -= tie * (grid.stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
     return _changed(state, normal, right, tie), chi2
 
 
@@ -340,7 +316,7 @@ def extended(state: State, new: State, tie: float, unseen: TextureTable | None) 
 def _changed(state: State, normal: NormalMatrix, right: NDArray[np.float64], tie: float) -> State:
     """Return the state with the change of its map that solves normal equations (T, T), (T,)."""
     height = len(state.texture)
-    texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
+    texture = state.texture + grid.solve_map(normal, right, height, tie, MAP_STEPS).float()
     weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight)
 
@@ -349,12 +325,12 @@ def sharp_map(state: State) -> Tensor:
     """Return the paint without the blur of the pictures, (H, 2 H) float64."""
     normal, right, _ = _map_equations(state)
     right += normal @ state.texture.double().numpy().ravel()
-    tie = paint_tie(state.texture, state.blur_rad)
+    tie = grid.paint_tie(state.texture, state.blur_rad)
     expected = torch.zeros_like(state.texture)
     if state.expected is not None:
         _, (gain, offset) = _as_filmed(state, state.expected)
         expected = gain * state.expected + offset
-    return sharpened(normal, right, state.blur_rad, tie, expected)
+    return grid.sharpened(normal, right, state.blur_rad, tie, expected)
 
 
 def _unexpected(state: State) -> Tensor:
@@ -368,7 +344,7 @@ def _unexpected(state: State) -> Tensor:
 def _as_filmed(state: State, paint: Tensor) -> tuple[Tensor, tuple[float, float]]:
     """Return the coefficients of paint (H, 2 H) as the pictures blur it, and gain and offset to the state's map."""
     height = len(paint)
-    table = texture_table(paint, coefficients_blur_rad(state.blur_rad, height))
+    table = texture_table(paint, grid.coefficients_blur_rad(state.blur_rad, height))
     filmed = table.sample(map_directions(height).reshape(-1, 3).float().T[None])[0].reshape(paint.shape)
     return filmed, fit_levels(filmed, state.texture)
 
@@ -389,7 +365,7 @@ def _map_equations(state: State) -> tuple[NormalMatrix, NDArray[np.float64], flo
 def map_weight(state: State) -> Tensor:
     """Return the sum of the pixels' weights at each texel, (H, 2 H) float64: its inverse variance by noise."""
     height = len(state.texture)
-    total = sum((texel_sums(at.by_texel(height)) for at in state.linearised()), np.zeros(2 * height * height))
+    total = sum((grid.texel_sums(at.by_texel(height)) for at in state.linearised()), np.zeros(2 * height * height))
     return torch.from_numpy(total.reshape(height, -1))
 
 

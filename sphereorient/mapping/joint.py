@@ -94,11 +94,8 @@ def linear_system(at: Linearisation, height: int) -> LinearSystem:
     gram = rows @ rows.mT + RIDGE * torch.eye(rows.shape[1], dtype=rows.dtype)
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
     # Near the limb the map is not learnt; it must not move the pose there.
-    by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over)
-    residual = at.residual * root
-    return LinearSystem(
-        by_texel=at.by_texel(height), by_pose=by_pose * root[:, None], by_light=basis, residual=residual
-    )
+    by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over) * root[:, None]
+    return LinearSystem(by_texel=at.by_texel(height), by_pose=by_pose, by_light=basis, residual=at.residual * root)
 
 
 def joint_step(
@@ -170,10 +167,4 @@ def _inverse_blocks(blocks: Tensor, damp: Tensor, fixed: bool) -> Callable[[Tens
         return lambda pose: (inverse @ pose[..., None])[..., 0]
     turns = torch.linalg.inv(blocks[:, :3, :3].double()).float()
     move = torch.linalg.inv(blocks[:, 3:, 3:].sum(0).double()).float()
-    count = len(blocks)
-
-    def solve(pose: Tensor) -> Tensor:
-        turned = (turns @ pose[:-3].reshape(count, 3, 1)).reshape(-1)
-        return torch.cat([turned, move @ pose[-3:]])
-
-    return solve
+    return lambda pose: torch.cat([(turns @ pose[:-3].reshape(-1, 3, 1)).reshape(-1), move @ pose[-3:]])

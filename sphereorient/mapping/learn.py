@@ -8,39 +8,28 @@ from pathlib import Path
 import h5py
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.experiment.recording import Progress
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
 from sphereorient.files.whole_file import writing
+from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
-from sphereorient.mapping.compare import compare_maps, turned_map
-from sphereorient.mapping.disks import Crops, Disks, disks_of, evenly_spread
+from sphereorient.mapping.compare import compare_maps, turned_map, weighted_correlation
+from sphereorient.mapping.disks import Crops, Disks, disks_of, evenly_spread, normalised_disks
 from sphereorient.mapping.grid import look_up, texel_areas
-from sphereorient.mapping.iterations import (
-    LAB_ITERATIONS,
-    LIGHT_ITERATIONS,
-    ROW,
-    Iteration,
-    State,
-    first_map,
-    first_state,
-    fitted,
-    iterate,
-    map_height,
-    map_weight,
-    sharp_map,
-)
+from sphereorient.mapping.iterations import Iteration, State
 from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses
 from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.view import perspective_view
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
 SHOWN_MIN = 0.4
@@ -55,6 +44,11 @@ PIXELS_A_TEXEL = 3.0
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
+HELD_EVERY = 5  # instants; the map of the others is compared with this one
+SEEN_MIN = 0.99  # share of a pixel on texels that other pictures show, below which it is not compared
+HELD_ITERATIONS = 2  # of the held poses with that map
+JUMP_RAD, JUMPS = math.radians(3.0), 10.0  # rotations so far off their neighbours', and so many times the usual
+WINDOW = 5  # rotations whose median is usual
 SCHEMA = "sphereorient-unfinished-map/1"  # of the file of an unfinished map
 STATE_PARTS = ("position_lab_mm", "R_lab_body", "texture")  # kept
 
@@ -95,11 +89,7 @@ def fit_map(
     """Learn the texture map, all orientations and the light from the crops of opened movies.
     `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
     `old`: a map (h, 2 h) of the ball as it was, which noise does not change; the body frame is not that of it.
-
-    Raises:
-        PaintError: too few frames, no rotation, no common patch, or different spheres.
-        OutputError: `kept` cannot be written.
-
+    Raises PaintError (too few frames, no rotation, no common patch, or different spheres), OutputError (for `kept`).
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
     before = None if kept is None else read_kept(kept)
@@ -110,23 +100,24 @@ def fit_map(
         start, state, done = _resumed(crops, before, settings)
     chain = start.chain.R_lab_body[start.rows]
     arrived_rad = math.radians(settings.arrived_deg)
-    while len(done) < settings.rounds and not (len(done) > LIGHT_ITERATIONS and done[-1].moved_rad < arrived_rad):
+    least = iterations.LIGHT_ITERATIONS
+    while len(done) < settings.rounds and not (len(done) > least and done[-1].moved_rad < arrived_rad):
         if kept is not None:
             write_kept(kept, _parts(start, state, done))
         progress("map", len(done), settings.rounds)
-        state, iteration = iterate(state, settings, len(done))
+        state, iteration = iterations.iterate(state, settings, len(done))
         if len(done) in RECOVERY_AFTER:
             state = recovered(start.crops, state, chain)
         done.append(iteration)
     progress("map", settings.rounds, settings.rounds)
     if old is not None:
-        R_now_old = compare_maps(sharp_map(state).float(), old).R_other_reference
+        R_now_old = compare_maps(iterations.sharp_map(state).float(), old).R_other_reference
         state = replace(state, expected=turned_map(old.float(), R_now_old.mT, len(state.texture)))
         for k in range(settings.rounds):
             progress("map, with the old one", k, settings.rounds)
-            state, iteration = iterate(state, settings, LIGHT_ITERATIONS + k)
+            state, iteration = iterations.iterate(state, settings, least + k)
             done.append(iteration)
-            if k >= LAB_ITERATIONS and iteration.moved_rad < arrived_rad:
+            if k >= iterations.LAB_ITERATIONS and iteration.moved_rad < arrived_rad:
                 break
         progress("map, with the old one", settings.rounds, settings.rounds)
     return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
@@ -144,8 +135,8 @@ class _Start:
 def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
     """Return what `_resumed` needs beside the crops."""
     chain, light = start.chain, state.fitter.light
-    closure, iterations = astuple(chain.closure), [astuple(one) for one in done]
-    numbers = {"closure": closure, "blur_px": state.blur_px, "done": iterations}
+    closure, rounds = astuple(chain.closure), [astuple(one) for one in done]
+    numbers = {"closure": closure, "blur_px": state.blur_px, "done": rounds}
     parts = {"place": start.crops.position_lab_mm, "frames": start.frames, "rows": start.rows, "known": light.known}
     parts |= {"chain_rows": chain.rows, "chain": chain.R_lab_body, "first_map": start.state.texture}
     parts |= {name: getattr(state, name) for name in STATE_PARTS} | light.parts()
@@ -161,7 +152,7 @@ def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tu
     closure = Closure(**dict(zip(Closure.__dataclass_fields__, [*map(int, counts), before, after, moved], strict=True)))
     chain = PairwiseAttitudes(rows=kept["chain_rows"], R_lab_body=kept["chain"], closure=closure)
     few = _settings_of_few(settings, crops, frames) if settings.unordered else settings
-    first = first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
+    first = iterations.first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
     fitter = replace(first.fitter, light=light_of(kept, bool(kept["known"])))
     X, R, texture = (kept[name] for name in STATE_PARTS)
     state = replace(first, position_lab_mm=X, R_lab_body=R, texture=texture, fitter=fitter)
@@ -178,7 +169,7 @@ def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -
     state = start.state
     for k in range(POSITION_ITERATIONS):
         progress("place", k, POSITION_ITERATIONS)
-        state, _ = iterate(state, settings, k)
+        state, _ = iterations.iterate(state, settings, k)
     progress("place", POSITION_ITERATIONS, POSITION_ITERATIONS)
     known = torch.isfinite(crops.position_lab_mm).all(1)[:, None]
     X = torch.where(known, state.position_lab_mm[0], torch.nan)
@@ -192,8 +183,8 @@ def _from_chain(crops: Crops, settings: MapSettings, progress: Progress) -> _Sta
     disks = disks_of(crops, frames, settings)
     chain = find_chain(disks, settings)
     progress("chain", 1, 1)
-    first = first_map(disks, chain.R_lab_body, map_height(crops.views, settings))
-    state = first_state(crops, frames[rows], chain.R_lab_body[rows], first, settings)
+    first = iterations.first_map(disks, chain.R_lab_body, iterations.map_height(crops.views, settings))
+    state = iterations.first_state(crops, frames[rows], chain.R_lab_body[rows], first, settings)
     return _Start(crops=crops, frames=frames, rows=rows, chain=chain, state=state)
 
 
@@ -208,8 +199,8 @@ def _start_from_photographs(crops: Crops, settings: MapSettings, progress: Progr
     few = _settings_of_few(settings, crops, frames)
     R, X = _coarse(crops, frames, disks, chain.R_lab_body, few, progress)
     crops = replace(crops, position_lab_mm=crops.position_lab_mm.index_put((frames,), X))
-    first = first_map(disks, R, map_height(crops.views, few))
-    rows, state = torch.arange(len(frames)), first_state(crops, frames, R, first, few)
+    first = iterations.first_map(disks, R, iterations.map_height(crops.views, few))
+    rows, state = torch.arange(len(frames)), iterations.first_state(crops, frames, R, first, few)
     return _Start(crops=crops, frames=frames, rows=rows, chain=replace(chain, R_lab_body=R), state=state)
 
 
@@ -218,8 +209,8 @@ def _settings_of_few(settings: MapSettings, crops: Crops, frames: Tensor) -> Map
     disks = int(crops.seen[frames].sum())
     pixels = max(settings.pixels, FEW_PIXELS // disks)
     seen = disks * min(pixels, math.pi / 4 * widest_px(crops.views) ** 2)
-    rows = int(math.sqrt(seen / PIXELS_A_TEXEL / 2)) // ROW * ROW
-    height = settings.height or min(map_height(crops.views, settings), max(ROW, rows))
+    rows = int(math.sqrt(seen / PIXELS_A_TEXEL / 2)) // iterations.ROW * iterations.ROW
+    height = settings.height or min(iterations.map_height(crops.views, settings), max(iterations.ROW, rows))
     return settings.model_copy(update={"pixels": pixels, "height": height})
 
 
@@ -229,22 +220,23 @@ def _coarse(
     """Return orientations (M, 3, 3) and positions (M, 3), mm, refined in blurred pictures."""
     extra_px = COARSE * widest_px(crops.views) / 2
     whole_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
-    rows = max(ROW, map_height(crops.views, settings) // 2)
+    rows = max(iterations.ROW, iterations.map_height(crops.views, settings) // 2)
     coarse = settings.model_copy(update={"blur_px": whole_px, "height": rows})
-    state = first_state(crops, frames, R_lab_body, first_map(disks, R_lab_body, rows), settings, extra_px)
+    first = iterations.first_map(disks, R_lab_body, rows)
+    state = iterations.first_state(crops, frames, R_lab_body, first, settings, extra_px)
     for k in range(COARSE_ITERATIONS):
         progress("coarse map", k, COARSE_ITERATIONS)
-        state, _ = iterate(state, coarse, k)
+        state, _ = iterations.iterate(state, coarse, k)
     progress("coarse map", COARSE_ITERATIONS, COARSE_ITERATIONS)
     return state.R_lab_body, state.position_lab_mm
 
 
 def _finished(
-    start: _Start, state: State, settings: MapSettings, iterations: tuple[Iteration, ...], arrived: bool
+    start: _Start, state: State, settings: MapSettings, done: tuple[Iteration, ...], arrived: bool
 ) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
-    state, fit = fitted(state, POSE_ITERATIONS, crops)
+    state, fit = iterations.fitted(state, POSE_ITERATIONS, crops)
     state = replace(state, R_lab_body=so3.nearest_rotation(state.R_lab_body))
     all_R = interpolated(chain.R_lab_body, rows, state.R_lab_body)
     Q = all_R[0].clone()  # R_new = R Q^T, and new directions are Q times the old
@@ -272,7 +264,7 @@ def _finished(
         light=state.fitter.light,
         blur_px=state.blur_px,
         closure=chain.closure,
-        rounds=iterations,
+        rounds=done,
         arrived=arrived,
     )
 
@@ -292,21 +284,19 @@ def interpolated(chain: Tensor, rows: Tensor, known: Tensor) -> Tensor:
 
 def recovered(crops: Crops, state: State, chain: Tensor) -> State:
     """Restart instants that do not fit from the chain (n, 3, 3), corrected like their neighbours."""
-    score = _scores(fitted(state, 1)[1], state.use)
+    score = _scores(iterations.fitted(state, 1)[1], state.use)
     good = score >= GOOD_SHARE * score.nanmedian()
     if good.all() or not good.any():
         return state
     lost = torch.nonzero(~good)[:, 0]
     R = interpolated(chain, torch.nonzero(good)[:, 0], state.R_lab_body[good])[lost]
-    X, use = state.position_lab_mm[lost], state.use[lost]
-    fitter = state.map_fitter()
+    again, fitter = replace(state.where(lost), R_lab_body=R), state.map_fitter()
     optics = fitter.optics
     steps = [(level, 1, RECOVERY_ITERATIONS) for level in (optics.coarse, optics.middle, optics.fine)]
-    fit = fitter.fit_through(steps, crops.pictures(state.frames[lost]), PoseStart(X, R, use, held=state.fixed))
-    R, X = fit.R_lab_body, X if state.fixed else fit.position_lab_mm
-    better = _scores(fit, use) > score[lost]
-    rows = (lost[better],)
-    R, X = state.R_lab_body.index_put(rows, R[better]), state.position_lab_mm.index_put(rows, X[better])
+    fit = fitter.fit_through(steps, crops.pictures(again.frames), again.start(held=state.fixed))
+    better = _scores(fit, again.use) > score[lost]
+    rows, X = (lost[better],), again.position_lab_mm if state.fixed else fit.position_lab_mm
+    R, X = state.R_lab_body.index_put(rows, fit.R_lab_body[better]), state.position_lab_mm.index_put(rows, X[better])
     return replace(state, R_lab_body=R, position_lab_mm=X)
 
 
@@ -318,12 +308,49 @@ def final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sharpen the map and rotate it by Q: texture, counts and sigma, (H, 2 H) each."""
     height = FINER * len(state.texture)
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
-    texture = look_up(sharp_map(state), direction).clamp(0, 1)
-    weight = look_up(map_weight(state), direction)
+    texture = look_up(iterations.sharp_map(state), direction).clamp(0, 1)
+    weight = look_up(iterations.map_weight(state), direction)
     seen = _counts(state, direction)
     unknown = (seen == 0) | (weight <= 0)
     sigma = torch.where(unknown, torch.inf, weight.clamp_min(1e-30).rsqrt())
     return torch.where(unknown, torch.nan, texture).float(), torch.where(unknown, 0, seen), sigma.float()
+
+
+def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tensor:
+    """Return correlations (n, C) of pictures with a map to which they were not fitted; NaN where not compared.
+    Both are normalised as for pairs of pictures, so that shading counts for nothing.
+    """
+    rows = torch.arange(HELD_EVERY // 2, len(state.use), HELD_EVERY)
+    found = torch.full(state.use.shape, torch.nan, dtype=torch.float64)
+    if not len(rows):
+        return found
+    others, _ = iterations.with_map(replace(state, use=state.use.index_fill(0, rows, False)))
+    known = (iterations.map_weight(others) > 0).float()
+    one, _ = iterations.fitted(replace(others, use=state.use).where(rows), HELD_ITERATIONS, crops)
+    X = crops.position_lab_mm.index_put((one.frames,), one.position_lab_mm)
+    filmed = disks_of(replace(crops, position_lab_mm=X), one.frames, settings)
+    for c in range(found.shape[1]):
+        view = perspective_view(settings.disk_px, float(filmed.distance_radii[:, c].median()))
+        body = view.normal_view.double() @ filmed.R_lab_view[:, c].mT.double() @ one.R_lab_body
+        pictures, seen = (view.picture(look_up(each, body)) for each in (others.texture, known))
+        at = filmed.where(slice(None), slice(c, c + 1))
+        model = normalised_disks(pictures[:, None], at.R_lab_view, at.distance_radii, at.seen, settings, at.shown)
+        a, b = (disks.layers[:, 0, 0].flatten(1) for disks in (at, model))
+        weight = filmed.share.flatten() * filmed.weight(slice(None), c) * (seen > SEEN_MIN).flatten(1)
+        found[rows, c] = weighted_correlation(a, b, weight).double()
+    return found
+
+
+def jumps(R_lab_body: Tensor) -> Tensor:
+    """Return the frames (J,) from which a ball with orientations (N, 3, 3) turns unlike before and after; NaN: unknown.
+    A rotation is compared with the median of its neighbours': a lasting change of the rate is none.
+    """
+    turn = so3.log((R_lab_body[1:] @ R_lab_body[:-1].mT).nan_to_num())
+    turn = torch.where(R_lab_body.isfinite().flatten(1).all(1).unfold(0, 2, 1).all(1)[:, None], turn, torch.nan)
+    near = F.pad(turn.T[None], (WINDOW // 2, WINDOW // 2), value=torch.nan)[0].unfold(1, WINDOW, 1)
+    off = (turn - near.nanmedian(2).values.T).norm(dim=1)
+    usual = off[off.isfinite()].median() if off.isfinite().any() else off.new_zeros(())
+    return torch.nonzero(off > (JUMPS * usual).clamp_min(JUMP_RAD))[:, 0]
 
 
 def _counts(state: State, direction_body: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Relative rotations of pairs of instants from pictures alone, and orientations from them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,12 @@ class RelativeRotations:
 
     def where(self, chosen: Tensor) -> "RelativeRotations":
         """Return some of the pairs."""
-        return RelativeRotations(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
+        return RelativeRotations(**{name: part[chosen] for name, part in vars(self).items()})
+
+    @classmethod
+    def joined(cls, parts: Sequence["RelativeRotations"]) -> "RelativeRotations":
+        """Join several records of pairs."""
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__})
 
     def residual(self, R_lab_body: Tensor) -> Tensor:
         """Return delta (E, 3), rad, between the pairs and orientations (N, 3, 3): R_ji = exp([delta]x) R(j) R(i)^T."""
@@ -66,12 +72,6 @@ class Closure:
         moved = attitude_change_rad(before, after)
         counts = {"pairs": pairs, "loops": loops, "closed": len(closed)}
         return cls(**counts, drift_before_rad=drift, drift_after_rad=left, moved_rad=moved)
-
-
-def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
-    """Join several records of pairs."""
-    names = RelativeRotations.__dataclass_fields__
-    return RelativeRotations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 def attitude_change_rad(before: Tensor, after: Tensor) -> float:
@@ -137,7 +137,7 @@ def refine_pairs(
         R, normal, score, overlap = so3.nearest_rotation(R.double()), normal.double(), score.double(), overlap.double()
         return RelativeRotations(first=i, second=j, R_ji=R, information=normal, score=score, overlap=overlap)
 
-    return all_rotations(list(side_by_side(refined, torch.split(torch.arange(len(first)), BATCH))))
+    return RelativeRotations.joined(list(side_by_side(refined, torch.split(torch.arange(len(first)), BATCH))))
 
 
 def _normal_equations(
@@ -236,14 +236,11 @@ def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) 
 def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: Tensor) -> Tensor:
     """Solve residual = delta_j - R_ji delta_i for all pairs, (N, 3)."""
     count, i, j = len(R), pairs.first, pairs.second
-    carry = R[j] @ R[i].mT
-    rows, columns, values = [], [], []
-    axes = torch.arange(3)
+    carry, axes = R[j] @ R[i].mT, torch.arange(3)
     left = carry.mT @ weight
-    for a, b, block in ((i, i, left @ carry), (i, j, -left), (j, i, -weight @ carry), (j, j, weight)):
-        rows.append((3 * a[:, None, None] + axes[:, None]).expand(-1, 3, 3).reshape(-1))
-        columns.append((3 * b[:, None, None] + axes).expand(-1, 3, 3).reshape(-1))
-        values.append(block.reshape(-1))
+    blocks = torch.cat([left @ carry, -left, -weight @ carry, weight])
+    rows = (3 * torch.cat([i, i, j, j])[:, None, None] + axes[:, None]).expand_as(blocks)
+    columns = (3 * torch.cat([i, j, i, j])[:, None, None] + axes).expand_as(blocks)
     pulled = (weight @ residual[..., None])[..., 0]
     right = torch.zeros(count, 3, dtype=R.dtype).index_add(0, j, pulled)
     right = right.index_add(0, i, -(carry.mT @ pulled[..., None])[..., 0])
@@ -251,6 +248,7 @@ def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: T
     diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
     diagonal[:3] = 1e9
     every = torch.arange(3 * count)
-    entries = [torch.cat(part).numpy() for part in ([*values, diagonal], [*rows, every], [*columns, every])]
-    matrix = coo_matrix((entries[0], (entries[1], entries[2])), shape=(3 * count, 3 * count)).tocsc()
+    parts = (blocks, diagonal), (rows, every), (columns, every)
+    entries, at, to = (torch.cat([part.reshape(-1), own]).numpy() for part, own in parts)
+    matrix = coo_matrix((entries, (at, to)), shape=(3 * count, 3 * count)).tocsc()
     return torch.from_numpy(np.asarray(spsolve(matrix, right.reshape(-1).numpy())).reshape(count, 3))

@@ -12,24 +12,9 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.chain import (
-    EVERY,
-    ITERATIONS,
-    OVERLAP_MIN,
-    SMALLER,
-    PairwiseAttitudes,
-    check_turned,
-    sight_cosines,
-)
+from sphereorient.mapping.chain import EVERY, ITERATIONS, OVERLAP_MIN, SMALLER, PairwiseAttitudes, check_turned
 from sphereorient.mapping.disks import Disks, reduced
-from sphereorient.mapping.pairs import (
-    Closure,
-    RelativeRotations,
-    all_rotations,
-    refine_pairs,
-    search_views,
-    solve_graph,
-)
+from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs, search_views, solve_graph
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.search.candidates import distinct
 
@@ -41,7 +26,6 @@ PEAK_DEG = 18.0  # between distinct ones
 FINER = 2.7  # detail, window and pixels of the disks in the last comparison, where the pictures have it
 DISK_PX_MAX = 128
 CHANCE_PAIRS = 500  # pairs at random rotations, which show how well different patches correlate
-CHANCE_SEED = 0
 CHI2_MEDIAN = 0.4549  # of the square of a normal number
 JOIN_ITERATIONS = 4  # of the refinement of a pair between two sets
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
@@ -81,9 +65,7 @@ class Evidence:
 
 def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
     """Find orientations of N unordered photographs in disks, finally in `finer` ones; only the largest set gets any.
-
-    Raises:
-        PaintError: fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres.
+    Raises PaintError (fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres).
     """
     if len(disks) < FEWEST:
         do = "take more pictures of the ball, of all its sides"
@@ -105,7 +87,7 @@ def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> Pairw
 
 def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:
     """Measure the correlation of different patches at random rotations."""
-    rng = torch.Generator().manual_seed(CHANCE_SEED)
+    rng = torch.Generator().manual_seed(0)
     first = torch.randint(len(disks), (CHANCE_PAIRS,), generator=rng)
     second = (first + 1 + torch.randint(len(disks) - 1, (CHANCE_PAIRS,), generator=rng)) % len(disks)
     pairs = refine_pairs(disks, first, second, so3.random_rotations(CHANCE_PAIRS, generator=rng), 0, EVERY)
@@ -156,7 +138,7 @@ def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, T
             placed = torch.where(other[:, None, None], R @ (R[j].mT @ R_ji @ R[i]), R)
             between, gained = _compared_at(evidence, placed, one[:, None] & other, JOIN_ITERATIONS)
             if float(gained.sum()) > SURE:
-                pairs = all_rotations([pairs, between.where(gained > 0)])
+                pairs = RelativeRotations.joined([pairs, between.where(gained > 0)])
                 label = torch.where(other, label[i], label)
                 R = _solved(placed, pairs, one | other)
     return label, R
@@ -166,7 +148,7 @@ def _compared_at(
     evidence: Evidence, R_lab_body: Tensor, wanted: Tensor, iterations: int
 ) -> tuple[RelativeRotations, Tensor]:
     """Compare pairs `wanted` (N, N) at given orientations; return rotations and log-odds (E,), low if far away."""
-    near = sight_cosines(evidence.disks, R_lab_body, torch.arange(len(R_lab_body)))
+    near = evidence.disks.sight_cosines(R_lab_body, torch.arange(len(R_lab_body)))
     first, second = torch.nonzero(wanted & (near > math.cos(math.radians(TILT_DEG)))).T
     about = R_lab_body[second] @ R_lab_body[first].mT
     pairs = refine_pairs(evidence.disks, first, second, about, iterations, EVERY)

@@ -109,11 +109,10 @@ class RelativeTracker:
 
     def _nearest(self, now: Disks, R: Tensor) -> list[tuple[Disks, Tensor]]:
         """Return the keyframes that show most of what an orientation shows."""
-        here = (R.mT @ now.sight_lab[0][..., None])[..., 0]
         if not self._keys:
             return []
         there = torch.stack([(key.mT @ disks.sight_lab[0][..., None])[..., 0] for disks, key in self._keys])
-        cosine = (here @ there.mT).flatten(1).amax(1)
+        cosine = ((R.mT @ now.sight_lab[0][..., None])[..., 0] @ there.mT).flatten(1).amax(1)
         return [self._keys[k] for k in cosine.topk(min(NEAREST, len(self._keys))).indices.tolist()]
 
     def _is_far(self, R: Tensor) -> bool:

@@ -18,6 +18,7 @@ def omega_from_orientations(
     A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt), weight m^2, optimal for white attitude noise. It damps f
     cycles per frame by sin(2 pi f m) / (2 pi f m). 2 max(m) |omega| dt must stay well below pi (not checked). The error
     comes from the scatter of the separations; NaN with fewer than two.
+    Raises ShapeError (R_lab_body does not end in (N, 3, 3)), SettingsError (no separation, one below 1, or twice).
     Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
 
     Args:
@@ -26,19 +27,14 @@ def omega_from_orientations(
         separations: values of m, frames, from 1 up, each once.
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
         min_separations: number of separations that a frame needs, else NaN.
-
-    Raises:
-        ShapeError: R_lab_body does not end in (N, 3, 3).
-        SettingsError: no separation, one below 1, or one given twice.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     if R_lab_body.dim() < 3:
         got = str(tuple(R_lab_body.shape))
         raise ShapeError(refusal("R_lab_body", expected="shape (..., N, 3, 3)", got=got, do="pass all frames at once"))
     check_separations(separations)
-    there = R_lab_body.isfinite().all(-1).all(-1)
-    R = torch.where(there[..., None, None], R_lab_body, torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device))
-    usable = usable_separations(there, separations, segment)  # (..., N, S)
+    there = R_lab_body.isfinite().all((-1, -2))
+    usable, R = usable_separations(there, separations, segment), torch.where(there[..., None, None], R_lab_body, 0.0)
     # frames that wrap around an end are never used
     turns = torch.stack([R.roll(-m, -3) @ R.roll(m, -3).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
     return mean_over_separations(turns, usable, dt_s, separations, min_separations)
@@ -75,8 +71,7 @@ def mean_over_separations(
     turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted mean omega of S separations and its standard error, (..., N, 3), rad/s.
-    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; those not `usable` (..., N, S) are left
-    out.
+    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m, lab; those not `usable` (..., N, S) are left out.
     """
     # a turn that is not used may be half a turn, where log has no gradient
     turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))
@@ -123,13 +118,9 @@ def omega_from_markers(
     seen = points_lab.isfinite().all(-1)  # (..., N, K)
     points = torch.where(seen[..., None], points_lab, 0.0)
     usable = usable_separations(seen.sum(-1) >= FEWEST_POINTS, separations, segment)
-    turns, enough = [], []
-    for m in separations:
-        both = seen.roll(-m, -2) & seen.roll(m, -2)
-        common = both.sum(-1) >= FEWEST_POINTS
-        # equal weights keep the mean defined where the turn is not used
-        weights = torch.where(common[..., None], both, True).to(points.dtype)
-        turns.append(kabsch(points.roll(m, -3), points.roll(-m, -3), weights))
-        enough.append(common)
-    usable = usable & torch.stack(enough, dim=-1)
-    return mean_over_separations(torch.stack(turns, dim=-3), usable, dt_s, separations, min_separations)
+    both = torch.stack([seen.roll(-m, -2) & seen.roll(m, -2) for m in separations], dim=-2)  # (..., N, S, K)
+    common = both.sum(-1) >= FEWEST_POINTS
+    # equal weights keep the mean defined where the turn is not used
+    weights = torch.where(common[..., None], both, True).to(points.dtype)
+    before, after = (torch.stack([points.roll(side * m, -3) for m in separations], -3) for side in (1, -1))
+    return mean_over_separations(kabsch(before, after, weights), usable & common, dt_s, separations, min_separations)

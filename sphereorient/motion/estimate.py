@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from sphereorient.motion.kalman import Bools, Floats, SmoothedStates, run_filter, smooth
 from sphereorient.motion.matern import Prior, prior_of_band
-from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack
+from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack, mahalanobis2
 from sphereorient.motion.settings import SmoothSettings
 
 ITERATIONS = 8  # of Gauss and Newton at most between two rejections; two or three do
@@ -35,10 +35,6 @@ class ProcessPrior:
     prior: Prior  # per frame
     scale: float  # true errors of the measurements over their sigmas
 
-    def at_rate(self, ratio: float) -> "ProcessPrior":
-        """Return the same motion in frames that last `ratio` times as long."""
-        return replace(self, prior=Prior(pole=self.prior.pole * ratio, deviation=self.prior.deviation * ratio))
-
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
@@ -47,6 +43,14 @@ class ProcessNoise:
     place: ProcessPrior | None  # None: too few frames to estimate it
     turn: ProcessPrior | None
     frame_s: float  # that `ProcessPrior` counts in
+
+    def at(self, frame_s: float) -> list[ProcessPrior | None]:
+        """Return the same of positions and orientations in frames of another duration."""
+        k = frame_s / self.frame_s
+        return [
+            one and replace(one, prior=Prior(pole=one.prior.pole * k, deviation=one.prior.deviation * k))
+            for one in (self.place, self.turn)
+        ]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,11 +90,10 @@ def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: Smooth
     scales = settings.least_scale, settings.most_scale
     learnt = estimate_process(pieces, scales, band)
     for _ in range(ROUNDS):
-        settled = [_settled(piece, learnt, settings) for piece in pieces]
-        moved = any(farthest > FAR_MOVED for _, _, farthest in settled)
-        judged = any((new.used != old.used).any() for (new, _, _), old in zip(settled, pieces, strict=True))
-        pieces = [new for new, _, _ in settled]
-        if not (moved or judged):
+        before, (settled, _, moves) = pieces, zip(*(_settled(one, learnt, settings) for one in pieces), strict=True)
+        pieces = settled
+        judged = any((new.used != old.used).any() for new, old in zip(pieces, before, strict=True))
+        if not (judged or max(moves) > FAR_MOVED):
             break
         learnt = estimate_process(pieces, scales, band, before=learnt)
     return learnt
@@ -103,9 +106,12 @@ def _settled(
     scale, limit = learnt.scale, settings.outlier_sigma**2
     path = replace(path, covariance=path.covariance * scale**2)
     farthest, tries, judgements = 0.0, 0, 0
+    wanted = np.zeros((9, SIZE))
+    wanted[VALUE, DELTA] = wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = np.eye(3)
+    wanted[CHANGE, 9:12] = learnt.prior.pole * np.eye(3)
     while True:
         chain = path.chain(learnt.prior)
-        states = smooth(chain, run_filter(chain), _wanted(learnt.prior.pole))
+        states = smooth(chain, run_filter(chain), wanted)
         path = path.moved(states.state, learnt.prior)
         step = float(np.abs(states.state[:, DELTA]).max()) / path.sigma
         farthest, tries = max(farthest, step), tries + 1
@@ -136,23 +142,9 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
     return used
 
 
-def mahalanobis2(off: Floats, covariance: Floats) -> Floats:
-    """Return the squared Mahalanobis distances (n,) of deviations (n, 3) of covariances (n, 3, 3)."""
-    return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off))
-
-
-def _wanted(pole: float) -> Floats:
-    """Return the rows (9, SIZE) of value, rate and change in a state."""
-    wanted = np.zeros((9, SIZE))
-    wanted[VALUE, DELTA] = wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = np.eye(3)
-    wanted[CHANGE, 9:12] = pole * np.eye(3)
-    return wanted
-
-
 def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings) -> Estimate:
     """Return a segment's estimate; one measurement has no rate, two have no change of it."""
-    count = int(path.used.sum())
-    if count < 2:
+    if (count := int(path.used.sum())) < 2:
         return _alone(path)
     settled, states, _ = _settled(path, learnt, settings)
     rate, change = settled.mean + settled.rate[:, 0], settled.rate[:, 1] * settled.pole
@@ -162,8 +154,7 @@ def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
     own = np.where(path.seen[:, None, None], path.covariance, path.sigma**2 * np.eye(3))
     covariance[:, VALUE, VALUE] += slow * own
     if count < 3:
-        change = np.full_like(change, np.nan)
-        covariance[:, CHANGE] = covariance[:, :, CHANGE] = np.nan
+        change[:] = covariance[:, CHANGE] = covariance[:, :, CHANGE] = np.nan
     rejected = settled.seen & ~settled.used
     return Estimate(value=settled.reference, rate=rate, change=change, covariance=covariance, rejected=rejected)
 
@@ -214,13 +205,9 @@ def _likeliest(
 
 def _cost(paths: Sequence[SegmentTrack], prior: Prior, scales: tuple[float, float]) -> tuple[float, float]:
     """Return the negative log-likelihood, up to a constant, and the scale; all covariances in units of scale^2."""
-    misfit, logs, number = 0.0, 0.0, 0
-    for path in paths:
-        filtered = run_filter(path.chain(prior))
-        misfit += filtered.misfit
-        logs += filtered.log_determinant
-        number += 3 * int(path.used.sum()) - FREE
-    number = max(number, 1)
+    found = [run_filter(path.chain(prior)) for path in paths]
+    misfit, logs = sum(one.misfit for one in found), sum(one.log_determinant for one in found)
+    number = max(sum(3 * int(path.used.sum()) - FREE for path in paths), 1)
     scale = float(np.clip(np.sqrt(misfit / number), *scales))
     beforehand = (np.log(scale) / UNSURE) ** 2
     return 0.5 * (logs + number * 2 * np.log(scale) + misfit / scale**2 + beforehand), scale

@@ -116,9 +116,7 @@ class ForwardRate:
         self._x[..., DELTA] -= step @ self._axes
 
     def _transition(self, ticks: int) -> tuple[Floats, Floats, Floats]:
-        """Return the transitions F over a part of a step, transposed, too, and the covariances that it adds, (K, SIZE,
-        SIZE) each.
-        """
+        """Return transitions over a part of a step, transposed ones, and added covariances, (K, SIZE, SIZE) each."""
         if ticks not in self._transitions:
             tau = ticks / TICKS
             F, Q = np.zeros((2, len(POLES), SIZE, SIZE))

@@ -77,9 +77,7 @@ class Prior:
 
 
 def prior_of_band(band: float, noise: float) -> Prior:
-    """Return the prior whose spectrum equals white noise at the band (cycles per frame).
-    `noise`: standard deviation of the measured value by axis, one measurement a frame.
-    """
+    """Return the prior whose spectrum equals white noise of sigma `noise` a frame at the band (cycles per frame)."""
     rate = 2 * np.pi * band
     pole = 0.75 * rate  # as estimated from turbulence-like motion: the fall begins a little before the band ends
     density = _DENSITY / pole * (1 + (rate / pole) ** 2) ** -ORDER  # of w of unit variance at the band

@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,6 +11,12 @@ from sphereorient.motion.stencil import Order, apply, compose, gap_aware_stencil
 from sphereorient.so3 import nearest_rotation
 
 M_PER_MM = 1e-3
+RATE_UNITS = {"velocity": "m_s", "acceleration": "m_s2"}
+RATE_UNITS |= {"omega_lab": "rad_s", "omega_body": "rad_s", "alpha_lab": "rad_s2", "alpha_body": "rad_s2"}
+POSES = {"position_smooth": "position_lab_mm", "position_smooth_cov": "position_cov_mm2"}
+POSES |= {"orientation_smooth": "R_lab_body", "orientation_smooth_cov": "orientation_cov_rad2"}
+FIELDS = {name: f"{name}_{unit}" for name, unit in RATE_UNITS.items()}
+FIELDS |= {f"{name}_sigma": f"{name}_sigma_{unit}" for name, unit in RATE_UNITS.items()}  # of `Motion`, by dataset
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,6 +43,15 @@ class Motion:
     alpha_body_sigma_rad_s2: Tensor
 
 
+def datasets_of(found: Motion, length_unit: str = "mm") -> dict[str, Any]:
+    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names of a track and in its units.
+    Lengths of positions in another unit than mm are those of velocities, too.
+    """
+    parts = {name: getattr(found, own).numpy() for name, own in (POSES | FIELDS).items()}
+    rates = ("velocity", "acceleration") if length_unit != "mm" else ()
+    return {name: part / M_PER_MM if name.startswith(rates) else part for name, part in parts.items()}
+
+
 def measure_motion(
     position_mm: Tensor,
     R_lab_body: Tensor,
@@ -47,6 +63,7 @@ def measure_motion(
     """Return smooth pose, velocity, acceleration, omega, alpha of all frames whose neighbours determine them, else NaN.
     Positions are smoothed with the Gaussian of velocity, orientations with that of alpha, by the chordal mean on SO(3).
     Nothing crosses the ends of a segment; single lost frames are bridged. Body components need the frame's orientation.
+    Raises ShapeError (wrong last axes, or unequal numbers of frames).
     Source: the paper, section III; docs/errata.md E4 and E6; the mean: Moakher 2002, SIAM J. Matrix Anal. 24, 1.
 
     Args:
@@ -57,9 +74,6 @@ def measure_motion(
         settings: widths and limits.
         sigmas: of the position's coordinates, mm, and of delta in R_true = exp([delta]x) R, rad, (..., N) or
             (..., N, 3) each; None or NaN: unknown.
-
-    Raises:
-        ShapeError: wrong last axes, or unequal numbers of frames.
     """
     check_tail("position_mm", position_mm, 3)
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -103,7 +117,7 @@ def _rotation(
     slope = _stencil(omega, segment, settings.alpha_sigma_frames, 1, settings)
     alpha = apply(slope, omega) / dt_s
     # neighbouring omegas share orientations: their noise is not white, that of the orientations is
-    usable = usable_separations(_oriented(R_lab_body), separations, segment)
+    usable = usable_separations(R_lab_body.isfinite().all((-1, -2)), separations, segment)
     turn = omega_stencil(usable, separations, fewest, omega.dtype)
     omega_sigma = propagated_sigma(turn, sigma_rad.to(omega)) / dt_s
     return (omega, omega_sigma), (alpha, propagated_sigma(compose(slope, turn), sigma_rad.to(omega)) / dt_s**2)
@@ -123,16 +137,11 @@ def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:
     return (sigma if sigma.dim() == like.dim() else sigma[..., None]).expand_as(like)
 
 
-def _oriented(R_lab_body: Tensor) -> Tensor:
-    return R_lab_body.isfinite().all(-1).all(-1)
-
-
 def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     """Turn to body components where there is an orientation, NaN elsewhere."""
-    there = (_oriented(R_lab_body) & x_lab.isfinite().all(-1))[..., None]
+    there = (R_lab_body.isfinite().all((-1, -2)) & x_lab.isfinite().all(-1))[..., None]
     # numbers in place of NaN, whose gradient would be NaN
-    unit = torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device)
-    R, x = torch.where(there[..., None], R_lab_body, unit), torch.where(there, x_lab, 0.0)
+    R, x = torch.where(there[..., None], R_lab_body, 0.0), torch.where(there, x_lab, 0.0)
     return torch.where(there, to_body(R, x), torch.nan)
 
 

@@ -87,13 +87,8 @@ class SegmentTrack:
 
     def moved(self, state: Floats, prior: Prior) -> Self:
         """Return the path about the states (N, SIZE)."""
-        return replace(
-            self,
-            reference=self.stepped(self.reference, state[:, DELTA]),
-            mean=self.mean + state[0, MEAN],
-            rate=state[:, RATE].reshape(-1, ORDER, 3),
-            pole=prior.pole,
-        )
+        reference, rate = self.stepped(self.reference, state[:, DELTA]), state[:, RATE].reshape(-1, ORDER, 3)
+        return replace(self, reference=reference, mean=self.mean + state[0, MEAN], rate=rate, pole=prior.pole)
 
     def away(self) -> Floats:
         """Return the measurements as deviations (N, 3) from the reference; 0 where not measured."""
@@ -157,6 +152,11 @@ class SegmentTrack:
         start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, view)
         steps: dict[str, Any] = {"carried": carried, "drift": drift, "kind": kind, "grown": grown_by, "noise": noise}
         return StateSpace(**steps, start=start, measured=self.away(), covariance=self.covariance, used=self.used)
+
+
+def mahalanobis2(off: Floats, covariance: Floats) -> Floats:
+    """Return the squared Mahalanobis distances (n,) of deviations (n, 3) of covariances (n, 3, 3)."""
+    return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off))
 
 
 def _by_axis(blocks: Floats) -> Floats:

@@ -28,21 +28,12 @@ class MotionSettings(BaseModel, frozen=True, extra="forbid"):
     alpha_sigma_frames: float = Field(
         2.0, gt=0, description="width of the Gaussian that takes alpha from omega, frames; omega is already an average"
     )
-    truncate: float = Field(
-        3.0, gt=0, description="half width of these windows in units of their sigma; 3 holds 99.7 % of the Gaussian"
-    )
-    min_share: float = Field(
-        0.55, gt=0, le=1, description="measured share of a Gaussian's weight, else NaN; 0.55 passes two lost frames"
-    )
+    truncate: float = Field(3.0, gt=0, description="half width of these windows, sigmas; 3 holds 99.7 % of them")
+    min_share: float = Field(0.55, gt=0, le=1, description="least measured share, else NaN; 0.55 passes two gaps")
     separations: tuple[int, ...] = Field(
-        (1, 2, 3, 4, 5),
-        min_length=1,
-        description="omega is averaged over the turns from frame k - m to k + m for these m, frames; the turn, "
-        "2 m omega / frame_rate, must stay well below 180 degrees",
+        (1, 2, 3, 4, 5), min_length=1, description="omega averages turns from k - m to k + m, each below 180 degrees"
     )
-    min_separations: int = Field(
-        3, ge=1, description="separations that must be measurable, else omega is NaN; 3 loses 3 frames at ends"
-    )
+    min_separations: int = Field(3, ge=1, description="least measured separations, else NaN; 3 loses 3 frames at ends")
 
     @model_validator(mode="after")
     def _separations_can_be_measured(self) -> Self:
@@ -63,22 +54,12 @@ class SmoothSettings(BaseModel, frozen=True, extra="forbid"):
     orientation_band_hz: float | None = Field(
         None, gt=0, description="frequency up to which orientations are followed, Hz; null learns it likewise"
     )
-    learn_frames: int = Field(
-        600, ge=20, description="frames from which band and noise are learnt, at most; more only cost time"
-    )
+    learn_frames: int = Field(600, ge=20, description="most frames for learning band and noise; more only cost time")
     least_frames: int = Field(10, ge=5, description="measured frames in all below which nothing is smoothed")
     least_scale: float = Field(0.5, gt=0, description="least factor on the measurements' sigmas")
     most_scale: float = Field(4.0, gt=0, description="largest factor on the measurements' sigmas")
     slow_share: float = Field(
-        0.25,
-        ge=0,
-        lt=1,
-        description="least share of the measurements' error variance that lasts over many frames; no smoother can tell "
-        "it from motion, so it is added to the smoothed covariances; more where two cameras' disagreement lasts longer",
+        0.25, ge=0, lt=1, description="least share of the error variance that lasts and no smoother sees; it is added"
     )
-    outlier_sigma: float = Field(
-        6.0, gt=0, description="a measurement farther from what all others say is left out, sigmas (of three axes)"
-    )
-    outlier_share: float = Field(
-        0.1, ge=0, le=0.5, description="largest share of a segment's measurements that may be left out"
-    )
+    outlier_sigma: float = Field(6.0, gt=0, description="a measurement farther from all others is left out, sigmas")
+    outlier_share: float = Field(0.1, ge=0, le=0.5, description="largest share of a segment that may be left out")

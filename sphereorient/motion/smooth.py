@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -10,19 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.motion.estimate import (
-    CHANGE,
-    SPEED,
-    VALUE,
-    Estimate,
-    ProcessNoise,
-    ProcessPrior,
-    estimate,
-    mahalanobis2,
-)
+from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, ProcessPrior, estimate
 from sphereorient.motion.kalman import Bools, Floats
 from sphereorient.motion.measure import M_PER_MM, Motion
-from sphereorient.motion.path import RotationTrack, SegmentTrack, rotation_of
+from sphereorient.motion.path import RotationTrack, SegmentTrack, mahalanobis2, rotation_of
 from sphereorient.motion.settings import SmoothSettings
 
 Rows = NDArray[np.int64]
@@ -89,42 +80,37 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     `known`, with one factor on the sigmas. The errors of a frame's orientation and position go together (`coupling`):
     orientations are smoothed as they are given the smoothed positions. There is no lag; ends are included, gaps inside
     a segment filled, outliers rejected. A segment of one measured frame has no derivatives, of two no accelerations; a
-    track too short for the estimation has no derivatives.
+    track too short for the estimation has no derivatives. Raises ShapeError (times that do not increase).
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
     SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
-
-    Raises:
-        ShapeError: times that do not increase.
     """
-    names = ("time_s", "position_lab_mm", "position_cov_mm2", "R_lab_body", "orientation_cov_rad2")
-    parts = (getattr(measured, name) for name in names)
-    t, X, X_cov, R, R_cov = (part.detach().cpu().to(torch.float64).numpy() for part in parts)
-    numbers = measured.segment.cpu().numpy()
+    given = {name: part.detach().cpu().numpy() for name, part in vars(measured).items() if part is not None}
+    numbers, coupling = given.pop("segment"), given.pop("coupling", None)
+    t, X, X_cov, R, R_cov = (part.astype(np.float64) for part in given.values())
     segments, frame_s = _segments(t, numbers)
     seen_X = np.isfinite(X).all(1) & np.isfinite(X_cov).all((1, 2))
     seen_R = np.isfinite(R).all((1, 2)) & np.isfinite(R_cov).all((1, 2))
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
-    out = {one.name: np.full((len(t), 3, 3) if one.name in square else (len(t), 3), np.nan) for one in fields(Motion)}
-    rejected, by_path = np.zeros(len(t), dtype=bool), np.zeros((len(t), 3, 3))
-    ratio = 1.0 if known is None else frame_s / known.frame_s
-    prior = [each and each.at_rate(ratio) for each in ((known.place, known.turn) if known else (None, None))]
+    out = {one.name: np.full_like(R if one.name in square else X, np.nan) for one in fields(Motion)}
+    rejected, by_path = np.zeros(len(t), dtype=bool), np.zeros_like(R)
+    prior = known.at(frame_s) if known else (None, None)
     bands = [hz and hz * frame_s for hz in (settings.position_band_hz, settings.orientation_band_hz)]
     found, position_scale, place = _estimates(SegmentTrack, (X, X_cov, seen_X), segments, bands[0], settings, prior[0])
     for rows, at in found:
         _put_places(out, rows, at, frame_s)
         rejected[rows] |= at.rejected
-    if measured.coupling is not None:
-        coupling = measured.coupling.detach().cpu().to(torch.float64).numpy()
+    if coupling is not None:
         off, path_cov = out["position_lab_mm"] - X, out["position_cov_mm2"]
         told = np.flatnonzero(seen_X & seen_R & ~rejected & np.isfinite(off).all(1))
         told = told[mahalanobis2(off[told], X_cov[told]) < ON_PATH**2]
-        R, R_cov = R.copy(), R_cov.copy()
-        R[told], R_cov[told], by_path[told] = _given_path(
-            R[told], R_cov[told], coupling[told], off[told], X_cov[told], path_cov[told]
-        )
-    found, orientation_scale, turn = _estimates(
-        RotationTrack, (R, R_cov, seen_R), segments, bands[1], settings, prior[1]
-    )
+        # Paint that shifts in the picture is a turn or a move of the sphere; the limb alone tells them apart, and the
+        # path knows the move better than the limb of one frame.
+        gain = coupling[told] @ np.linalg.inv(X_cov[told])
+        R[told] = rotation_of((gain @ off[told, :, None])[..., 0]) @ R[told]
+        R_cov[told] -= gain @ coupling[told].mT
+        by_path[told] = gain @ path_cov[told] @ gain.mT
+    poses = R, R_cov, seen_R
+    found, orientation_scale, turn = _estimates(RotationTrack, poses, segments, bands[1], settings, prior[1])
     for rows, at in found:
         _put_turns(out, rows, at, frame_s)
         rejected[rows] |= at.rejected
@@ -132,12 +118,10 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     shared = np.abs(by_path).sum((1, 2)) > 0
     usual = by_path[shared].mean(0) if shared.any() else np.zeros((3, 3))
     out["orientation_cov_rad2"] += np.where(shared[:, None, None], by_path, usual)
+    out |= {"R_given_path": R, "cov_given_path_rad2": R_cov * orientation_scale**2 + by_path}
+    marks = {"extrapolated": (numbers >= 0) & ~(seen_X & seen_R), "rejected": rejected}
     return Smoothed(
-        **{name: torch.from_numpy(value) for name, value in out.items()},
-        R_given_path=torch.from_numpy(R),
-        cov_given_path_rad2=torch.from_numpy(R_cov * orientation_scale**2 + by_path),
-        extrapolated=torch.from_numpy((numbers >= 0) & ~(seen_X & seen_R)),
-        rejected=torch.from_numpy(rejected),
+        **{name: torch.from_numpy(value) for name, value in (out | marks).items()},
         position_scale=position_scale,
         orientation_scale=orientation_scale,
         process=ProcessNoise(place=place, turn=turn, frame_s=frame_s),
@@ -173,27 +157,16 @@ def _estimates(
     return [(at.rows, at.take(found)) for at, found in zip(instants, estimates, strict=True)], scale, process
 
 
-def _given_path(
-    R: Floats, R_cov: Floats, coupling: Floats, off: Floats, X_cov: Floats, path_cov: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return orientations, covariances given the positions of the path, and those that the path's own error adds.
-    `off` (n, 3), mm: path less measured position, which agree. Paint that shifts in the picture is a turn or a move of
-    the sphere; the limb alone tells them apart, and the path knows the move better than the limb of one frame.
-    """
-    gain = coupling @ np.linalg.inv(X_cov)
-    turned = rotation_of((gain @ off[..., None])[..., 0]) @ R
-    return turned, R_cov - gain @ coupling.mT, gain @ path_cov @ gain.mT
-
-
 def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: float) -> float:
     """Return the share of the variance of cameras' disagreements that lasts over frames, at least the one assumed.
     `apart` (N, P, 3): turns between the orientations of P pairs of cameras, covariance (N, P, 3, 3); NaN where missing.
     """
     there = torch.isfinite(apart).all(-1) & torch.isfinite(covariance).all((-1, -2)) & (segment >= 0)[:, None]
-    whole = torch.where(there[..., None, None], covariance, torch.eye(3, dtype=covariance.dtype))
-    factor, failed = torch.linalg.cholesky_ex(whole)  # a picture with few pixels left may have no full covariance
+    unit = torch.eye(3, dtype=covariance.dtype)
+    # A picture with few pixels left may have no full covariance.
+    factor, failed = torch.linalg.cholesky_ex(torch.where(there[..., None, None], covariance, unit))
     there = there & (failed == 0)
-    factor = torch.where(there[..., None, None], factor, torch.eye(3, dtype=factor.dtype))
+    factor = torch.where(there[..., None, None], factor, unit)
     z = torch.linalg.solve(factor, apart.nan_to_num()[..., None])[..., 0].clamp(-CLIP, CLIP)
     shared, both = z.new_zeros(()), 0
     for lag in range(1, LAGS + 1):
@@ -242,23 +215,21 @@ def _sigma(covariance: Floats) -> Floats:
 
 def _put_places(out: dict[str, Floats], rows: Rows, at: Estimate, frame_s: float) -> None:
     """Write the positions of one segment; mm per frame become m/s."""
-    speed, change = M_PER_MM / frame_s, M_PER_MM / frame_s**2
     out["position_lab_mm"][rows] = at.value
     out["position_cov_mm2"][rows] = at.covariance[:, VALUE, VALUE]
-    out["velocity_m_s"][rows] = at.rate * speed
-    out["velocity_sigma_m_s"][rows] = _sigma(at.covariance[:, SPEED, SPEED]) * speed
-    out["acceleration_m_s2"][rows] = at.change * change
-    out["acceleration_sigma_m_s2"][rows] = _sigma(at.covariance[:, CHANGE, CHANGE]) * change
+    of_rates = (("velocity", "m_s", 1, SPEED, at.rate), ("acceleration", "m_s2", 2, CHANGE, at.change))
+    for name, unit, power, part, values in of_rates:
+        scale = M_PER_MM / frame_s**power
+        out[f"{name}_{unit}"][rows] = values * scale
+        out[f"{name}_sigma_{unit}"][rows] = _sigma(at.covariance[:, part, part]) * scale
 
 
 def _put_turns(out: dict[str, Floats], rows: Rows, at: Estimate, frame_s: float) -> None:
     """Write the orientations of one segment; rad per frame become rad/s, in the lab and in the body."""
-    C = at.covariance.copy()
+    R, rate, change, C = (x.copy() for x in (at.value, at.rate, at.change, at.covariance))
     lost = _sigma(C[:, VALUE, VALUE]).max(1) > LOST_RAD
-    R, rate, change = (
-        np.where(lost.reshape(-1, *(1,) * (x.ndim - 1)), np.nan, x) for x in (at.value, at.rate, at.change)
-    )
-    C[lost] = np.nan
+    for x in (R, rate, change, C):
+        x[lost] = np.nan
     out["R_lab_body"][rows] = R
     out["orientation_cov_rad2"][rows] = C[:, VALUE, VALUE]
     for name, unit, power, part, values in (("omega", "rad_s", 1, SPEED, rate), ("alpha", "rad_s2", 2, CHANGE, change)):
@@ -271,24 +242,3 @@ def _put_turns(out: dict[str, Floats], rows: Rows, at: Estimate, frame_s: float)
         out[f"{name}_lab_sigma_{unit}"][rows] = _sigma(C[:, part, part]) * scale
         out[f"{name}_body_{unit}"][rows] = (R.mT @ values[..., None])[..., 0] * scale
         out[f"{name}_body_sigma_{unit}"][rows] = _sigma(R.mT @ whole @ R) * scale
-
-
-RATE_UNITS = {"velocity": "m_s", "acceleration": "m_s2"}
-RATE_UNITS |= {"omega_lab": "rad_s", "omega_body": "rad_s", "alpha_lab": "rad_s2", "alpha_body": "rad_s2"}
-POSES = {
-    "position_smooth": "position_lab_mm",
-    "position_smooth_cov": "position_cov_mm2",
-    "orientation_smooth": "R_lab_body",
-    "orientation_smooth_cov": "orientation_cov_rad2",
-}
-
-
-def datasets_of(found: Motion, length_unit: str = "mm") -> dict[str, Any]:
-    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names of a track and in its units.
-    Lengths of positions in another unit than mm are those of velocities, too.
-    """
-    names = POSES | {name: f"{name}_{unit}" for name, unit in RATE_UNITS.items()}
-    names |= {f"{name}_sigma": f"{name}_sigma_{unit}" for name, unit in RATE_UNITS.items()}
-    parts = {name: getattr(found, own).numpy() for name, own in names.items()}
-    rates = ("velocity", "acceleration") if length_unit != "mm" else ()
-    return {name: part / M_PER_MM if name.startswith(rates) else part for name, part in parts.items()}

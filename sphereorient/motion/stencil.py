@@ -19,9 +19,8 @@ TRUNCATE = 3.0  # holds 99.7 % of the Gaussian
 
 def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
     """Return the neighbours of every frame of x (..., N): entry [k, half + j] of (..., N, 2 half + 1) is x[k + j]."""
-    if x.shape[-1] == 0:
-        return x.new_empty(*x.shape, 2 * half + 1)
-    return pad(x, (half, half), value=fill).unfold(-1, 2 * half + 1, 1)
+    # Padded by one more than needed: no frames at all have no window.
+    return pad(x, (half, half + 1), value=fill).unfold(-1, 2 * half + 1, 1)[..., : x.shape[-1], :]
 
 
 def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
@@ -35,9 +34,7 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Return which neighbours of a frame can be used in pairs k - j, k + j; arguments as `neighbours_there`.
-    The weights of pairs have one parity: no lower power of time enters the result, whichever frames are missing.
-    """
+    """Return which of the `neighbours_there` pair up, k - j with k + j: their weights have one parity in time."""
     near = neighbours_there(there, segment, half)
     return near & near.flip(-1)
 
@@ -73,26 +70,19 @@ def gaussian_derivative(
     """Return the derivative (..., N, D) of x (..., N, D), in its unit / s^order, by a Gaussian kernel; order 0 smooths.
     NaN where the window (`truncate` sigmas on each side) reaches a missing value or an end. Exact for polynomials up to
     degree order + 1. A sine of f cycles per frame is damped by about exp(-(2 pi f sigma)^2 / 2).
+    Raises SettingsError (an order other than 0, 1, 2, or a width that is not positive).
     Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
-
-    Raises:
-        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
-    kernel = gaussian_kernel(sigma_frames, order, truncate, x)
-    near = windows(x.mT, kernel.shape[-1] // 2)
-    return (near * kernel).sum(-1).mT / dt_s**order
+    kernel = _with_exact_moments(*_gaussian(sigma_frames, order, truncate, x), order)
+    return (windows(x.mT, len(kernel) // 2) * kernel).sum(-1).mT / dt_s**order
 
 
-def gaussian_kernel(
-    sigma_frames: float, order: Order, truncate: float = TRUNCATE, like: Tensor | None = None
-) -> Tensor:
+def gaussian_kernel(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> Tensor:
     """Return the weights (2 h + 1) of the frames k - h .. k + h in `gaussian_derivative` with dt_s = 1.
     Their norm is the gain of white noise: for sigma above 1.5 frames, orders 0, 1, 2: 0.531 sigma^-0.5,
     0.376 sigma^-1.5, 0.460 sigma^-2.5.
     """
-    like = torch.empty(0, dtype=torch.float64) if like is None else like
-    gauss, step = _gaussian(sigma_frames, _half_width(sigma_frames, order, truncate), like)
-    return _with_exact_moments(gauss, step, order)
+    return _with_exact_moments(*_gaussian(sigma_frames, order, truncate, torch.empty(0, dtype=torch.float64)), order)
 
 
 def gap_aware_stencil(
@@ -108,14 +98,11 @@ def gap_aware_stencil(
     A neighbour is used where its mirror image is measured and both are in the segment; polynomials stay exact. `there`
     (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN where less than
     `min_share` of the Gaussian's weight is measured.
-
-    Raises:
-        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
+    Raises SettingsError (an order other than 0, 1, 2, or a width that is not positive).
     """
-    half = _half_width(sigma_frames, order, truncate)
     like = torch.empty(0, dtype=torch.float64, device=there.device)
-    gauss, step = _gaussian(sigma_frames, half, like)
-    kept = gauss * paired(there, segment, half)
+    gauss, step = _gaussian(sigma_frames, order, truncate, like)
+    kept = gauss * paired(there, segment, len(step) // 2)
     share = kept.sum(-1) / gauss.sum()
     # sums of equal terms may differ in their last digits, in float32 by 1e-6
     m0, m2, m4 = ((kept * step**power).sum(-1) for power in (0, 2, 4))
@@ -125,18 +112,14 @@ def gap_aware_stencil(
     return torch.where(enough[..., None], stencil, torch.nan)
 
 
-def _half_width(sigma_frames: float, order: int, truncate: float) -> int:
-    """Return the half width of the window; at least 1, which a derivative needs."""
+def _gaussian(sigma_frames: float, order: int, truncate: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the Gaussian and its abscissae, frames, at least one to either side, which a derivative needs."""
     if order not in (0, 1, 2):
         raise SettingsError(refusal("order", expected="0, 1 or 2", got=str(order), do="differentiate twice"))
     if not (sigma_frames > 0 and truncate > 0):
         got = f"sigma_frames {sigma_frames}, truncate {truncate}"
         raise SettingsError(refusal("Gaussian", expected="a positive width", got=got, do="raise it"))
-    return max(1, math.ceil(truncate * sigma_frames))
-
-
-def _gaussian(sigma_frames: float, half: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the Gaussian and its abscissae in units of sigma."""
+    half = max(1, math.ceil(truncate * sigma_frames))
     step = torch.arange(-half, half + 1, dtype=like.dtype, device=like.device)
     return torch.exp(-0.5 * (step / sigma_frames) ** 2), step
 
@@ -144,8 +127,4 @@ def _gaussian(sigma_frames: float, half: int, like: Tensor) -> tuple[Tensor, Ten
 def _with_exact_moments(gauss: Tensor, step: Tensor, order: int) -> Tensor:
     """Correct weights (..., 2 h + 1) to exact moments 0 .. order + 1, as a weighted Savitzky-Golay fit."""
     m0, m2, m4 = ((gauss * step**power).sum(-1, keepdim=True) for power in (0, 2, 4))
-    if order == 0:
-        return gauss / m0
-    if order == 1:
-        return gauss * step / m2
-    return gauss * 2 * (m0 * step**2 - m2) / (m0 * m4 - m2**2)
+    return (gauss / m0, gauss * step / m2, gauss * 2 * (m0 * step**2 - m2) / (m0 * m4 - m2**2))[order]

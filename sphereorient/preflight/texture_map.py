@@ -16,7 +16,7 @@ from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warn
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.search.normalisation import LocalNormalisation
-from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.refine_rotation import detail_level, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture, unseen_share
 from sphereorient.sphere.texture import map_directions
@@ -154,8 +154,8 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
     found = ViewPair(score=0.0, angle_rad=math.pi, pictures=pictures(seen[:1]).expand(2, -1, -1), R_view_body=seen[:2])
     for k in best.values.argsort(descending=True)[:REFINED].tolist():
         disk = pictures(seen[k : k + 1])[0]
-        R, _ = refine_rotation(rough, level_reference(rough, disk), grid[best.indices[k]][None], settings.rough_steps)
-        R, score = refine_rotation(fine, level_reference(fine, disk), R, settings.fine_steps)
+        R, _ = refine_rotation(rough, disk, grid[best.indices[k]][None], settings.rough_steps)
+        R, score = refine_rotation(fine, disk, R, settings.fine_steps)
         angle = float(so3.geodesic_distance(seen[k].double(), R[0].double()))
         if float(score) > found.score and angle > math.radians(APART_DEG):
             pair = torch.stack([seen[k], R[0]])

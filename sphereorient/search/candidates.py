@@ -97,20 +97,11 @@ class Candidates:
             reason=tuple(next(own) if here else why for here, why in zip(placed.tolist(), reason, strict=True)),
         )
 
-    def padded_views(self, leading: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return R_view_body (*leading, C, 3, 3) and scores (*leading, C), best first; NaN in unused places."""
-        R, score, _ = self._padded(self.R_view_body, torch.full((3, 3), torch.nan), torch.nan)
-        return R.reshape(*leading, -1, 3, 3), score.reshape(*leading, -1)
-
-    def padded(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return R_lab_body (N, C, 3, 3), scores (N, C) and mask (N, C), C the largest count, at least 1.
-        Unused places hold the unit rotation, score 0 and mask False.
-        """
-        return self._padded(self.R_lab_body, torch.eye(3), 0.0)
-
-    def _padded(self, R: Tensor, no_rotation: Tensor, no_score: float) -> tuple[Tensor, Tensor, Tensor]:
+    def padded(self, views: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return R_lab_body or R_view_body (N, C, 3, 3), scores and mask (N, C); unit rotation and 0 if unused."""
+        R = self.R_view_body if views else self.R_lab_body
         mask = torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
-        rotations, score = no_rotation.to(R).repeat(*mask.shape, 1, 1), self.score.new_full(mask.shape, no_score)
+        rotations, score = torch.eye(3).to(R).repeat(*mask.shape, 1, 1), self.score.new_zeros(mask.shape)
         rotations[mask], score[mask] = R, self.score
         return rotations, score, mask
 
@@ -163,7 +154,9 @@ class DiskSearch(nn.Module, ABC):
         """
         grey = tensor_of("disks", disks).float()
         check_finite("disks", grey)
-        return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
+        R, score, mask = self.propose(grey.reshape(-1, *grey.shape[-2:])).padded(views=True)
+        R[~mask], score[~mask] = torch.nan, torch.nan
+        return R.reshape(*grey.shape[:-2], -1, 3, 3), score.reshape(*grey.shape[:-2], -1)
 
 
 class FallbackProposer:
@@ -192,9 +185,7 @@ def resized(disks: Tensor, size_px: int) -> Tensor:
     """Return disks (F, S, S) resampled to `size_px` pixels across."""
     if disks.shape[-1] == size_px:
         return disks
-    grey: Tensor = F.interpolate(
-        disks[:, None], (size_px, size_px), mode="bilinear", align_corners=False, antialias=True
-    )
+    grey: Tensor = F.interpolate(disks[:, None], (size_px,) * 2, mode="bilinear", align_corners=False, antialias=True)
     return grey[:, 0]
 
 

@@ -31,8 +31,7 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
 
 
 def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the threshold between the classes of histograms (..., B) of 0 .. 1, and the difference of their means,
-    (...).
+    """Return the threshold (...) of histograms (..., B) of 0 .. 1, and the difference of the classes' means, (...).
     The threshold is the middle of a plateau; the difference is 0 where all values lie in one bin.
     Source: Otsu 1979, eq. (18): the greatest variance between the classes.
     """
@@ -40,10 +39,8 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
     at = (torch.arange(bins, dtype=histogram.dtype, device=histogram.device) + 0.5) / bins
     weight = histogram / histogram.sum(-1, keepdim=True).clamp_min(torch.finfo(histogram.dtype).tiny)
     below = weight.cumsum(-1)[..., :-1]
-    sum_below = (weight * at).cumsum(-1)
-    mean = sum_below[..., -1:]
-    sum_below = sum_below[..., :-1]
-    above = 1.0 - below
+    sums = (weight * at).cumsum(-1)
+    sum_below, mean, above = sums[..., :-1], sums[..., -1:], 1.0 - below
     mixed = (below > 1e-6) & (above > 1e-6)
     safe_below, safe_above = torch.where(mixed, below, 1.0), torch.where(mixed, above, 1.0)
     step = torch.where(mixed, (mean - sum_below) / safe_above - sum_below / safe_below, 0.0)
@@ -60,10 +57,8 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
 def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Tensor:
     """Return the paint of grey disks (F, S, S) float32 in the mask (S, S): -1 black, +1 white, 0 undecided or outside.
     Otsu's thresholds of the whole disk and of two moving square regions must agree.
+    Raises ShapeError (disks and mask differ in size).
     Source: paper section III B.
-
-    Raises:
-        ShapeError: disks and mask differ in size.
     """
     check_disks(disks, *inside.shape)
     grey = stretch_contrast(disks, inside, settings.black_share, settings.white_share)
@@ -72,8 +67,7 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
     vote = torch.where(grey > threshold[:, None, None], 1.0, -1.0)
     for share in settings.regions:
         local = _moving_threshold(one_hot, threshold, share, settings.region_contrast_min)
-        agree = vote * torch.where(grey > local, 1.0, -1.0)
-        vote = torch.where(agree > 0, vote, torch.zeros_like(vote))
+        vote = torch.where(vote * torch.where(grey > local, 1.0, -1.0) > 0, vote, 0.0)
     return vote * inside
 
 

@@ -12,10 +12,10 @@ from torch.nn import functional as F
 from sphereorient import so3
 from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import LocalNormalisation
-from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.refine_rotation import detail_level, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, perspective_view
-from sphereorient.sphere.texture_table import TextureTable, texture_table
+from sphereorient.sphere.texture_table import texture_table
 
 # Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
 BATCH = 32
@@ -46,39 +46,33 @@ class GreySearch(DiskSearch):
         bank: Tensor | None = None,
     ) -> None:
         super().__init__()
-        settings = settings or GreySearchSettings()
-        texture = torch.as_tensor(texture)
-        self._settings = settings
-        size, distance = settings.size_px, settings.distance_radii
-        self.size_px = size
+        self._settings = settings = settings or GreySearchSettings()
+        self.size_px, distance = settings.size_px, settings.distance_radii
+        size, pixel_rad = self.size_px, 2.0 / self.size_px
         self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
         self._normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
-        pixel_rad = 2.0 / size
-        paint = texture_table(texture, max(blur, min(pixel_rad, settings.detail)), TABLE_SIDE)
-        self._rough = detail_level(self._view, paint, settings.detail, every=2, blur=blur)
-        self._fine = detail_level(self._view, paint, pixel_rad, every=1, blur=blur)
+        finest = max(blur, min(pixel_rad, settings.detail))
+        self._paint = texture_table(torch.as_tensor(texture), finest, TABLE_SIDE)
+        self._rough = detail_level(self._view, self._paint, settings.detail, every=2, blur=blur)
+        self._fine = detail_level(self._view, self._paint, pixel_rad, every=1, blur=blur)
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
         # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
         self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
-        self._paint = paint
         if bank is not None:
             vars(self)["bank"] = bank
 
     @cached_property
     def bank(self) -> Tensor:
         """Normalised views of all rotations, (K, P) int8."""
-        return self._templates(self._paint)
+        normal, views = self._view.normal_view.T.contiguous(), torch.split(self.templates, BATCH)
+        pictures = (self._view.picture(self._paint.sample(R.mT @ normal)[0]) for R in views)
+        return torch.cat([to_int8(self._normalise(some)) for some in pictures])
 
     def prepare(self) -> None:
         """Make the bank now, not when it is needed."""
         self.bank.size()
-
-    @property
-    def made(self) -> bool:
-        """Whether the bank is made."""
-        return "bank" in vars(self)
 
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
@@ -91,25 +85,20 @@ class GreySearch(DiskSearch):
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
         The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
         the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
-
-        Raises:
-            ShapeError: the disks are of another size.
+        Raises ShapeError (the disks are of another size).
         """
         check_disks(disks, self.size_px, self.size_px)
-        parts: list[Candidates] = []
-        for some in torch.split(disks, PRODUCT):
-            for disk, place, peak in zip(some, *self.search(some), strict=True):
-                parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
-        return Candidates.joined(parts)
+        found = ((some, *self.search(some)) for some in torch.split(disks, PRODUCT))
+        each = (one for some in found for one in zip(*some, strict=True))
+        most = self._settings.peaks
+        return Candidates.joined([self._refined(disk, self.templates[at[peak][:most]]) for disk, at, peak in each])
 
     def likeness(self, disks: Tensor) -> Tensor:
         """Return the correlation of disks (F, S, S) with the template most like each, (F,)."""
         return self.score(disks).amax(-1)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
-        All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
-        """
+        """Return the best templates of the best groups (F, M), best first, and which are peaks, (F, M) bool."""
         scores = torch._int_mm(self._normalised(disks), self.bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)
@@ -121,18 +110,12 @@ class GreySearch(DiskSearch):
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
         return torch.cat([to_int8(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
 
-    def _templates(self, paint: TextureTable) -> Tensor:
-        """Return normalised views of all rotations, (K, P) int8."""
-        normal = self._view.normal_view.T.contiguous()
-        chunks = torch.split(self.templates, BATCH)
-        return torch.cat([to_int8(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
-
     def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
         """Refine the peaks of one disk; return its proposals, best first."""
         settings = self._settings
-        R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
+        R, score = refine_rotation(self._rough, disk, starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]
-        R, score = refine_rotation(self._fine, level_reference(self._fine, disk), R, settings.fine_steps)
+        R, score = refine_rotation(self._fine, disk, R, settings.fine_steps)
         chosen = self._distinct(R, score)
         chosen = chosen[score[chosen] >= settings.score_min]
         return Candidates.of_disk(so3.nearest_rotation(R[chosen].double()), score[chosen].double())

@@ -16,23 +16,16 @@ def crop_disk(
     frame: NDArray[np.generic], u_px: float, v_px: float, radius_px: float, size_px: int
 ) -> NDArray[np.float32]:
     """Return the square about a disk of a frame (H, W), resampled bilinearly to (S, S) float32 grey levels.
-    u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border the nearest pixel
-    repeats.
+    u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border, border pixels repeat.
     """
     offset = disk_offsets(size_px).numpy() * radius_px
     # The window first: a map over the whole frame would convert all of it to float.
     left, right = _span(u_px, radius_px, frame.shape[1])
     top, bottom = _span(v_px, radius_px, frame.shape[0])
     window = frame[top:bottom, left:right].astype(np.float32)
-    return np.asarray(
-        cv2.remap(
-            window,
-            (offset[..., 0] + (u_px - left)).astype(np.float32),
-            (offset[..., 1] + (v_px - top)).astype(np.float32),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-    )
+    at = np.add(offset, [u_px - left, v_px - top]).astype(np.float32)
+    found = cv2.remap(window, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found)
 
 
 def _span(centre_px: float, radius_px: float, length: int) -> tuple[int, int]:

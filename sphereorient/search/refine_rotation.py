@@ -53,36 +53,24 @@ def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int,
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Target:
-    """The pixels of one disk at one level."""
-
-    grey: Tensor  # (P,), in units of its deviation from the smoothest light
-    unexplained: Tensor  # (), cost of light without paint
-
-
-def level_reference(level: DetailLevel, disk: Tensor) -> Target:
-    """Return a level's pixels of a disk, (S, S) grey levels of any scale."""
+def refine_rotation(level: DetailLevel, disk: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Fit rough orientations R_view_body (Q, 3, 3) float32 of a disk (S, S) by Gauss-Newton steps; return scores (Q,),
+    too: the share of the disk's deviation from smooth light that paint explains, at most 1.
+    Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
+    """
     grey = level.blur(disk[None])[0].reshape(-1)[level.place]
     grey = grey - (grey * level.weight).sum() / level.weight.sum()
     grey = grey / grey.abs().amax().clamp_min(1e-12)
     rough = grey - (_solved(level.white[None], grey, level.weight) @ level.white)[0]
     deviation = (rough.square() * level.weight).sum().div(level.weight.sum()).sqrt().clamp_min(1e-12)
-    return Target(grey=grey / deviation, unexplained=_cost(level, rough / deviation))
-
-
-def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Fit rough orientations R_view_body (Q, 3, 3) float32 by Gauss-Newton steps; return them with scores (Q,).
-    The score is the share of the disk's deviation from smooth light that paint explains, at most 1.
-    Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
-    """
+    grey, unexplained = grey / deviation, _cost(level, rough / deviation)
     R, weight, whites = R_view_body, level.weight.expand(len(R_view_body), -1), len(level.white)
     for _ in range(steps):
         normal_body = R.mT @ level.normal
         value, slope = level.paint.sample(normal_body)
         light = _light_columns(level, value)
-        found = _solved(light, target.grey, weight)
-        left = target.grey - (found[:, None] @ light)[:, 0]
+        found = _solved(light, grey, weight)
+        left = grey - (found[:, None] @ light)[:, 0]
         weight = level.weight * _trust(left)
         gain = (found[:, None, :whites] @ level.white)[:, 0].clamp_min(GAIN_MIN)
         # Rotating the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
@@ -90,10 +78,10 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
         R = R @ cayley(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
     light = _light_columns(level, level.paint.sample(R.mT @ level.normal)[0])
-    found = _solved(light, target.grey, weight)
-    cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
+    found = _solved(light, grey, weight)
+    cost = _cost(level, grey - (found[:, None] @ light)[:, 0])
     # A negative gain is the negative of the map.
-    return R, torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
+    return R, torch.where(found[:, 0] > 0, 1.0 - cost / unexplained.clamp_min(1e-12), -1.0)
 
 
 def cayley(turn: Tensor) -> Tensor:

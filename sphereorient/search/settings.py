@@ -6,44 +6,25 @@ from pydantic import BaseModel, Field
 class OrientSettings(BaseModel, frozen=True, extra="forbid"):
     """How possible orientations are found (paper sections III B and C)."""
 
-    size_px: int | None = Field(
-        None, ge=16, description="side of the disk's picture, px; null takes the movie's median diameter (real size)"
-    )
-    black_share: float = Field(
-        0.30, gt=0, lt=1, description="at least this share of the disk becomes black; the paper's b"
-    )
+    size_px: int | None = Field(None, ge=16, description="side of disks, px; null: the movie's median diameter")
+    black_share: float = Field(0.30, gt=0, lt=1, description="least share of the disk that becomes black; paper: b")
     white_share: float = Field(0.30, gt=0, lt=1, description="at least this share becomes white; the paper's w")
     regions: tuple[float, float] = Field(
-        (0.5, 0.3),
-        description="sides of the two moving regions of Otsu's method, in diameters: light changes over the first, "
-        "patches are as large as the second",
+        (0.5, 0.3), description="sides of Otsu's moving regions, diameters: as light changes, and as patches are large"
     )
     region_contrast_min: float = Field(
-        0.3,
-        ge=0,
-        le=1,
-        description="a region whose two classes differ less (0..1) shows one paint: the global one decides",
+        0.3, ge=0, le=1, description="a region whose classes differ less shows one paint: the global one decides"
     )
-    disk_share: float = Field(
-        1.0, gt=0.5, le=1, description="pixels within this share of the radius are compared; the paper: all"
-    )
+    disk_share: float = Field(1.0, gt=0.5, le=1, description="share of the radius that is compared; the paper: all")
     coarse_step_deg: float = Field(12.0, ge=4, le=30, description="step of the coarse Lattman grid; the paper's 12")
     score_margin: float = Field(
         0.1, gt=0, lt=0.5, description="possible orientations: T above the best less this; the paper's 0.1"
     )
-    group_deg: float = Field(
-        30.0, gt=0, lt=180, description="orientations closer than this are one group; the paper: 30 to 45"
-    )
-    groups_max: int = Field(
-        40, ge=1, description="a frame with more groups is a runaway: noise fits everywhere, paint in a few places"
-    )
+    group_deg: float = Field(30.0, gt=0, lt=180, description="orientations closer than this are a group; paper: 30-45")
+    groups_max: int = Field(40, ge=1, description="a frame with more groups is a runaway: noise fits everywhere")
     fine_step_deg: float = Field(3.0, gt=0.5, le=12, description="step of the fine grid; the paper's 3")
     fine_radius_deg: float = Field(
-        12.0,
-        gt=0,
-        le=45,
-        description="reach of the fine grid about each possible orientation of a group; the coarse grid's covering "
-        "radius is 0.704 steps",
+        12.0, gt=0, le=45, description="reach of the fine grid; the coarse grid's covering radius is 0.704 steps"
     )
     renderer: Literal["table", "kornia"] = Field(
         "table", description="who makes the fine grid's templates: a table that the renderer fills, or the renderer"
@@ -54,26 +35,15 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
 class GreySearchSettings(BaseModel, frozen=True, extra="forbid"):
     """How orientations are searched for on grey values (method precise)."""
 
-    size_px: int = Field(
-        40, ge=16, le=128, description="side of the disk's picture, px; 40 has 1,256 pixels, 24 twice the speed"
-    )
+    size_px: int = Field(40, ge=16, le=128, description="side of the disk's picture, px; 24 takes half the time of 40")
     distance_radii: float | None = Field(
         None, gt=1.5, description="of the camera from the ball, in its radii; null: so far that perspective is nothing"
     )
-    step_deg: float = Field(
-        12.0, ge=6, le=30, description="step of the bank's Lattman grid; 12: no rotation is beyond 14.5 of a template"
-    )
-    detail: float = Field(
-        0.1, gt=0, lt=0.5, description="detail finer than this is blurred away in the bank, in radii (5.7 degrees)"
-    )
-    window: float = Field(
-        0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken to be even, radii (standard deviation)"
-    )
+    step_deg: float = Field(12.0, ge=6, le=30, description="step of the bank's grid; 12: at most 14.5 to a template")
+    detail: float = Field(0.1, gt=0, lt=0.5, description="finer detail is blurred away in the bank, radii")
+    window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood of even light, radii (standard deviation)")
     clip: float = Field(
-        0.6,
-        gt=0.1,
-        description="differences from the neighbourhood beyond this many deviations of the disk are cut off: "
-        "reflections, places lit better than others",
+        0.6, gt=0.1, description="differences beyond this many deviations are cut off: reflections, uneven light"
     )
     peak_deg: float = Field(20.0, gt=0, lt=90, description="the bank's peaks are at least this far apart")
     peaks: int = Field(8, ge=1, le=32, description="best peaks from which a climb begins")
@@ -81,21 +51,15 @@ class GreySearchSettings(BaseModel, frozen=True, extra="forbid"):
     finalists: int = Field(4, ge=1, description="climbs that go on to the finest detail")
     fine_steps: int = Field(3, ge=1, description="steps of these")
     distinct_deg: float = Field(8.0, gt=0, lt=90, description="proposals nearer than this to a better one are the same")
-    score_min: float = Field(
-        0.45, ge=0, lt=1, description="proposals that explain less of the picture (0..1) are none; smooth noise: 0.36"
-    )
+    score_min: float = Field(0.45, ge=0, lt=1, description="proposals that explain less are none; smooth noise: 0.36")
 
 
 class ProposeSettings(BaseModel, frozen=True, extra="forbid"):
     """Who proposes orientations: the template search, a trained network, or both (docs/proposer.md)."""
 
-    checkpoint: str | None = Field(
-        None, description="a trained network's file, `default` for the one that comes along; null: the templates alone"
-    )
+    checkpoint: str | None = Field(None, description="a network's file, `default`: the bundled; null: templates alone")
     when: Literal["always", "in_doubt"] = Field(
         "in_doubt",
         description="in_doubt: templates first, the network where they explain too little; always: the network alone",
     )
-    sure: float = Field(
-        0.75, ge=0, le=1, description="in_doubt: templates of a score above this need no second opinion"
-    )
+    sure: float = Field(0.75, ge=0, le=1, description="in_doubt: templates of a higher score need no second opinion")

@@ -71,9 +71,8 @@ class TemplateBank(DiskSearch):
         grey = torch.as_tensor(disks).float()
         flat = grey.reshape(-1, *grey.shape[-2:])
         filled = F.pad(flat, (0, 0, 0, 0, 0, -len(flat) % BATCH))
-        parts = [
-            extract_paint(some, self._view.inside, self._settings) for some in torch.split(filled, BATCH) if len(some)
-        ]
+        batches = torch.split(filled, BATCH) if len(flat) else ()
+        parts = [extract_paint(some, self._view.inside, self._settings) for some in batches]
         return torch.cat([flat[:0], *parts])[: len(flat)].reshape(grey.shape)
 
     def quality(self, paint: Tensor, R_view_body: Tensor) -> Tensor:
@@ -100,9 +99,8 @@ class TemplateBank(DiskSearch):
             ShapeError: the disks are of another size.
         """
         check_disks(disks, self.size_px, self.size_px)
-        return Candidates.joined(
-            [self._proposals(paint) for paint in torch.split(self.paint(disks), BATCH) if len(paint)]
-        )
+        batches = torch.split(self.paint(disks), BATCH) if len(disks) else ()
+        return Candidates.joined([self._proposals(paint) for paint in batches])
 
     def groups(self, T: Tensor) -> Tensor:
         """Return the group (F, K) int64 of each possible orientation by T (F, K), 0 about the best; -1: not possible.
@@ -141,15 +139,12 @@ class TemplateBank(DiskSearch):
         T, views = T.gather(-1, order), views.gather(1, order[..., None, None].expand_as(views))
         # Two groups may reach one rotation: keep the better of those within two fine steps.
         kept = (self._settings.score_min <= T) & distinct(views, 2 * math.radians(self._settings.fine_step_deg))
-        reason = [
-            Reason.RUNAWAY if lost else Reason.OK if any_ else Reason.LOW_SCORE
-            for lost, any_ in zip(runaway.tolist(), kept.any(-1).tolist(), strict=True)
-        ]
+        states = zip(runaway.tolist(), kept.any(-1).tolist(), strict=True)
         return Candidates(
             offset=F.pad(kept.sum(-1).cumsum(0), (1, 0)),
             R_view_body=so3.nearest_rotation(views[kept].double()),
             score=T[kept].double(),
-            reason=tuple(reason),
+            reason=tuple(Reason.RUNAWAY if lost else Reason.OK if any_ else Reason.LOW_SCORE for lost, any_ in states),
         )
 
     def _fine_search(self, paint: Tensor, frame: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:

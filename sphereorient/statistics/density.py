@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erfcx, log_ndtr, logsumexp
 
-from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_counts, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, Statistic, bootstrap, segment_counts, segment_sums
 from sphereorient.statistics.moments import noise_let_through
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
@@ -14,6 +14,7 @@ ROOT3 = np.sqrt(3.0)
 WIDEST_S = 1.5  # upper limit of the fit: flatness 14,000
 NARROWEST_S = 0.02  # nearly the uniform law, flatness 1.8
 NODES = 120  # values of a at which the likelihood is tabulated
+STEP = 1e-3  # of ln|x|, of its derivative
 FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
 TINY = 1e-300
@@ -34,10 +35,8 @@ def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float =
     if noise_share > 0:
         place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
         clean = np.sqrt(1 - noise_share)
-        logs = [
-            np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
-            for z, w in zip(place, weight, strict=True)
-        ]
+        each = [log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a) for z in place]
+        logs = [np.log(w / np.sqrt(2 * np.pi)) + one for w, one in zip(weight, each, strict=True)]
         return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
     a = np.asarray(a, np.float64)
     size = np.maximum(np.abs(x), TINY)
@@ -84,7 +83,7 @@ def fit_stretched(
     counts = segment_counts(bins, FINE_BINS, segment, segments)
     squares = segment_sums(np.stack([normal, normal**2], axis=1), segment, segments)
     sums = np.concatenate([counts[:, used].astype(np.float64), squares], axis=1)
-    found = bootstrap(sums, _Likelihood(middle[used], noise_share).fit, settings)
+    found = bootstrap(sums, _likeliest(middle[used], noise_share), settings)
     logs = log_stretched_exponential(np.exp(middle[used]), float(found.value[0]), noise_share)
     return StretchedFit(
         a=found.part(0),
@@ -94,32 +93,27 @@ def fit_stretched(
     )
 
 
-class _Likelihood:
-    """The likelihood of binned data, ln|x| (K,), as a smooth function of a and of the scale."""
+def _likeliest(log_x: Floats, noise_share: float) -> Statistic:
+    """Return the fit of a and flatness (..., 2) to counts by ln|x| (K,) and sums of x and x^2, (..., K + 2)."""
+    nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
+    steps = (0.0, STEP, -STEP)
+    table, up, down = (log_stretched_exponential(np.exp(log_x + s)[:, None], nodes, noise_share) for s in steps)
+    slope = (up - down) / (2 * STEP)  # a resampled ensemble is divided by its own standard deviation
 
-    def __init__(self, log_x: Floats, noise_share: float) -> None:
-        self.nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
-        self.table = log_stretched_exponential(np.exp(log_x)[:, None], self.nodes, noise_share)
-        # d/d ln|x|: a resampled ensemble has its own standard deviation, by which its values are divided
-        step = 1e-3
-        up, down = (
-            log_stretched_exponential(np.exp(log_x + s)[:, None], self.nodes, noise_share) for s in (step, -step)
-        )
-        self.slope = (up - down) / (2 * step)
-
-    def fit(self, totals: Floats) -> Floats:
-        """Return a and flatness (..., 2) of counts and squares (..., K + 2)."""
+    def fit(totals: Floats) -> Floats:
         counts, first, second = totals[..., :-2], totals[..., -2], totals[..., -1]
         number = counts.sum(-1)
         log_scale = 0.5 * np.log(second / number - (first / number) ** 2)
-        value = counts @ self.table - log_scale[..., None] * (counts @ self.slope)
+        value = counts @ table - log_scale[..., None] * (counts @ slope)
         # the largest value, interpolated by a parabola
         k = np.clip(value.argmax(-1), 1, NODES - 2)[..., None]
         left, mid, right = (np.take_along_axis(value, k + j, axis=-1)[..., 0] for j in (-1, 0, 1))
         bend = left - 2 * mid + right
         shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
-        a = self.nodes[0] + np.clip(k[..., 0] + shift, 0, NODES - 1) * (self.nodes[1] - self.nodes[0])
+        a = nodes[0] + np.clip(k[..., 0] + shift, 0, NODES - 1) * (nodes[1] - nodes[0])
         return np.stack([a, flatness_of(a)], axis=-1)
+
+    return fit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,11 +142,10 @@ def density_of(
     x: Floats, segment: Rows, segments: int, *, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> Density:
     """Return the PDF of values (M,) sorted by segment, over 10 standard deviations to either side; as `density`."""
-    normal, bins = (x - x.mean()) / x.std(), BINS
-    edges = np.linspace(-REACH, REACH, bins + 1)
-    place = np.searchsorted(edges, normal, side="right") - 1
-    inside = (place >= 0) & (place < bins)
-    flat = segment_counts(place[inside], bins, segment[inside], segments)
+    edges = np.linspace(-REACH, REACH, BINS + 1)
+    place = np.searchsorted(edges, (x - x.mean()) / x.std(), side="right") - 1
+    inside = (place >= 0) & (place < BINS)
+    flat = segment_counts(place[inside], BINS, segment[inside], segments)
     sums = np.concatenate([flat, np.bincount(segment, minlength=segments)[:, None]], axis=1).astype(np.float64)
     width = edges[1] - edges[0]
     pdf = bootstrap(sums, lambda totals: totals[..., :-1] / (totals[..., -1:] * width), settings)

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sphereorient.motion.measure import M_PER_MM
 from sphereorient.statistics.bootstrap import Floats, Interval, bootstrap, segment_sums
 from sphereorient.statistics.moments import Moments
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-
-M_PER_MM = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,8 +69,7 @@ def zero_mean_p_value(rows: Floats) -> float:
     if count <= size + 1:
         return float("nan")
     mean = rows.mean(0)
-    deviation = rows - mean
-    covariance = deviation.T @ deviation / (count - 1)
+    covariance = (rows - mean).T @ (rows - mean) / (count - 1)
     t2 = count * mean @ np.linalg.pinv(covariance) @ mean
     return float(fisher.sf(t2 * (count - size) / (size * (count - 1)), size, count - size))
 
@@ -98,10 +97,8 @@ def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
     step_s = (ensemble.time_s[second] - ensemble.time_s[first])[:, None]
     middle = (omega[first] + omega[second]) / 2
     size = np.sqrt(np.square(middle).mean())
-    lab, body = (
-        float(np.sqrt(np.square(rotvec / step_s - middle).mean()) / size)
-        for rotvec in (rotvec_between(before, after), rotvec_between(after.mT, before.mT))
-    )
+    turns = rotvec_between(before, after), rotvec_between(after.mT, before.mT)
+    lab, body = (float(np.sqrt(np.square(turn / step_s - middle).mean()) / size) for turn in turns)
     frame: Literal["lab", "body", "none", "both"] = "lab" if lab < ALIKE else "none"
     if body < ALIKE:
         frame = "both" if lab < ALIKE else "body"

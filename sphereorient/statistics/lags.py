@@ -17,9 +17,7 @@ FEWEST_SEGMENTS = 10  # of a lag; with fewer its error bar means little
 
 
 def places(frame: Rows, segment: Rows) -> Rows:
-    """Return the places of rows (M,) on one regular grid: `frame` of its segment, an empty place after each segment.
-    Frames increase within a segment; segments 0 .. S - 1 increase.
-    """
+    """Return the places of rows (M,), sorted by segment, on one regular grid; an empty place ends each segment."""
     lengths = frame[np.flatnonzero(np.append(np.diff(segment), 1))] + 2
     return np.asarray(frame + (np.cumsum(lengths) - lengths)[segment], np.int64)
 
@@ -112,9 +110,8 @@ def integral_time(curve: Floats, lag_s: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Increments:
-    """Increments x(t + lag) - x(t) of one quantity; made by `increments`. Columns: x, y, z, and all three pooled."""
+    """Increments of omega_lab over a lag; made by `increments`. Columns: x, y, z, and all three pooled."""
 
-    quantity: str
     lag_s: Floats  # (L,)
     lag_frames: Rows  # (L,)
     rms: Interval  # (L, 4); pooled: of one component
@@ -124,12 +121,11 @@ class Increments:
 
 def increments(
     ensemble: Ensemble,
-    quantity: str = "omega_lab",
     lags_s: Sequence[float] | None = None,
     integral_time_s: float | None = None,
     settings: BootstrapSettings | None = None,
 ) -> Increments:
-    """Return rms and flatness of increments of a quantity (a name in UNITS), for lags that ten segments or more reach.
+    """Return rms and flatness of increments of omega_lab, for lags that ten segments or more reach.
     `lags_s`, s, are rounded to frames; None: twelve, geometric, from one frame to `integral_time_s` (None: half the
     median segment). The flatness goes from the derivative's to 3 + (F - 3) / 2 at long lags.
     Source: the paper, section IV, with docs/errata.md E7.
@@ -141,7 +137,7 @@ def increments(
     else:
         frames = np.asarray(lags_s) / ensemble.step_s
     wanted = np.unique(np.clip(np.rint(frames).astype(np.int64), 1, max(pairs.longest, 1)))
-    x = ensemble.values[quantity]
+    x = ensemble.values["omega_lab"]
     sums, counts, lags = [], [], []
     for lag in wanted.tolist():
         first, second = pairs.at(lag)
@@ -152,12 +148,11 @@ def increments(
         sums.append(segment_sums(np.stack([np.ones_like(d2), d2, d2 * d2], axis=-1), segment, ensemble.segments))
         counts.append(len(first))
         lags.append(lag)
-    whole = np.stack(sums, axis=1)  # (S, L, 3, 3)
+    whole, lag_frames = np.stack(sums, axis=1), np.array(lags, dtype=np.int64)  # (S, L, 3, 3), (L,)
     found = studentized(whole.reshape(*whole.shape[:2], 9), _rms_and_flatness, np.ones(8, bool), settings)
     return Increments(
-        quantity=quantity,
-        lag_s=np.asarray(np.array(lags, dtype=np.int64) * ensemble.step_s, np.float64),
-        lag_frames=np.array(lags, dtype=np.int64),
+        lag_s=np.asarray(lag_frames * ensemble.step_s, np.float64),
+        lag_frames=lag_frames,
         rms=found.part((..., slice(0, 4))),
         flatness=found.part((..., slice(4, 8))),
         pairs=np.array(counts),
@@ -172,15 +167,9 @@ def _rms_and_flatness(totals: Floats) -> Floats:
     return np.concatenate([np.sqrt(second / count), fourth * count / second**2], axis=-1)
 
 
-def increment_density(
-    ensemble: Ensemble,
-    lag_frames: int,
-    quantity: str = "omega_lab",
-    component: int = 0,
-    settings: BootstrapSettings | None = None,
-) -> Density:
-    """Return the PDF of the increments over one lag, in their standard deviations; some segment must be longer."""
+def increment_density(ensemble: Ensemble, lag_frames: int, settings: BootstrapSettings | None = None) -> Density:
+    """Return the PDF of increments of omega_lab's x over one lag, standard deviations; some segment must be longer."""
     first, second = Pairs(ensemble).at(lag_frames)
-    x = ensemble.values[quantity][:, component]
+    x = ensemble.values["omega_lab"][:, 0]
     there, segment = np.unique(ensemble.segment[first], return_inverse=True)
     return density_of(x[second] - x[first], segment, len(there), settings=settings)

@@ -47,39 +47,25 @@ class MultiLag:
         return np.sqrt(np.maximum(self.variance.value, 0.0))
 
 
-def multi_lag(
-    tracks: Trajectory | list[Trajectory],
-    quantity: str,
-    lags: tuple[int, ...] = LAGS,
-    settings: BootstrapSettings | None = None,
-) -> MultiLag:
+def multi_lag(tracks: Sequence[Trajectory], quantity: str, settings: BootstrapSettings | None = None) -> MultiLag:
     """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
     The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
-    fit over four lags n or more separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
-
-    Raises:
-        TrackError: too few segments or lags for the fit.
-
+    fit over some lags n separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
+    Raises TrackError (too few segments for the fit).
     Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
-    many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
-    step_s = float(np.median(np.concatenate([np.diff(t.time) for t in many])))
-    sums = [np.concatenate([_second_differences(t, quantity, n, step_s) for t in many]) for n in lags]
+    step_s = float(np.median(np.concatenate([np.diff(t.time) for t in tracks])))
+    sums = [np.concatenate([_second_differences(t, quantity, n, step_s) for t in tracks]) for n in LAGS]
     whole = np.stack(sums, axis=1)  # (S, L, 3, 2)
     whole = whole[(whole[..., 1] > 0).any((1, 2))]
-    if len(whole) < 2 or len(lags) < 4:
-        got, do = f"{len(whole)} segments and {len(lags)} lags", "pass more tracks"
-        raise TrackError(refusal("multi_lag", expected="at least two segments and four lags", got=got, do=do))
-    lag_s = step_s * np.array(lags)
+    if len(whole) < 2:
+        got, do = f"{len(whole)}", "pass more tracks"
+        raise TrackError(refusal("multi_lag", expected="at least two segments", got=got, do=do))
+    lag_s = step_s * np.array(LAGS)
     found = bootstrap(whole, lambda totals: _extrapolated(totals[..., 0] / totals[..., 1], lag_s), settings)
     total = whole.sum(0)
-    return MultiLag(
-        quantity=quantity,
-        lag_s=lag_s,
-        naive=total[..., 0] / total[..., 1] / lag_s[:, None] ** 4,
-        variance=found.part(0),
-        noise_variance=found.part(1),
-    )
+    naive = total[..., 0] / total[..., 1] / lag_s[:, None] ** 4
+    return MultiLag(quantity=quantity, lag_s=lag_s, naive=naive, variance=found.part(0), noise_variance=found.part(1))
 
 
 def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float) -> Floats:
@@ -113,7 +99,7 @@ def _rotation(R: Floats, first: Rows, second: Rows) -> Floats:
 def _extrapolated(square: Floats, lag_s: Floats) -> Floats:
     """Fit square (..., L, 3) = 6 noise + variance lag^4 - loss lag^6 + more lag^8; return variance and noise."""
     scale = lag_s / lag_s[-1]
-    powers = np.stack([np.full_like(scale, 6.0), scale**4, scale**6, scale**8], axis=1)[:, : min(4, len(lag_s) - 1)]
+    powers = np.stack([np.full_like(scale, 6.0), scale**4, scale**6, scale**8], axis=1)
     weight = 1 / square.mean(-1, keepdims=True)
     design = powers * weight[..., 0][..., None]
     normal = np.einsum("...lp,...lq->...pq", design, design)
@@ -137,7 +123,7 @@ class WidthCurve:
 
 
 def width_curve(
-    tracks: Trajectory | Sequence[Trajectory],
+    tracks: Sequence[Trajectory],
     quantity: str,
     widths_frames: Sequence[float] = WIDTHS,
     settings: BootstrapSettings | None = None,
@@ -147,8 +133,7 @@ def width_curve(
     frames that the widest one reaches; NaN where all segments are shorter. White noise and regular times are assumed.
     Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
-    many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
-    sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in many])
+    sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in tracks])
     if not len(sums):
         sums = np.zeros((1, len(widths_frames), 3, 6))  # 0 / 0 is NaN
     found = studentized(sums.reshape(len(sums), -1, 6), _width_statistics, np.ones(5, bool), settings)
@@ -156,8 +141,8 @@ def width_curve(
     rows = np.arange(3 * len(widths_frames)).reshape(-1, 3)
     return WidthCurve(
         quantity=quantity,
-        width_s=np.array(widths_frames) * _step(many[0]),
-        length_unit=many[0].length_unit,
+        width_s=np.array(widths_frames) * _step(tracks[0]),
+        length_unit=tracks[0].length_unit,
         **{name: found.part((rows, k)) for k, name in enumerate(names)},
     )
 

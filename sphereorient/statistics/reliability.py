@@ -28,10 +28,7 @@ class Reliability:
 def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
     """Compare probabilities (N,), 0 .. 1 or NaN (left out), with outcomes (N,), bool, in at most `bins` bins.
     Bins have equal counts, but equal probabilities stay in one bin.
-
-    Raises:
-        ShapeError: unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin.
-
+    Raises ShapeError (unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin).
     Source: Naeini et al. 2015 (expected calibration error) with bins of equal count; interval: Wilson 1927.
     """
     said, came = np.asarray(probability, np.float64), np.asarray(outcome, np.bool_)
@@ -54,10 +51,9 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     sums = np.add.reduceat(columns, edges[:-1], axis=1) if len(edges) > 1 else np.zeros((3, 0))
     mean, spread, share = sums / count
     low, high = wilson(share, count)
-    weight = count / len(said) if len(said) else np.full(1, np.nan)
     # The mean absolute deviation of a normal variable is sqrt(2 / pi) sigma.
-    chance = float((weight * np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)).sum()) if len(said) else math.nan
-    error = float((weight * np.abs(share - mean)).sum()) if len(said) else math.nan
+    off = np.abs(share - mean), np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)
+    error, chance = (float((count / len(said) * each).sum()) if len(said) else math.nan for each in off)
     return Reliability(probability=mean, share=share, low=low, high=high, count=count, error=error, chance=chance)
 
 

@@ -68,11 +68,7 @@ def ensemble_of(
     """Collect the usable segments of one or many tracks; `name` is for messages.
     A frame is usable if all six quantities and the smooth pose are finite, and it was not extrapolated. A segment
     counts if it has enough usable frames; frames with larger errors at its ends are then left out.
-
-    Raises:
-        TrackError: no usable frame, fewer than `fewest` segments (if 0: no valid frame), or tracks of kernels and of
-            smoothers together.
-
+    Raises TrackError (no usable frame, fewer than `fewest` segments, or tracks of kernels and smoothers together).
     Source: the paper, section IV: segments above 0.25 T_L; docs/errata.md, settings of the paper: 50 frames.
     """
     settings = settings or SegmentSettings()
@@ -180,10 +176,7 @@ class Durations:
 
 def durations(span_s: Floats, truncated_s: float, *, bins: int = 20, level: float = 0.95) -> Durations:
     """Return the histogram of durations (S,), s, and their exponential decay time with its exact interval.
-
-    Raises:
-        TrackError: fewer than two durations are `truncated_s` or longer.
-
+    Raises TrackError (fewer than two durations are `truncated_s` or longer).
     Source: textbook (Epstein and Sobel 1953), maximum likelihood; the paper, section IV.
     """
     from scipy.stats import chi2

@@ -7,23 +7,13 @@ class SegmentSettings(BaseModel, frozen=True, extra="forbid"):
     """Which frames and segments of a track go into its statistics."""
 
     min_frames: int = Field(50, ge=2, description="segments with fewer frames are left out, as the paper does")
-    min_integral_times: float = Field(
-        0.25, ge=0, description="segments shorter than this many integral times are left out"
-    )
-    integral_time_s: float | None = Field(
-        None, gt=0, description="integral time, s; null: the flow's in experiment.yaml, else that of the velocity"
-    )
+    min_integral_times: float = Field(0.25, ge=0, description="shorter segments are left out, integral times")
+    integral_time_s: float | None = Field(None, gt=0, description="s; null: of experiment.yaml, or the velocity's")
     max_duration_s: float | None = Field(
-        None,
-        gt=0,
-        description="longer segments are cut into pieces of this duration, s, which then count as independent: for few "
-        "long records; several integral times",
+        None, gt=0, description="longer segments are cut into pieces of this duration, s: several integral times"
     )
     max_sigma: float = Field(
-        3.0,
-        gt=1,
-        description="frames whose stated error of acceleration or alpha is more than so many times their track's "
-        "median are left out: the ends of segments, where the smoother knows one side only",
+        3.0, gt=1, description="frames whose error of acceleration or alpha is so many times the median are left out"
     )
     keep_extrapolated: bool = Field(False, description="also use frames that the smoother filled from their neighbours")
 

@@ -1,6 +1,7 @@
 """All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -69,10 +70,7 @@ def summarise(
 ) -> Summary:
     """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
     A single segment gives only the table, without intervals; without a segment that counts its numbers are NaN.
-
-    Raises:
-        TrackError: no valid frame, or tracks of kernels and of smoothers together.
-
+    Raises TrackError (no valid frame, or tracks of kernels and of smoothers together).
     Source: the paper, section IV, with docs/errata.md A5, E6, E7.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
@@ -85,9 +83,8 @@ def summarise(
         around = replace(around, diameter_mm=None)
     progress(1, STEPS)
     if ensemble.segments >= FEWEST and settings.integral_time_s is None:
-        measured = float(
-            lags.correlation(ensemble, next(iter(ensemble.values)), settings=settings).integral_time_s.value[3]
-        )
+        first = lags.correlation(ensemble, next(iter(ensemble.values)), settings=settings)
+        measured = float(first.integral_time_s.value[3])
         if measured > 0:  # leave out segments that are short compared with the integral time of all of them
             settings = settings.model_copy(update={"integral_time_s": measured})
             kept = ensemble.span_s >= settings.min_integral_times * measured
@@ -121,12 +118,11 @@ def _distributions(
     longest_s = float(curves["omega_lab"].integral_time_s.value[3])
     lagged = lags.increments(ensemble, integral_time_s=longest_s if longest_s > 0 else None, settings=settings)
     chosen = np.unique(np.linspace(0, len(lagged.lag_frames) - 1, SHOWN_LAGS).round().astype(int))
+    shown = lagged.lag_frames[chosen].tolist()
     return Distributions(
         densities=each(lambda q: tuple(density.density(ensemble, q, i, settings=settings) for i in range(3))),
         increments=lagged,
-        increment_densities={
-            lag: lags.increment_density(ensemble, lag, settings=settings) for lag in lagged.lag_frames[chosen].tolist()
-        },
+        increment_densities={lag: lags.increment_density(ensemble, lag, settings=settings) for lag in shown},
         correlations=curves,
         durations=_durations(tracks, ensemble, settings),
         angles=isotropy.euler_densities(ensemble, settings=settings),
@@ -153,8 +149,6 @@ def _durations(tracks: Sequence[Trajectory], ensemble: Ensemble, settings: Stati
 def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> dict[str, noise.MultiLag]:
     found = {}
     for quantity in ("alpha_lab",) if all(track.held for track in tracks) else noise.RATES:
-        try:
-            found[quantity] = noise.multi_lag(list(tracks), quantity, settings=settings)
-        except TrackError:  # too few neighbouring frames: left out, and the page says so
-            continue
+        with suppress(TrackError):  # too few neighbouring frames: left out, and the page says so
+            found[quantity] = noise.multi_lag(tracks, quantity, settings)
     return found

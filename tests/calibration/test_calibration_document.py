@@ -59,7 +59,7 @@ def clicked(points, name="cam1"):
 FAULTS = [
     ({"surveyed": None}, r"surveyed: expected a pose that defines the lab frame, got none; write the plate's pose"),
     (surveyed(pose=77), r"surveyed: expected a pose with a picture, got pose 77, without a picture; name"),
-    (surveyed(R_lab_plate=MIRROR), r"R_lab_plate: expected a rotation, got a reflection"),
+    (surveyed(R_lab_plate=MIRROR), r"R_lab_plate: expected a rotation.* det = -1"),
     (surveyed(R_lab_plate=[[1.0, 0, 0], [0, 1.1, 0], [0, 0, 1.0]]), r"R_lab_plate: expected a rotation"),
     (surveyed(T_lab_plate=[0.0, float("nan"), 0.0]), r"surveyed.T_lab_plate.*finite number, got nan"),
     ({"plate": None}, r"plate: expected a plate, got none"),
@@ -84,7 +84,7 @@ FAULTS = [
     ({"pixel_pitch": [0.02, -0.02]}, r"pixel_pitch.1.*greater than 0"),
     ({"model": "fisheye"}, r"model.*'tsai'.*got 'fisheye'"),
     ({"modle": "tsai"}, r"got 'modle'; write 'model' instead"),
-    ({"ports": {"cam3": PORT}}, r"ports: expected a camera with pictures, got 'cam3'"),
+    ({"ports": {"cam3": PORT}}, r"ports.*cam3"),
     ({"ports": {"cam1": PORT}, "fit_ports": ["port_ofset"]}, r"write 'port_offset' instead"),
     ({"fit_ports": ["port_offset"]}, r"fit_ports: expected ports to fit, got none"),
     ({"ports": {"cam1": PORT}, "fit_ports": ["port_offset"] * 2}, r"fit_ports: expected different names"),

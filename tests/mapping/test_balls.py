@@ -11,8 +11,9 @@ import torch
 from sphereorient.cameras import sphere_disk_px
 from sphereorient.errors import PaintError
 from sphereorient.locate import CameraScene
+from sphereorient.locate.matching import assigned
 from sphereorient.locate.outline import Outline
-from sphereorient.mapping.balls import FREE, _assigned, _crops_of, _instant, _linked, _places
+from sphereorient.mapping.balls import FARTHEST, FREE, _crops_of, _instant, _linked, _places
 from sphereorient.mapping.disks import Crop
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.synth import SynthSettings
@@ -36,9 +37,9 @@ class Chosen:
 def test_no_disk_is_in_two_balls_and_a_ball_that_fits_nowhere_is_not_seen():
     matches = [Chosen(0, 0), Chosen(1, 0), Chosen(1, 1)]
     cost = np.array([[0.5, 3.0, 50.0], [4.0, 0.2, 1.0]])
-    assert _assigned(cost, matches).tolist() == [0, 2], "the second one's best match has a disk of the first"
+    assert assigned(cost - FARTHEST, matches) == [(0, 0), (1, 2)], "the second one's best match has a disk of the first"
     cost[1] = 5.0, 5.0, 30.0
-    assert _assigned(cost, matches).tolist() == [0, -1]
+    assert assigned(cost - FARTHEST, matches) == [(0, 0)]
 
 
 def paths() -> dict[str, torch.Tensor]:

@@ -12,7 +12,7 @@ from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.mapping.chain import _chained_pairs, chained, close_loops, find_chain
 from sphereorient.mapping.disks import without_static
-from sphereorient.mapping.pairs import RelativeRotations, all_rotations, solve_graph
+from sphereorient.mapping.pairs import RelativeRotations, solve_graph
 from sphereorient.mapping.settings import MapSettings
 
 
@@ -44,7 +44,7 @@ def test_loops_break_a_planted_drift_and_wrong_ones_do_not():
     loops = turns_of(R, first[apart], second[apart])
     wrong = loops.where(torch.arange(0, len(loops), 4))
     wrong = turns_of(R, wrong.first, wrong.second, [0.0, 0.9, 0.4])
-    closed, left = solve_graph(drifted, all_rotations([chain, loops, wrong]), math.radians(1))
+    closed, left = solve_graph(drifted, RelativeRotations.joined([chain, loops, wrong]), math.radians(1))
     assert error_deg(closed, R).max() < 0.6
     assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # told apart from the right ones
     alone, _ = solve_graph(drifted, chain, math.radians(1))

@@ -18,7 +18,7 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
-from sphereorient.mapping.verdict import jumps, paint_correlation
+from sphereorient.mapping.learn import jumps, paint_correlation
 from sphereorient.movies import open_movie
 
 QUICK = MapSettings(rounds=4, pixels=600, height=64)

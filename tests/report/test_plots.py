@@ -183,7 +183,6 @@ def planted_increments() -> SimpleNamespace:
     frames = np.array([1, 5, 20])
     flat = np.stack([[9.0, 6.0, 4.0], [8.0, 5.5, 3.5], [7.0, 5.0, 3.2], [8.5, 5.6, 3.6]], axis=1)
     steps = Increments(
-        quantity="omega_lab",
         lag_s=frames / RATE_HZ,
         lag_frames=frames,
         rms=interval(np.ones((3, 4))),

@@ -84,7 +84,7 @@ def test_statistics_and_their_figures_say_radii():
         "radii/s^2",
         "rad/s",
     ]
-    widths = {"acceleration": width_curve(tracks, "acceleration", settings=FEW)}
+    widths = {"acceleration": width_curve([tracks], "acceleration", settings=FEW)}
     assert "(radii/s²)" in plots.widths_figure(widths).axes[0].get_ylabel()
 
 

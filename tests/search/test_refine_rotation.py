@@ -13,7 +13,7 @@ from orient_examples import attitudes, texture_of
 
 from sphereorient import so3
 from sphereorient.search.normalisation import Blur, LocalNormalisation, rim_share
-from sphereorient.search.refine_rotation import DetailLevel, cayley, detail_level, level_reference, refine_rotation
+from sphereorient.search.refine_rotation import DetailLevel, cayley, detail_level, refine_rotation
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 from sphereorient.sphere.view import disk_offsets
@@ -51,9 +51,9 @@ def test_a_climb_from_10_degrees_away_arrives(kind, detail, error_deg, explained
     R = attitudes(1, seed=5)[0]
     level = level_of(kind, detail)
     starts = away(R, 10.0, 12)
-    target = level_reference(level, disk_of(kind, R))
-    _, before = refine_rotation(level, target, starts, 0)
-    found, after = refine_rotation(level, target, starts, 4)
+    disk = disk_of(kind, R)
+    _, before = refine_rotation(level, disk, starts, 0)
+    found, after = refine_rotation(level, disk, starts, 4)
     assert so3.geodesic_distance(found.double(), R).rad2deg().max() < error_deg
     assert (after > before + 0.1).all()
     assert after.min() > explained
@@ -63,10 +63,10 @@ def test_a_climb_from_10_degrees_away_arrives(kind, detail, error_deg, explained
 def test_each_axis_is_turned_the_right_way():
     R = attitudes(1, seed=6)[0]
     level = level_of("blobs")
-    target = level_reference(level, disk_of("blobs", R))
+    disk = disk_of("blobs", R)
     axes = torch.eye(3, dtype=torch.float64)
     starts = so3.exp(math.radians(2.0) * torch.cat([axes, -axes])) @ R
-    found, _ = refine_rotation(level, target, starts.float(), 1)
+    found, _ = refine_rotation(level, disk, starts.float(), 1)
     assert so3.geodesic_distance(found.double(), R).rad2deg().max() < 0.7
 
 
@@ -81,19 +81,19 @@ def test_half_the_pixels_arrive_too():
     R = attitudes(1, seed=7)[0]
     level = level_of("patches", every=2)
     assert abs(len(level.place) / len(VIEW.normal_view) - 0.5) < 0.01
-    found, _ = refine_rotation(level, level_reference(level, disk_of("patches", R)), away(R, 6.0, 8), 4)
+    found, _ = refine_rotation(level, disk_of("patches", R), away(R, 6.0, 8), 4)
     assert so3.geodesic_distance(found.double(), R).rad2deg().max() < 0.5
 
 
 def test_a_climb_stays_where_it_is_right_and_takes_no_leaps_where_nothing_fits():
     R = attitudes(1, seed=8)[0]
     level = level_of("dots", 0.05)
-    target = level_reference(level, disk_of("dots", R))
-    found, score = refine_rotation(level, target, R[None].float(), 1)
+    disk = disk_of("dots", R)
+    found, score = refine_rotation(level, disk, R[None].float(), 1)
     assert so3.geodesic_distance(found.double(), R).rad2deg() < 0.15
     assert score > 0.96
     far = away(R, 120.0, 20)
-    moved, _ = refine_rotation(level, target, far, 1)
+    moved, _ = refine_rotation(level, disk, far, 1)
     assert so3.geodesic_distance(moved, far).rad2deg().max() < 8.1  # STEP_RAD
 
 
@@ -103,9 +103,9 @@ def test_the_light_is_solved_whatever_it_is_and_the_negative_explains_nothing():
     disk = disk_of("blobs", R)
     x, y = disk_offsets(SIZE, torch.float32).unbind(-1)
     for lit in (disk, 0.01 * disk - 7, disk * (1 + 0.4 * x - 0.3 * y + 0.2 * x * y), disk + 90 * y):
-        _, score = refine_rotation(level, level_reference(level, lit), R[None].float(), 0)
+        _, score = refine_rotation(level, lit, R[None].float(), 0)
         assert score > 0.97
-    _, negative = refine_rotation(level, level_reference(level, 255 - disk), R[None].float(), 0)
+    _, negative = refine_rotation(level, 255 - disk, R[None].float(), 0)
     assert negative == -1
 
 
@@ -113,13 +113,13 @@ def test_the_light_is_solved_whatever_it_is_and_the_negative_explains_nothing():
 def test_a_start_climbs_alike_in_any_company(starts):
     R = attitudes(1, seed=10)[0]
     level = level_of("blobs")
-    target = level_reference(level, disk_of("blobs", R))
+    disk = disk_of("blobs", R)
     many = away(R, 6.0, 7)
-    found, score = refine_rotation(level, target, many[: starts[0]], 3)
+    found, score = refine_rotation(level, disk, many[: starts[0]], 3)
     assert found.shape == (*starts, 3, 3)
     assert score.shape == starts
     for k in range(*starts):
-        alone, alone_score = refine_rotation(level, target, many[k : k + 1], 3)
+        alone, alone_score = refine_rotation(level, disk, many[k : k + 1], 3)
         assert_close(found[k], alone[0], atol=1e-4)
         assert_close(score[k], alone_score[0], atol=1e-4)
 

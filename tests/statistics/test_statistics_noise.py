@@ -31,7 +31,7 @@ def track(true):
     ("quantity", "noise"), [("acceleration", NOISE_MM * 1e-3), ("alpha_lab", np.radians(NOISE_DEG))]
 )
 def test_many_lags_tell_the_motions_variance_from_the_noise(true, track, quantity, noise):
-    found = multi_lag(track, quantity, settings=FEW)
+    found = multi_lag([track], quantity, settings=FEW)
     exact = np.sqrt(np.square(getattr(true, quantity)).mean(0))
     np.testing.assert_allclose(found.rms, exact, rtol=0.03)
     np.testing.assert_allclose(np.sqrt(found.noise_variance.value), noise, rtol=0.04)
@@ -40,7 +40,7 @@ def test_many_lags_tell_the_motions_variance_from_the_noise(true, track, quantit
 
 @pytest.mark.slow
 def test_two_degrees_of_noise_drown_alpha_but_not_its_estimate(true):
-    found = multi_lag(filtered_track(true, 2.0, NOISE_MM, 5), "alpha_lab", settings=FEW)
+    found = multi_lag([filtered_track(true, 2.0, NOISE_MM, 5)], "alpha_lab", settings=FEW)
     np.testing.assert_allclose(np.sqrt(found.noise_variance.value), np.radians(2.0), rtol=0.04)
     assert (found.naive[0] > 500 * 560**2).all()
 
@@ -48,11 +48,11 @@ def test_two_degrees_of_noise_drown_alpha_but_not_its_estimate(true):
 def test_a_segment_too_few_is_refused(track):
     one = track.at(np.flatnonzero(track.segment == 0))
     with pytest.raises(TrackError, match="two segments"):
-        multi_lag(one, "acceleration")
+        multi_lag([one], "acceleration")
 
 
 def test_rms_falls_with_the_width_and_so_does_the_noise(true, track):
-    found = width_curve(track, "acceleration", settings=FEW)
+    found = width_curve([track], "acceleration", settings=FEW)
     exact = np.sqrt(np.square(true.acceleration).mean(0))
     assert (np.diff(found.noise_share.value, axis=0) < 0).all()
     assert (np.diff(found.rms.value, axis=0) < 0).all()
@@ -62,7 +62,7 @@ def test_rms_falls_with_the_width_and_so_does_the_noise(true, track):
 
 
 def test_flatness_of_alpha_is_recovered_by_the_narrowest_kernels_and_lost_by_wide_ones(true, track):
-    found = width_curve(track, "alpha_lab", settings=FEW)
+    found = width_curve([track], "alpha_lab", settings=FEW)
     exact = (true.alpha_lab**4).mean(0) / np.square((true.alpha_lab**2).mean(0))
     assert (np.diff(found.corrected_flatness.value.mean(1)) < 0).all()
     assert found.corrected_flatness.value[0].mean() == pytest.approx(exact.mean(), rel=0.1)
@@ -71,7 +71,7 @@ def test_flatness_of_alpha_is_recovered_by_the_narrowest_kernels_and_lost_by_wid
 def test_foretold_noise_is_what_a_standing_sphere_shows(track):
     rng = np.random.default_rng(6)
     still = replace(track, position=NOISE_MM * rng.standard_normal(track.position.shape))
-    found = width_curve(still, "acceleration", settings=FEW)
+    found = width_curve([still], "acceleration", settings=FEW)
     np.testing.assert_allclose(found.noise_share.value[:5], 1.0, atol=0.05)
     by_hand = 1e-3 * NOISE_MM * float(gaussian_kernel(2.0, 2).norm()) * 600.0**2
     np.testing.assert_allclose(found.rms.value[2], by_hand, rtol=0.03)
@@ -80,7 +80,7 @@ def test_foretold_noise_is_what_a_standing_sphere_shows(track):
 
 def test_one_segment_is_differentiated_as_motion_does_it(track):
     one = track.at(np.flatnonzero(track.segment < 2))
-    found = width_curve(one, "acceleration", (2.0,), FEW)
+    found = width_curve([one], "acceleration", (2.0,), FEW)
     parts = [torch.from_numpy(one.position[one.segment == k]) for k in (0, 1)]
     values = np.concatenate([gaussian_derivative(x, 1 / 600, 2.0, 2).numpy() for x in parts]) * 1e-3
     np.testing.assert_allclose(found.rms.value[0], np.sqrt(np.nanmean(values**2, axis=0)), rtol=1e-6)
@@ -89,5 +89,5 @@ def test_one_segment_is_differentiated_as_motion_does_it(track):
 def test_a_lost_frame_is_not_differentiated_over(track):
     position = track.position.copy()
     position[::20] = np.nan
-    found = width_curve(replace(track, position=position), "acceleration", (1.0, 2.0), FEW)
+    found = width_curve([replace(track, position=position)], "acceleration", (1.0, 2.0), FEW)
     assert np.isfinite(found.rms.value).all()

@@ -14,7 +14,7 @@ from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure
 from sphereorient.search import Candidates, GreySearch, GreySearchSettings, Proposer
-from sphereorient.search.refine_rotation import DetailLevel, detail_level, level_reference, refine_rotation
+from sphereorient.search.refine_rotation import DetailLevel, detail_level, refine_rotation
 from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import texture_table
 from sphereorient.tools.spin import fit
@@ -139,10 +139,7 @@ def _greatest(spins: Spins) -> float:
 
 def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Refine each disk's own orientation (F, 3, 3) float64 from a given one; return also its score (F,)."""
-    each = [
-        refine_rotation(level, level_reference(level, disk), R[None].float(), steps)
-        for disk, R in zip(disks, R_view_body, strict=True)
-    ]
+    each = [refine_rotation(level, disk, R[None].float(), steps) for disk, R in zip(disks, R_view_body, strict=True)]
     R = torch.cat([R for R, _ in each]).double()
     return so3.nearest_rotation(R), torch.cat([score for _, score in each]).double()
 
