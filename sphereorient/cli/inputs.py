@@ -28,7 +28,6 @@ Flip = Annotated[str, Option(help="Mirror: none, vertical (rows), horizontal (co
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
 UNEVEN = 1e-3  # of the usual time between frames
-EXIT_FAULT = 1  # a run fails, or its numbers are wrong
 COLOURS = {"ok": typer.colors.GREEN, "warning": typer.colors.YELLOW, "fault": typer.colors.RED}
 MARK, TITLE = 9, 25  # columns of the list
 
@@ -60,7 +59,7 @@ def check(
         counts = [sum(one.severity is severity for one in result.findings) for severity in Severity]
         typer.echo(f"faults: {counts[2]}, warnings: {counts[1]}, without complaint: {counts[0]}. Wrote {picture}")
     if result.severity is Severity.FAULT:
-        raise typer.Exit(EXIT_FAULT)
+        raise typer.Exit(1)
 
 
 def _print_findings(findings: "Sequence[Finding]", quiet: bool) -> None:

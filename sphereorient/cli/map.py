@@ -125,7 +125,7 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
 
     _, seen, learnt, figure, moved = _files_of(out)
     texture_map.write_texture(result.texture, out)
-    texture_map.write_seen(result.seen, seen)
+    texture_map.write_seen(result.seen, out)
     texture_map.write_learnt(result.learnt, result.track, learnt)
     compared = texture_map.compare_pictures(result.learnt, result.track, result.experiment, out)
     write_figure(texture_map.map_figure(result.learnt, compared), figure)

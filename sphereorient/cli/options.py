@@ -44,10 +44,10 @@ def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> 
     """Read the settings that a method reads, and print remarks on the others."""
     from sphereorient.methods.settings import METHODS, read_settings
 
-    loaded = read_settings(path, overrides or [], method if method in METHODS else None)
-    for remark in loaded.remarks:
+    settings, remarks = read_settings(path, overrides or [], method if method in METHODS else None)
+    for remark in remarks:
         typer.echo(f"note: {remark}", err=True)
-    return loaded.settings
+    return settings
 
 
 def tracks_in(path: Path, sphere: str | None) -> "Tracks":

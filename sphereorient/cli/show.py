@@ -11,6 +11,7 @@ from typer import Argument, Option
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import (
     ExperimentPath,
+    Overrides,
     Quiet,
     SettingsPath,
     SphereName,
@@ -33,9 +34,7 @@ class _ReportOptions:
     out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
     experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
     settings: SettingsPath = None
-    set_: Annotated[
-        list[str] | None, Option("--set", help="Override one setting, e.g. --set statistics.min_frames=30.")
-    ] = None
+    set_: Overrides = None
     sphere: SphereName = None
     quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, only warnings.")] = False
 

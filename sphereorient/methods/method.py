@@ -15,7 +15,7 @@ import torch
 
 from sphereorient.errors import TrackError, error_words, refusal
 from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.files.hdf5 import digest, whole_hdf5
+from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses
@@ -29,7 +29,6 @@ from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
-from sphereorient.trajectory.trajectory import SPHERES
 
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
@@ -112,30 +111,14 @@ class Learnt:
         told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "majority", "worn")}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
-    def save(self, path: Path) -> None:
-        """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
-        save_learnt({"": self}, path)
-
-    @classmethod
-    def load(cls, path: Path) -> "Learnt":
-        """Read what `save` wrote; raise TrackError if it is missing, damaged, of several balls or another schema."""
-        found = load_learnt(path)
-        if list(found) != [""]:
-            do, got = "pass what was learnt of one ball", f"that of {', '.join(found)}"
-            raise TrackError(refusal(str(path), expected="what was learnt of one ball", got=got, do=do))
-        return found[""]
-
 
 def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:
     """Write what was learnt of each ball, by name, as HDF5, atomically; OutputError if the file cannot be written."""
     with whole_hdf5(path) as file:
-        if list(learnt) == [""]:
-            _write(learnt[""], file)
-        else:
-            file.attrs["schema"] = SCHEMA_OF_SEVERAL
-            _write_scenes(next(iter(learnt.values())), file)
-            for name, one in learnt.items():
-                _write(one, file.create_group(f"{SPHERES}/{name}"), scenes=False)
+        _write_scenes(next(iter(learnt.values())), file)
+        for name, one in learnt.items():
+            _write(one, ball_group(file, name))
+        file.attrs["schema"] = SCHEMA_OF_SEVERAL if SPHERES in file else SCHEMA
         file.attrs["sha256"] = digest(file)
 
 
@@ -152,9 +135,7 @@ def load_learnt(path: Path) -> dict[str, Learnt]:
             if file.attrs.get("sha256") not in (None, digest(file)):  # None: of an older version
                 raise ValueError("a checksum that does not fit")
             scenes = _read_scenes(file)
-            if schema == SCHEMA:
-                return {"": _read(file, scenes)}
-            return {str(name): _read(group, _scenes_of(group, scenes)) for name, group in file[SPHERES].items()}
+            return {name: _read(group, scenes) for name, group in ball_groups(file).items()}
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         expected, got = "a whole file of what was learnt", error_words(error)
         raise TrackError(refusal(str(path), expected=expected, got=got, do=do)) from error
@@ -187,7 +168,6 @@ class Method:
     # Instead of learn, with what is known of each ball; None: it learns nothing.
     resume: Callable[[Job, Mapping[str, Learnt]], Follower] | None
     join: Callable[[Job, Follower | None, Iterable[Measured], Progress], dict[str, Joined]]
-    several: bool = True  # whether it tracks several balls
 
 
 @contextmanager
@@ -212,12 +192,9 @@ def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
 
 
-def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
+def _write(learnt: Learnt, file: h5py.Group) -> None:
     file.attrs["schema"] = SCHEMA
-    for name in NUMBERS:
-        file.attrs[name] = getattr(learnt, name)
-    file.attrs["most_hidden"] = learnt.most_hidden
-    for name in WHETHER:
+    for name in (*NUMBERS, "most_hidden", *WHETHER):
         file.attrs[name] = getattr(learnt, name)
     if learnt.instants > 1:
         file.attrs["still_blur_px"], file.attrs["instants"] = learnt.still_blur_px, learnt.instants
@@ -225,10 +202,7 @@ def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
     if learnt.majority:
         file.attrs["majority"] = learnt.majority
-    if scenes:
-        _write_scenes(learnt, file)
-    else:
-        file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
+    file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
     for part, values in learnt.light.parts().items():
@@ -263,13 +237,12 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
     return scenes
 
 
-def _scenes_of(group: h5py.Group, scenes: Mapping[str, CameraScene]) -> dict[str, CameraScene]:
-    """Return the scenes with the diameters of one ball of several."""
-    sizes = zip(scenes.items(), group.attrs["diameter_px"], strict=True)
-    return {name: replace(scene, diameter_px=float(px)) for (name, scene), px in sizes}
-
-
 def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
+    """Read what was learnt of one ball; of several, each has its own diameters in the cameras' scenes."""
+    sizes = file.attrs.get("diameter_px", [scene.diameter_px for scene in scenes.values()])
+    scenes = {
+        name: replace(scene, diameter_px=float(px)) for (name, scene), px in zip(scenes.items(), sizes, strict=True)
+    }
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting.none(len(scenes))
