@@ -57,6 +57,9 @@ def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., Non
     record = next((one.annotation for one in inspect.signature(function).parameters.values()), None)
     record = record if isinstance(record, type) and is_dataclass(record) else None
     options = list(inspect.signature(record or function).parameters.values())
+    options.sort(
+        key=lambda one: record is not None and one.name not in vars(record)["__annotations__"]
+    )  # own ones first
     writes = any(one.name in OUTPUTS for one in options)
 
     @wraps(function)

@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,14 +41,35 @@ Resume = Annotated[bool, Option("--resume", help="Go on with what a run that was
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no summary.")]
 
 
-def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> "Settings":
-    """Read the settings that a method reads, and print remarks on the others."""
-    from sphereorient.methods.settings import METHODS, read_settings
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """Options of a command that reads settings."""
 
-    settings, remarks = read_settings(path, overrides or [], method if method in METHODS else None)
-    for remark in remarks:
-        typer.echo(f"note: {remark}", err=True)
-    return settings
+    settings: SettingsPath = None
+    set_: Overrides = None
+    quiet: Quiet = False
+
+    def chosen(self, method: str, *also: str) -> "Settings":
+        """Read the settings that a method reads, with further overrides, and print remarks on the others."""
+        from sphereorient.methods.settings import METHODS, read_settings
+
+        overrides = [*(self.set_ or ()), *also]
+        settings, remarks = read_settings(self.settings, overrides, method if method in METHODS else None)
+        for remark in remarks:
+            typer.echo(f"note: {remark}", err=True)
+        return settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions(CommonOptions):
+    """Options of a command that also chooses cameras."""
+
+    cameras: Cameras = None
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Names of the cameras; None: all."""
+        return cameras_of(self.cameras)
 
 
 def tracks_in(path: Path, sphere: str | None) -> "Tracks":

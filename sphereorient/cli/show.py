@@ -10,16 +10,14 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import (
+    CommonOptions,
     ExperimentPath,
-    Overrides,
     Quiet,
-    SettingsPath,
     SphereName,
     TrackPath,
     cameras_of,
     file_of,
     frames_of,
-    settings_of,
     tracks_in,
 )
 from sphereorient.errors import OutputError, SettingsError, TrackError, refusal
@@ -29,14 +27,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ReportOptions:
+class _ReportOptions(CommonOptions):
     tracks: Annotated[list[Path], Argument(metavar="TRACK...", help="track.h5 of `sphereorient track`.")]
     out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
     experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
-    settings: SettingsPath = None
-    set_: Overrides = None
     sphere: SphereName = None
-    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, only warnings.")] = False
 
 
 @app.command()
@@ -46,7 +41,7 @@ def report(given: _ReportOptions) -> None:
     from sphereorient.experiment import load_experiment
     from sphereorient.report.build import write_report
 
-    chosen = settings_of(given.settings, given.set_, "report").statistics
+    chosen = given.chosen("report").statistics
     known = [load_experiment(path) for path in given.experiment or ()]
     loaded, command = _load(given.tracks, given.sphere), command_line()
     with progress_bar(given.quiet, unit="") as advance:

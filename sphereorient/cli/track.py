@@ -10,17 +10,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import (
-    Cameras,
-    ExperimentPath,
-    NoCache,
-    Overrides,
-    Quiet,
-    Resume,
-    SettingsPath,
-    cameras_of,
-    settings_of,
-)
+from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -29,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _TrackOptions:
+class _TrackOptions(CameraOptions):
     experiments: Annotated[
         list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
     ]
@@ -37,9 +27,6 @@ class _TrackOptions:
     method: Annotated[
         str, Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
     ] = "precise"
-    settings: SettingsPath = None
-    set_: Overrides = None
-    cameras: Cameras = None
     device: Annotated[str, Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu"
     jobs: Annotated[int, Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1
     cluster: Annotated[str | None, Option(help="Dask cluster: its scheduler's address or file; or local.")] = None
@@ -49,7 +36,6 @@ class _TrackOptions:
     proposer: Annotated[str | None, Option(help="Proposer's checkpoint, or default (docs/proposer.md).")] = None
     no_learn_paint: Annotated[bool, Option("--no-learn-paint", help="Use the map even where paint differs.")] = False
     no_cache: NoCache = False
-    quiet: Quiet = False
 
 
 @app.command()
@@ -67,15 +53,15 @@ def track(given: _TrackOptions) -> None:
     from sphereorient.run.stages import with_proposer
     from sphereorient.trajectory import Tracks
 
-    overrides = [*(given.set_ or ()), *(["refine.learn_paint=false"] if given.no_learn_paint else ())]
-    chosen = with_proposer(settings_of(given.settings, overrides, given.method), given.proposer)
+    also = ["refine.learn_paint=false"] if given.no_learn_paint else []
+    chosen = with_proposer(given.chosen(given.method, *also), given.proposer)
     requests = [
         Request(
             experiment=experiment,
             out=path,
             method=given.method,
             settings=chosen,
-            cameras=cameras_of(given.cameras),
+            cameras=given.names,
             device=given.device,
             learnt=given.learnt,
             save_learnt=given.save_learnt,
@@ -156,7 +142,7 @@ def _print_summary(result: "Trajectory", name: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _LiveOptions:
+class _LiveOptions(CameraOptions):
     experiment: ExperimentPath
     source: Annotated[
         str, Option(help="movie: at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE.")
@@ -167,10 +153,6 @@ class _LiveOptions:
     ] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
-    cameras: Cameras = None
-    settings: SettingsPath = None
-    set_: Overrides = None
-    quiet: Quiet = False
 
 
 @app.command()
@@ -186,7 +168,7 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.live.sources import source_of
     from sphereorient.live.track import TrackBlocks
 
-    chosen, cameras = settings_of(given.settings, given.set_, "precise"), cameras_of(given.cameras)
+    chosen = given.chosen("precise")
     source, page = source_of(given.source, _tell), None
     with ExitStack() as opened:
         outputs = [open_output(name, _tell) for name in given.to or ()]
@@ -197,7 +179,7 @@ def live(given: _LiveOptions) -> None:
             server = opened.enter_context(open_page(page, given.page))
             opened.callback(server.shutdown)
             typer.echo(f"page: {server.address}", err=True)
-        set_up = opened.enter_context(open_live(given.experiment, chosen, cameras, given.learnt))
+        set_up = opened.enter_context(open_live(given.experiment, chosen, given.names, given.learnt))
         blocks = TrackBlocks(
             recording=set_up.recording,
             tracker=set_up.tracker,
