@@ -81,7 +81,12 @@ def map_(given: _MapOptions) -> None:
         return
     echo_lines(f"note: {remark}" for remark in next(iter(results.values())).remarks)
     for name, result in results.items():
-        _print_result(name, result, given.init)
+        if name:
+            typer.echo(f"ball {name}")
+        _print(result.learnt)
+        if result.comparison is not None:
+            _print_moved(result.comparison, f"against {given.init}")
+            typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in files))
     for name, result in results.items():
@@ -92,15 +97,6 @@ def map_(given: _MapOptions) -> None:
             typer.echo(
                 f"next: write texture: {map_path.name} in {place} of the experiment{why}, then `sphereorient track`"
             )
-
-
-def _print_result(name: str, result: "MapResult", init: Path | None) -> None:
-    if name:
-        typer.echo(f"ball {name}")
-    _print(result.learnt)
-    if result.comparison is not None:
-        _print_moved(result.comparison, f"against {init}")
-        typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
 
 
 def _files_of(out: Path) -> list[Path]:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
+from sphereorient.errors import SphereOrientError, refusal
+
 if TYPE_CHECKING:
     from sphereorient.methods.settings import Settings
     from sphereorient.trajectory import Tracks
@@ -94,9 +96,12 @@ def file_of(out: Path, ball: str) -> Path:
     return out.with_name(f"{out.stem}_{ball}{out.suffix}") if ball else out
 
 
-def frames_of(text: str) -> tuple[int | None, int | None] | None:
-    """Return first and last + 1 of A:B, None for an omitted end; None for another text."""
+def frames_of(text: str, error: type[SphereOrientError], count: int | None = None) -> tuple[int, int | None]:
+    """Return first and last + 1 of A:B, of a movie of `count` frames; None: the last one. Raise `error` for others."""
     found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
-    if not found:
-        return None
-    return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)
+    first, last = (int(found[1] or 0), int(found[2]) if found[2] else count) if found else (0, 0)
+    if last is not None and not first < last <= (count or last):
+        within = f"A:B{'' if count is None else f' within 0:{count}'}, A below B"
+        do = "write e.g. --frames 100:200"
+        raise error(refusal(f"--frames {text}", expected=within, got=f"'{text}'", do=do))
+    return first, last

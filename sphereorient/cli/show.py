@@ -97,12 +97,7 @@ def overlay(given: _OverlayOptions) -> None:
         raise OutputError(refusal("overlay", expected="something to write", got="neither --out nor --worst", do=do))
     if given.out is not None:
         check_writable(given.out)
-    first, last = frames_of(given.frames) or (0, 0)
-    if first is not None and last is not None and first >= last:
-        do = "write e.g. --frames 100:200"
-        raise SettingsError(
-            refusal(f"--frames {given.frames}", expected="A:B, A below B", got=f"'{given.frames}'", do=do)
-        )
+    first, last = frames_of(given.frames, SettingsError)
     from sphereorient.experiment import load_experiment
     from sphereorient.report.gallery import worst_frames
     from sphereorient.report.overlay import FrameSelection, overlay_movie

@@ -141,8 +141,7 @@ class ZmqOutput(Output):
                 self._socket.bind(f"tcp://{host}:{port}")
         except zmq.ZMQError as error:
             self._context.destroy(0)
-            do = "choose another port, or end the program that has it"
-            raise OutputError(refusal(name, expected="a free port", got=error_words(error), do=do)) from None
+            raise _taken(name, error) from None
 
     def send(self, line: str) -> None:
         """Publish a line."""
@@ -161,10 +160,7 @@ class TcpOutput(Output):
         try:
             self._server = socket.create_server((host, port))
         except OSError as error:
-            do = "choose another port, or end the program that has it"
-            raise OutputError(
-                refusal(f"tcp:{host}:{port}", expected="a free port", got=error_words(error), do=do)
-            ) from None
+            raise _taken(f"tcp:{host}:{port}", error) from None
         self.port = int(self._server.getsockname()[1])
         self._readers: list[tuple[socket.socket, Spool]] = []
         self._thread = Thread(target=self._accept, name="tcp", daemon=True)
@@ -192,6 +188,11 @@ class TcpOutput(Output):
         for connection, spool in self._readers:
             spool.close()
             connection.close()
+
+
+def _taken(name: str, error: Exception) -> OutputError:
+    do = "choose another port, or end the program that has it"
+    return OutputError(refusal(name, expected="a free port", got=error_words(error), do=do))
 
 
 def _send_all(connection: socket.socket, lines: list[str]) -> None:

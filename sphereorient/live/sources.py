@@ -17,9 +17,9 @@ import numpy as np
 from sphereorient.errors import MovieError, SettingsError, error_words, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream
+from sphereorient.files.picture import luma
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
 from sphereorient.live.shared import shared_frames
-from sphereorient.movies.movie import luma
 
 AGAIN_S = 1.0  # between attempts to open a camera
 WAIT_S = 1.0  # of one call of a GenICam driver; a camera that waits for its trigger is asked again

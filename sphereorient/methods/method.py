@@ -31,10 +31,17 @@ from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
-OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
-WHETHER = ("together", "second_ball", "sharper")
+SCORES, WHETHER = ("score_min", "right_score", "usual_apart_rad"), ("together", "second_ball", "sharper")
+OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn")  # fields that `Learnt` shares with it
+# Fields that are attributes of the file, and their types; tensors are datasets.
+KINDS: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys((*SCORES, "blur_px", "still_blur_px", "most_hidden", "widest_px", "acceleration_rad_s2"), float),
+    **dict.fromkeys(WHETHER, bool),
+    "instants": int,
+    "majority": lambda cameras: tuple(map(int, cameras)),
+}
+TENSORS = ("limb_px", "worn")
 LASTING = ("covariance", "own_rad2")
-NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,17 +50,17 @@ class Learnt:
 
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
     light: Light
-    limb_px: torch.Tensor | None  # (C,), see `SphereModel`; None: of an older version
     lasting: Lasting
     blur_px: float
     still_blur_px: float  # of frames whose motion is not known
-    instants: int  # of the exposure that fits render
-    most_hidden: float  # share of a disk that occluders may cover
     widest_px: float
     score_min: float
     right_score: float
     usual_apart_rad: float
-    together: bool
+    limb_px: torch.Tensor | None = None  # (C,), see `SphereModel`; None: of an older version
+    instants: int = 1  # of the exposure that fits render
+    most_hidden: float = 0.0  # share of a disk that occluders may cover
+    together: bool = False
     majority: tuple[int, ...] = ()  # see `Appearance`
     second_ball: bool = False
     sharper: bool = False
@@ -78,8 +85,7 @@ class Learnt:
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
-            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER, "majority")},
-            worn=study.worn,
+            **{name: getattr(study, name) for name in OF_APPEARANCE},
             process=process,
             acceleration_rad_s2=acceleration_rad_s2 if told else None,
         )
@@ -108,7 +114,7 @@ class Learnt:
         )
         if self.instants > 1:
             fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
-        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "majority", "worn")}
+        told = {name: getattr(self, name) for name in OF_APPEARANCE}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
 
@@ -194,25 +200,19 @@ def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
 
 def _write(learnt: Learnt, file: h5py.Group) -> None:
     file.attrs["schema"] = SCHEMA
-    for name in (*NUMBERS, "most_hidden", *WHETHER):
-        file.attrs[name] = getattr(learnt, name)
-    if learnt.instants > 1:
-        file.attrs["still_blur_px"], file.attrs["instants"] = learnt.still_blur_px, learnt.instants
-    if learnt.acceleration_rad_s2 is not None:
-        file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
-    if learnt.majority:
-        file.attrs["majority"] = learnt.majority
+    for name in KINDS:
+        if (value := getattr(learnt, name)) not in (None, ()):
+            file.attrs[name] = value
     file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
     for part, values in learnt.light.parts().items():
         light.create_dataset(part, data=values.numpy(), track_times=False)
-    if learnt.limb_px is not None:
-        file.create_dataset("limb_px", data=learnt.limb_px.numpy(), track_times=False)
-    for part in LASTING:
-        file.create_dataset(f"lasting/{part}", data=getattr(learnt.lasting, part).numpy(), track_times=False)
-    if learnt.worn is not None:
-        file.create_dataset("worn", data=learnt.worn.numpy(), track_times=False)
+    tensors = {name: getattr(learnt, name) for name in TENSORS}
+    tensors |= {f"lasting/{part}": getattr(learnt.lasting, part) for part in LASTING}
+    for name, tensor in tensors.items():
+        if tensor is not None:
+            file.create_dataset(name, data=tensor.numpy(), track_times=False)
     if learnt.process is not None:
         group = file.create_group("process")
         group.attrs["frame_s"] = learnt.process.frame_s
@@ -248,22 +248,12 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     lasting = Lasting.none(len(scenes))
     if "lasting" in file:
         lasting = Lasting(**{part: torch.from_numpy(file["lasting"][part][()]) for part in LASTING})
-    acceleration = file.attrs.get("acceleration_rad_s2")
-    told: dict[str, Any] = {name: bool(file.attrs.get(name, False)) for name in WHETHER}
-    told |= {name: float(file.attrs[name]) for name in NUMBERS}
+    told = {name: kind(file.attrs[name]) for name, kind in KINDS.items() if name in file.attrs}
+    told.setdefault("still_blur_px", told["blur_px"])
+    told |= {name: torch.from_numpy(file[name][()]) for name in TENSORS if name in file}
+    process = _process(file["process"]) if "process" in file else None
     return Learnt(
-        scenes=scenes,
-        still_blur_px=float(file.attrs.get("still_blur_px", file.attrs["blur_px"])),
-        instants=int(file.attrs.get("instants", 1)),
-        most_hidden=float(file.attrs.get("most_hidden", 0.0)),  # an older version sought none
-        light=light_of(parts, bool(light.attrs["known"])),
-        limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
-        lasting=lasting,
-        worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,
-        majority=tuple(int(k) for k in file.attrs.get("majority", ())),
-        process=_process(file["process"]) if "process" in file else None,
-        acceleration_rad_s2=None if acceleration is None else float(acceleration),
-        **told,
+        scenes=scenes, light=light_of(parts, bool(light.attrs["known"])), lasting=lasting, process=process, **told
     )
 
 

@@ -208,8 +208,9 @@ def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | N
     return replace(track, method=request.method, settings=settings_yaml(settings), provenance=origin)
 
 
-def with_proposer(settings: Settings, proposer: str | Path | None) -> Settings:
-    """Return settings with a checkpoint as proposer; unchanged for None."""
+def with_proposer(settings: Settings | None, proposer: str | Path | None) -> Settings:
+    """Return settings (None: the defaults) with a checkpoint as proposer; unchanged for None."""
+    settings = settings or Settings()
     if proposer is None:
         return settings
     return settings.model_copy(update={"propose": settings.propose.model_copy(update={"checkpoint": str(proposer)})})
