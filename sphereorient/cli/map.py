@@ -71,7 +71,7 @@ def map_(given: _MapOptions) -> None:
             kept=kept,
             command=command_line(),
         )
-        results, files = found if isinstance(found, dict) else {"": found}, []
+        results, files = found if isinstance(found, dict) else {found.paint_of: found}, []
         advance("figure", 0, len(results))
         for done, (name, result) in enumerate(results.items(), start=1):
             files += _write(result, old, outs[name])

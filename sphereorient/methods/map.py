@@ -32,7 +32,7 @@ class MapResult:
     remarks: tuple[str, ...]  # on the inputs
     comparison: MapComparison | None = None  # with the old map, where one was given
     kept_share: float = 0.0  # of the sphere with the old map's texture, because it was never seen
-    paint_of: str = ""  # of several balls: the name of the first one that wears this paint
+    paint_of: str  # name of the first ball that wears this paint
 
     @property
     def texture(self) -> Tensor:
