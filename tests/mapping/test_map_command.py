@@ -170,7 +170,7 @@ def test_an_old_map_that_is_none_is_refused_before_any_work(copy, tmp_path, monk
 def test_unknown_cameras_and_settings_are_refused(copy, tmp_path, monkeypatch, capsys):
     out = tmp_path / "map.png"
     assert "cam1 or cam2" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--cameras", "cam3")
-    assert "paint.rounds" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
+    assert "write 'rounds'" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
 
 
 def test_track_without_a_map_says_how_to_get_one(copy, tmp_path, monkeypatch, capsys):
