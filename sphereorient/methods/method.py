@@ -33,15 +33,16 @@ from sphereorient.trajectory import Trajectory
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
 SCORES, WHETHER = ("score_min", "right_score", "usual_apart_rad"), ("together", "second_ball", "sharper")
 OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn")  # fields that `Learnt` shares with it
+BLURS = ("blur_px", "limb_blur_px", "still_blur_px", "still_limb_blur_px")
 # Fields that are attributes of the file, and their types; tensors are datasets.
 KINDS: dict[str, Callable[[Any], Any]] = {
-    **dict.fromkeys((*SCORES, "blur_px", "still_blur_px", "most_hidden", "widest_px", "acceleration_rad_s2"), float),
+    **dict.fromkeys((*SCORES, *BLURS, "most_hidden", "widest_px", "acceleration_rad_s2"), float),
     **dict.fromkeys(WHETHER, bool),
     "instants": int,
     "majority": lambda cameras: tuple(map(int, cameras)),
 }
 TENSORS = ("limb_px", "worn")
-LASTING = ("covariance", "own_rad2")
+LASTING = ("covariance", "own_rad2", "alone")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,8 +52,10 @@ class Learnt:
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
     light: Light
     lasting: Lasting
-    blur_px: float
+    blur_px: float  # of the paint
+    limb_blur_px: float
     still_blur_px: float  # of frames whose motion is not known
+    still_limb_blur_px: float
     widest_px: float
     score_min: float
     right_score: float
@@ -81,7 +84,9 @@ class Learnt:
             limb_px=fitter.limb_px,
             lasting=study.lasting,
             blur_px=fitter.optics.blur_px,
+            limb_blur_px=fitter.optics.limb_blur_px,
             still_blur_px=study.still.optics.blur_px,
+            still_limb_blur_px=study.still.optics.limb_blur_px,
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
@@ -106,14 +111,15 @@ class Learnt:
         fitter = still = Fitter(
             views=views,
             radius_mm=recording.experiment.radius_mm,
-            optics=Optics(paint, self.still_blur_px, widest),
+            optics=Optics(paint, self.still_blur_px, widest, self.still_limb_blur_px),
             light=self.light,
             widest_px=self.widest_px,
             limb_px=self.limb_px,
             most_hidden=self.most_hidden,
         )
         if self.instants > 1:
-            fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
+            optics = Optics(paint, self.blur_px, widest, self.limb_blur_px)
+            fitter = replace(still, optics=optics, instants=self.instants)
         told = {name: getattr(self, name) for name in OF_APPEARANCE}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
@@ -247,9 +253,12 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting.none(len(scenes))
     if "lasting" in file:
-        lasting = Lasting(**{part: torch.from_numpy(file["lasting"][part][()]) for part in LASTING})
+        kept = {part: torch.from_numpy(values[()]) for part, values in file["lasting"].items()}
+        lasting = Lasting.of_older(**kept) if "alone" not in kept else Lasting(**kept)
     told = {name: kind(file.attrs[name]) for name, kind in KINDS.items() if name in file.attrs}
-    told.setdefault("still_blur_px", told["blur_px"])
+    told = {"still_blur_px": told["blur_px"], "limb_blur_px": told["blur_px"]} | told  # an older version knew one blur
+    of_limb = "limb_blur_px" if told["still_blur_px"] == told["blur_px"] else "still_blur_px"
+    told.setdefault("still_limb_blur_px", told[of_limb])
     told |= {name: torch.from_numpy(file[name][()]) for name in TENSORS if name in file}
     process = _process(file["process"]) if "process" in file else None
     return Learnt(

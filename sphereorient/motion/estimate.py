@@ -21,7 +21,8 @@ JUDGEMENTS = 12  # rounds of rejection; outliers near each other are found one a
 AGAIN = 0.5  # of the limit, below which a measurement is used again; below 1 to avoid oscillation
 FAR_MOVED = 100.0  # sigmas; after a larger move of the reference the estimate is repeated
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
-POLES = (0.02, 3.0)  # per frame, between which the prior's band is looked for
+POLES = (0.02, 6.0)  # per frame, between which the prior's band is looked for; at 6 each frame has a rate of its own
+UNSURE = 0.5  # standard deviation of the logarithm of the scale beforehand: rates that change at will do not tell it
 SPREADS = (1e-3, 1e5)  # of the rate per frame, in sigmas of a measurement
 FREE = 6  # unknowns without a prior: the start of the segment and its constant rate
 FIRST_TRIES = (0.15, 0.45, 1.2)  # poles per frame from the best of which the search starts
@@ -178,7 +179,7 @@ def _alone(path: SegmentTrack) -> Estimate:
 def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
-    """Find the prior and the factor (within `scales`) on the measurements' sigmas with the highest likelihood.
+    """Find the most probable prior and factor (within `scales`) on the measurements' sigmas.
     Paths have at least five measurements each. `band`, cycles per frame, fixes the prior; `before` is a start.
     Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form.
     """
@@ -221,4 +222,5 @@ def _cost(paths: Sequence[SegmentTrack], prior: Prior, scales: tuple[float, floa
         number += 3 * int(path.used.sum()) - FREE
     number = max(number, 1)
     scale = float(np.clip(np.sqrt(misfit / number), *scales))
-    return 0.5 * (logs + number * 2 * np.log(scale) + misfit / scale**2), scale
+    beforehand = (np.log(scale) / UNSURE) ** 2
+    return 0.5 * (logs + number * 2 * np.log(scale) + misfit / scale**2 + beforehand), scale

@@ -79,7 +79,7 @@ class PyramidLevel:
     """One width of detail: what is laid over the picture, which pixels are looked at, the paint as blurred."""
 
     extra_px: float
-    blur_px: float
+    blur_px: float  # of the limb
     paint: TextureTable
 
     def stencil(self, radius_px: float) -> Stencil:
@@ -91,23 +91,46 @@ Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th p
 
 
 class Optics:
-    """Texture tables at the levels of blur of the fits: pictures of blur `blur_px` and disks of `diameter_px`, px."""
+    """Texture tables at the levels of blur of the fits: paint of blur `blur_px` on disks of `diameter_px`, px, and the
+    blur of the limb, None: the same. A map that is not sharp, or disks of other sizes, show as blur of the paint alone.
+    """
 
-    def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
+    def __init__(
+        self, base: TextureTable, blur_px: float, diameter_px: float, limb_blur_px: float | None = None
+    ) -> None:
         self.blur_px = blur_px
         self._radius_px = diameter_px / 2
         self.fine = level_of(base, blur_px, 0.0, self._radius_px)
+        if limb_blur_px is not None:
+            self.fine = replace(self.fine, blur_px=limb_blur_px)
 
     # Each from the one before: a wider blur allows a smaller table.
     @cached_property
     def middle(self) -> PyramidLevel:
         """The level of a fit that is right to a few degrees."""
-        return level_of(self.fine.paint, self.blur_px, MIDDLE * self._radius_px, self._radius_px)
+        return self._blurred(self.fine, MIDDLE)
 
     @cached_property
     def coarse(self) -> PyramidLevel:
         """The level of a fit from a candidate."""
-        return level_of(self.middle.paint, self.blur_px, COARSE * self._radius_px, self._radius_px)
+        return self._blurred(self.middle, COARSE)
+
+    def _blurred(self, before: PyramidLevel, extra: float) -> PyramidLevel:
+        level = level_of(before.paint, self.blur_px, extra * self._radius_px, self._radius_px)
+        return replace(level, blur_px=math.hypot(self.limb_blur_px, level.extra_px))
+
+    @property
+    def limb_blur_px(self) -> float:
+        """The standard deviation of the limb's blur, px."""
+        return self.fine.blur_px
+
+    def with_limb_blur(self, blur_px: float) -> "Optics":
+        """Return the same with another blur of the limb, px."""
+        other = copy(self)
+        other.fine = replace(self.fine, blur_px=blur_px)
+        for name in ("middle", "coarse"):
+            vars(other).pop(name, None)
+        return other
 
     @property
     def steps(self) -> Steps:

@@ -13,7 +13,7 @@ from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
-from sphereorient.so3 import solve_damped
+from sphereorient.so3 import inverse_damped, solve_damped
 from sphereorient.trajectory import Trajectory
 
 TILES = 4  # along each axis of the disk: errors of light are wide
@@ -26,28 +26,39 @@ class Lasting:
 
     covariance: Tensor  # (6, 6), of delta (rad, lab) and position (mm) by all cameras together
     own_rad2: Tensor  # (C, 3, 3), of the rotation by each camera alone, position held
+    alone: Tensor  # (C, 6, 6), as `covariance`, by each camera alone
 
     @classmethod
     def none(cls, cameras: int) -> "Lasting":
         """Return no such errors."""
         zeros = torch.zeros(cameras, 6, 6, dtype=torch.float64)
-        return cls(covariance=zeros[0], own_rad2=zeros[:, :3, :3])
+        return cls(covariance=zeros[0], own_rad2=zeros[:, :3, :3], alone=zeros)
+
+    @classmethod
+    def of_older(cls, covariance: Tensor, own_rad2: Tensor) -> "Lasting":
+        """Return those of a file that holds no `alone`: each camera's rotation, and the position of all."""
+        alone = covariance.repeat(len(own_rad2), 1, 1)
+        alone[:, :3, 3:] = alone[:, 3:, :3] = 0.0
+        alone[:, :3, :3] = own_rad2
+        return cls(covariance=covariance, own_rad2=own_rad2, alone=alone)
 
     def of(self, *cameras: int) -> "Lasting":
-        """Return those of some cameras; of one its distance is not known, its rotation as well as `own_rad2` says."""
-        own, covariance = self.own_rad2[list(cameras)], self.covariance.clone()
-        if len(cameras) == 1:
-            covariance[:3] = covariance[:, :3] = 0.0
-            covariance[:3, :3] = own[0]
-        return Lasting(covariance=covariance, own_rad2=own)
+        """Return those of some cameras."""
+        own, alone = self.own_rad2[list(cameras)], self.alone[list(cameras)]
+        return Lasting(covariance=alone[0] if len(cameras) == 1 else self.covariance, own_rad2=own, alone=alone)
 
     def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
         """Return errors that hold the mean difference of B poses by two models, `use` (B, C), that explain as much."""
         turn = so3.log(other.R_lab_body @ one.R_lab_body.mT)
         way = torch.cat([turn, other.position_lab_mm - one.position_lab_mm], dim=1)
         seen = use.to(turn.dtype)[..., None]
-        alone = (seen * (turn[:, None] + other.own_turn - one.own_turn)).sum(0) / seen.sum(0).clamp_min(1)
-        return Lasting(covariance=_holding(self.covariance, way.mean(0)), own_rad2=_holding(self.own_rad2, alone))
+        own = torch.cat([other.own_turn - one.own_turn, other.own_move - one.own_move], dim=-1)
+        each = (seen * (way[:, None] + own)).sum(0) / seen.sum(0).clamp_min(1)
+        return Lasting(
+            covariance=_holding(self.covariance, way.mean(0)),
+            own_rad2=_holding(self.own_rad2, each[:, :3]),
+            alone=_holding(self.alone, each),
+        )
 
 
 def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Lasting:
@@ -59,31 +70,66 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     """
     cameras = use.shape[1]
     at = fitted_residuals(pixels, fit, model)
-    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), cameras)
+    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), _px_mm(pixels, fit), cameras)
     others = normal.shape[-1] - 6
-    turn = [0, 1, 2, *range(6, 6 + others)]
-    alone = [part[..., turn] for part in (normal[..., turn, :], right, ridge[..., turn, :])]
-    own = torch.stack([of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
-    # The cameras share the pose; each has a light and a limb of its own.
+
+    def by_each(kept: list[int], count: int) -> Tensor:
+        parts = [part[..., kept] for part in (normal[..., kept, :], right, ridge[..., kept, :])]
+        return torch.stack([of_left_out(*of_camera)[:count, :count] for of_camera in zip(*parts, strict=True)])
+
+    together = of_left_out(*_joined(normal, right, ridge))[:6, :6]
+    own = by_each([0, 1, 2, *range(6, 6 + others)], 3)
+    # One camera does not tell the place of its limb from the distance.
+    alone = by_each([*range(4 + others), 5 + others], 6)
+    return Lasting(covariance=together, own_rad2=own, alone=alone)
+
+
+def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> float:
+    """Return by how much the limb of B * C disks, those of `use` (B, C), is blurred more than in the model, px.
+    One turn and move of all poses, with the light of each camera and the place of its limb, may change with it.
+    """
+    cameras = use.shape[1]
+    at = fitted_residuals(pixels, fit, model)
+    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), _px_mm(pixels, fit), cameras)
+    joined, pulled, ridges = _joined(normal, right, ridge)
+    wider = torch.arange(1, cameras + 1) * (normal.shape[-1] - 6) + 5
+    bread = inverse_damped(joined.sum(0) + ridges)
+    seen = use.any(0).double()
+    told = seen / bread.diagonal()[wider].clamp_min(1e-30)
+    found = (bread @ pulled.sum(0))[wider]
+    return -float((told * found).sum() / told.sum().clamp_min(1e-30))
+
+
+def _px_mm(pixels: Pixels, fit: FittedPoses) -> Tensor:
+    """Return the size of a pixel at the sphere, (B * C,), mm."""
+    origin = pixels.origin[..., 0].double()
+    X = fit.position_lab_mm.repeat_interleave(len(origin) // len(fit.position_lab_mm), 0)
+    px_mm: Tensor = pixels.pitch_mm + pixels.pitch_rad * (X - origin).norm(dim=-1)
+    return px_mm.to(pixels.grey)
+
+
+def _joined(normal: Tensor, right: Tensor, ridge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the normal equations of all cameras, (C * T, n, n), (C * T, n), (n, n), from those of each: they share the
+    pose; each has a light and a limb of its own.
+    """
+    cameras, others = len(normal), normal.shape[-1] - 6
     place = torch.zeros(cameras, 6 + cameras * others, 6 + others, dtype=torch.float64)
     for camera in range(cameras):
         place[camera, :6, :6] = torch.eye(6)
         place[camera, 6 + camera * others :][:others, 6:] = torch.eye(others)
     joined = (place[:, None] @ normal @ place[:, None].mT).flatten(0, 1)
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
-    together = of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
-    return Lasting(covariance=together, own_rad2=own)
+    return joined, pulled, (place @ ridge @ place.mT).sum(0)
 
 
 def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
     """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
     use = torch.from_numpy(track.believed)
     # Those of each camera are its own: the fewer count, the less of them is averaged away.
-    fewer = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None]
-    together = fewer * lasting.covariance[:3, :3]
-    alone = (use.to(torch.float64) @ lasting.own_rad2.flatten(1)).reshape(-1, 3, 3)
-    turn = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
-    place = (fewer * lasting.covariance[3:, 3:]).numpy()
+    together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * lasting.covariance
+    alone = (use.to(torch.float64) @ lasting.alone.flatten(1)).reshape(-1, 6, 6)
+    whole = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
+    turn, place = whole[:, :3, :3], whole[:, 3:, 3:]
     return replace(
         track,
         position_cov=track.position_cov + place,
@@ -99,12 +145,12 @@ def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
     return covariance + (1 - 1 / size.clamp_min(1)) * difference[..., :, None] * difference[..., None, :]
 
 
-def _by_tile(at: Residuals, precision: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:
+def _by_tile(at: Residuals, precision: Tensor, px_mm: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
     the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
     tiles of its own.
     """
-    limb = at.over * at.view.coverage_by_position.norm(dim=1)
+    limb = px_mm[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
     wider = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
     columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack([limb, wider], dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]

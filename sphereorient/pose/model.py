@@ -116,8 +116,8 @@ class SphereModel:
     """What a picture of the sphere depends on, its pose aside."""
 
     radius_mm: float
-    paint: TextureTable  # blurred by `blur_px` as seen at the disk's middle
-    blur_px: float  # standard deviation of optics, pixel and whatever was laid over the frame, px
+    paint: TextureTable  # blurred as seen at the disk's middle
+    blur_px: float  # of the limb: standard deviation of optics, pixel and whatever was laid over the frame, px
     light: Light  # of the C cameras
     shading: Shading = LATER  # how far a frame's light may differ from it
     limb_px: Tensor | None = None  # (C,), how far the limb lies outside of its place by all cameras: an error; None: 0

@@ -1,5 +1,6 @@
 """Write synthetic experiments in the format that `sphereorient track` reads."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -167,9 +168,11 @@ def frame_times_s(settings: SynthSettings) -> Tensor:
 
 
 def instants_s(settings: SynthSettings) -> Tensor:
-    """Return the instants of each exposure, (N, E) float64, s."""
+    """Return the instants of each exposure, (N, E) float64, s; their variance is that of the time it is open."""
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
+    if count > 1:
+        within = within / math.sqrt(1 - 1 / count**2)
     return frame_times_s(settings)[:, None] + within
 
 

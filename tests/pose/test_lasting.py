@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import pytest
 import torch
 from conftest import assert_close
 from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, refined, rig_of
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.lasting import Lasting, lasting_errors, of_left_out
+from sphereorient.pose.lasting import Lasting, lasting_errors, limb_wider_px, of_left_out
 from sphereorient.pose.lights.disk import no_glints
 from sphereorient.pose.poses import FittedPoses, PoseStart
 
@@ -81,7 +82,26 @@ def test_of_one_frame_more_may_last_than_of_many():
     assert so3.trace(one.covariance[:3, :3]) > so3.trace(many.covariance[:3, :3])
     alone = many.of(1)
     assert alone.own_rad2.shape == (1, 3, 3)
-    assert torch.equal(alone.covariance[:3, :3], many.own_rad2[1])
+    assert torch.equal(alone.covariance, many.alone[1])
+
+
+def test_one_camera_alone_errs_by_more_than_with_its_position_held():
+    _, _, found = measured(COUNT, LOBE)
+    assert bool((so3.trace(found.alone[:, :3, :3]) > so3.trace(found.own_rad2)).all())
+    assert bool((torch.linalg.eigvalsh(found.alone) > 0).all())
+    older = Lasting.of_older(found.covariance, found.own_rad2)
+    assert torch.equal(older.alone[:, :3, :3], found.own_rad2)
+    assert torch.equal(older.of(0).covariance[3:, 3:], found.covariance[3:, 3:])
+
+
+@pytest.mark.parametrize("wider_px", [-0.04, 0.0, 0.06])
+def test_the_blur_of_the_limb_is_found(wider_px: float):
+    X, R = balls(COUNT, 4)
+    pixels = cut(RIG, noisy(pictures_of(RIG, "patches", X, R), 1.0, 7), X)
+    model, use = model_of(RIG.table("patches"), 1.0), torch.ones(COUNT, 2, dtype=torch.bool)
+    model = replace(model, blur_px=model.blur_px - wider_px)
+    fit = refined(pixels, PoseStart(X, R, use), model)
+    assert limb_wider_px(pixels, fit, use, model) == pytest.approx(wider_px, abs=0.012)
 
 
 def test_leaving_out_is_fitting_again():

@@ -18,7 +18,7 @@ from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, make_scene, render_frame, write_synthetic_experiment
 from sphereorient.synth.scene import seeded
-from sphereorient.synth.write import default_cameras, motion_of
+from sphereorient.synth.write import default_cameras, frame_times_s, instants_s, motion_of
 
 FRAMES = 6
 # Light paint on dark ground, so that the whole disk stands out.
@@ -189,3 +189,12 @@ def test_an_exposure_longer_than_a_frame_is_refused_as_the_experiment_would_be()
     with pytest.raises(pydantic.ValidationError, match="exposure: expected at most 1 / frame_rate"):
         SynthSettings(exposure=0.01, frame_rate=200.0)
     assert SynthSettings(exposure=0.005, frame_rate=200.0).exposure == 0.005
+
+
+@pytest.mark.parametrize("samples", [2, 3, 8])
+def test_instants_spread_like_the_open_shutter(samples: int):
+    settings = SynthSettings(frames=2, frame_rate=100.0, exposure=0.002, exposure_samples=samples)
+    instants = instants_s(settings)[0] - frame_times_s(settings)[0]
+    assert float(instants.mean()) == pytest.approx(0.0, abs=1e-12)
+    assert float(instants.var(correction=0)) == pytest.approx(0.002**2 / 12)
+    assert float(instants.abs().max()) <= 0.001

@@ -5,14 +5,17 @@ from dataclasses import replace
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.record import Studied, enough_of, soft
 from sphereorient.pose.blur import FINER, FINEST, best_blur_px
-from sphereorient.pose.camera_view import Optics, widest_px
+from sphereorient.pose.camera_view import FINEST_PX, Optics, widest_px
 from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.lasting import limb_wider_px
 from sphereorient.pose.lights import kinds
 from sphereorient.pose.lights.kinds import Rivals
 from sphereorient.pose.occluders import USUALLY_HIDDEN
 
 BLUR_ROUNDS = 4
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
+LIMB_ROUNDS, LIMB_STAYS = 4, 0.005  # the same of the limb's blur
+MOST_WIDER = 1.25  # ratio by which a round may change the limb's blur: the step is linear
 
 
 def light_and_blur(studied: Studied, *, given: bool) -> Studied:
@@ -30,6 +33,20 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
             studied = replace(studied, fitter=replace(fitter, optics=Optics(studied.paint, blur_px, diameter_px)))
         studied = studied.lit()
         if not slow and abs(studied.fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
+            break
+    return _limb_blurred(studied)
+
+
+def _limb_blurred(studied: Studied) -> Studied:
+    """Estimate the blur of the limb: one that is too narrow moves the ball to its bright side."""
+    for _ in range(LIMB_ROUNDS):
+        fitter = studied.fitter
+        before_px = fitter.optics.limb_blur_px
+        wider_px = limb_wider_px(studied.pixels, studied.fit, studied.use, fitter.model())
+        blur_px = min(max(before_px + wider_px, before_px / MOST_WIDER, FINEST_PX), before_px * MOST_WIDER)
+        optics = fitter.optics.with_limb_blur(blur_px)
+        studied = replace(studied, fitter=replace(fitter, optics=optics)).lit()
+        if abs(blur_px / before_px - 1) < LIMB_STAYS:
             break
     return studied
 

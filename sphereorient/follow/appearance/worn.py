@@ -41,7 +41,7 @@ def without_worn(studied: Studied) -> tuple[Studied, Tensor | None]:
         for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
             worn = worn_cells(pixels, fit, use, now.model(), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
-            optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
+            optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views), fitter.optics.limb_blur_px)
             now = replace(now, optics=optics).with_light_of(pixels, fit, use, glints=False)
             fit = now.again(pixels, fit, use)
         return now, fit, worn
