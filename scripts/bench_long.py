@@ -22,9 +22,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import torch
+from experiment_file import write_experiment
 
 from sphereorient import so3
-from sphereorient.experiment import load_experiment, write_experiment
+from sphereorient.experiment import load_experiment
 
 
 def digest(path: Path) -> str:

@@ -19,8 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from experiment_file import write_experiment
 
-from sphereorient.experiment import Experiment, load_experiment, open_movies, write_experiment
+from sphereorient.experiment import Experiment, load_experiment, open_movies
 
 
 def lengthened(experiment: Experiment, times: int, folder: Path) -> Path:

@@ -27,7 +27,7 @@ import yaml
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.methods.method import Learnt
+from sphereorient.methods.method import Learnt, load_learnt
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run import MemoryStore, Request, run
@@ -259,7 +259,7 @@ def tracked(
     settings = load_settings(None, [f"refine.chunk_frames={BLOCK}"])
     known = folder / "learnt.h5"
     track = run(Request(experiment=path, settings=settings, learnt=given, save_learnt=known), MemoryStore())
-    return track, Learnt.load(known), tuple(track.provenance["remarks"])
+    return track, load_learnt(known)[""], tuple(track.provenance["remarks"])
 
 
 def compared(clean: Trajectory, track: Trajectory, rows: NDArray[np.int64]) -> tuple[bool, float, float]:

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from sphereorient.bench import BenchSettings
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.methods.settings import Settings, flat_settings_yaml, proposer_settings_yaml, settings_yaml
+from sphereorient.methods.settings import Settings, model_yaml, settings_yaml
 from sphereorient.synth import SynthSettings
 
 REPO = Path(__file__).resolve().parents[1]
@@ -85,9 +85,9 @@ def pages() -> dict[Path, str]:
         REPO / "docs" / "parameters.md": parameters(),
         REPO / "configs" / "paper.yaml": settings_yaml(method="paper"),
         REPO / "configs" / "precise.yaml": settings_yaml(method="precise"),
-        REPO / "configs" / "synth.yaml": flat_settings_yaml("A synthetic experiment", SynthSettings()),
-        REPO / "configs" / "robustness.yaml": flat_settings_yaml("The robustness benchmark", BenchSettings()),
-        REPO / "configs" / "train_proposer.yaml": proposer_settings_yaml(),
+        REPO / "configs" / "synth.yaml": model_yaml("A synthetic experiment", SynthSettings()),
+        REPO / "configs" / "robustness.yaml": model_yaml("The robustness benchmark", BenchSettings()),
+        REPO / "configs" / "train_proposer.yaml": model_yaml("Training of a proposer", ProposerSettings()),
     }
 
 

@@ -24,11 +24,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import torch
+from experiment_file import write_experiment
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
-from sphereorient.experiment import load_experiment, write_experiment
+from sphereorient.experiment import load_experiment
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.report.texture_map import shares_seen
 from sphereorient.sphere import load_texture, read_seen, seen_path

@@ -1,8 +1,9 @@
-"""All errors that sphereorient raises on purpose.
+"""All errors that sphereorient raises on purpose, and why a picture gives no orientation, which is no error.
 
 Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
 """
 
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -55,6 +56,26 @@ class BenchError(SphereOrientError):
 
 class OutputError(SphereOrientError):
     """A result cannot be written."""
+
+
+class Reason(StrEnum):
+    """Why a camera has no orientation in a frame; `OK` if it has one."""
+
+    OK = "ok"
+    NOT_FOUND = "not_found"
+    OUTLINE = "outline"
+    DARK = "dark"
+    SATURATED = "saturated"
+    REPEATED = "repeated"
+    RUNAWAY = "runaway"
+    LOW_SCORE = "low_score"
+    UNSEEN = "unseen"  # it shows paint that the texture map does not know
+    AMBIGUOUS = "ambiguous"
+    CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
+    SECOND_BALL = "second_ball"  # likewise, in a movie with two balls: it may show the other one
+    HIDDEN = "hidden"  # another sphere covers it
+    UNDECODABLE = "undecodable"
+    MISSING = "missing"
 
 
 def refusal(name: str, *, expected: str, got: str, do: str) -> str:

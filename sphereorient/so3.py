@@ -14,7 +14,6 @@ from sphereorient.files.compiled import compiled, record
 
 SOURCE = Path(__file__).with_suffix("")
 _Rotations = record(SOURCE, "Rotations")
-MEAN_STEPS = 12
 NO_ROTATION = 1e-3  # of an entry of R R^T - I: far beyond rounding, half a milliradian
 ROUNDING = 1e-9  # a count that is a whole number by geometry must not be rounded up for the last bits of a sine
 HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic lattice with a point per unit of volume
@@ -171,7 +170,7 @@ def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
     missing = (share == 0)[..., None] & R.isnan()
     R = torch.where(missing, torch.eye(3, dtype=R.dtype, device=R.device), R)
     mean = nearest_rotation((share[..., None] * R).sum(-3))
-    for _ in range(MEAN_STEPS):
+    for _ in range(12):
         mean = mean @ exp((share * log(mean[..., None, :, :].mT @ R)).sum(-2))
     return mean
 
@@ -288,10 +287,7 @@ def lattman_grid(
     Every rotation is within (1/2 + 1/sqrt 2) step_rad of the grid; random ones within sqrt(3)/2 step_rad (measured in
     tests/so3/test_so3_lattman.py). Rows of theta_y from -pi/2, each by theta_plus, then theta_minus. The last row,
     theta_y = pi/2, holds its rotations twice: there 2 pi of theta_plus is a full turn.
-    Source: Lattman 1972 as in the paper, with the steps of docs/errata.md E5.
-
-    Raises:
-        SettingsError: the step is not in 0 .. pi.
+    Source: Lattman 1972 as in the paper, with the steps of docs/errata.md E5. SettingsError: no step in 0 .. pi.
     """
     if not 0 < step_rad <= math.pi:
         raise SettingsError(refusal("step_rad", expected="0 .. pi", got=f"{step_rad}", do="give the step in rad"))
@@ -320,9 +316,7 @@ def local_grid(
     is included. Covering radius c = 0.704 step_rad: every rotation by at most radius_rad - c is within c of the grid,
     every one by at most radius_rad within 2 c.
     Source: Conway and Sloane, Sphere Packings, Lattices and Groups, ch. 2 (covering radius sqrt(5)/4 of the edge).
-
-    Raises:
-        SettingsError: the step is not above 0, or the radius not in 0 .. pi.
+    Raises SettingsError: the step is not above 0, or the radius not in 0 .. pi.
     """
     if not step_rad > 0:
         raise SettingsError(refusal("step_rad", expected="above 0", got=f"{step_rad}", do="give the step in rad"))

@@ -29,8 +29,11 @@ from sphereorient.cameras import load_cameras
 from sphereorient.cameras.io.cameras_yaml import ENTRIES, MODELS, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
 from sphereorient.cli import app
-from sphereorient.experiment import ExperimentKeys, load_experiment
-from sphereorient.methods.settings import DEFAULTS, load_proposer_settings, load_settings, load_synth_settings
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.experiment import ExperimentKeys
+from sphereorient.learn.settings import ProposerSettings
+from sphereorient.methods.settings import DEFAULTS, load_settings, read_model
+from sphereorient.synth import SynthSettings
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 DOCS = sorted([*REPO.glob("*.md"), *(REPO / "docs").glob("*.md")])
@@ -264,8 +267,8 @@ def test_every_command_of_a_page_exists_with_its_options_and_settings(page):
         options = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
         assert {word for word in words if word.startswith("-")} <= options, line
         changed = [value for option, value in pairwise(words) if option == "--set" and command.name != "init"]
-        load = {"synth": load_synth_settings, "train": load_proposer_settings}.get(command.name, load_settings)
-        load(None, changed)
+        model = {"synth": SynthSettings, "train": ProposerSettings}.get(command.name)
+        read_model(model, None, changed) if model else load_settings(None, changed)
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)

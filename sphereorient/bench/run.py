@@ -33,7 +33,6 @@ from sphereorient.files.cache import FOLDER
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
-from sphereorient.methods.settings import Settings
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies, with_proposer
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
@@ -45,9 +44,9 @@ DIGITS = 5
 MOSTLY = 0.5  # share of a disk from which it counts as hidden
 Floats = NDArray[np.float64]
 TRACKERS: dict[str, Tracker] = {
-    "precise": partial(track_movies, method="precise", settings=Settings()),
-    "paper": partial(track_movies, method="paper", settings=Settings()),
-    "precise_network": partial(track_movies, method="precise", settings=with_proposer(Settings(), "default")),
+    "precise": partial(track_movies, method="precise"),
+    "paper": partial(track_movies, method="paper"),
+    "precise_network": partial(track_movies, method="precise", settings=with_proposer(None, "default")),
 }
 DEFAULT = ("precise", "paper")
 

@@ -27,17 +27,12 @@ class PolynomialCamera(CentralCamera):
     def __post_init__(self) -> None:
         """Refuse also a distortion that folds inside the picture; its rim is enough."""
         super().__post_init__()
-        width, height = self.image_size
-        across = torch.linspace(-0.5, width - 0.5, RIM_STEPS, dtype=torch.float64)
-        down = torch.linspace(-0.5, height - 0.5, RIM_STEPS, dtype=torch.float64)
-        sides = [torch.stack([across, torch.full_like(across, v)], dim=-1) for v in (-0.5, height - 0.5)]
-        sides += [torch.stack([torch.full_like(down, u), down], dim=-1) for u in (-0.5, width - 0.5)]
-        rim_px = torch.cat(sides)
+        u, v = (torch.linspace(-0.5, side - 0.5, RIM_STEPS, dtype=torch.float64) for side in self.image_size)
+        rim_px = torch.cat([torch.cartesian_prod(u, v[[0, -1]]), torch.cartesian_prod(u[[0, -1]], v)])
         lost = torch.isnan(self.undistort(rim_px).detach()).any(-1)
         if bool(lost.any()):
-            u, v = rim_px[lost][0].tolist()
-            expected, do = "a distortion that can be undone in the picture", "correct the camera or calibrate again"
-            raise camera_error("k, p", expected, f"one that folds before ({u:g}, {v:g})", do)
+            got, do = "one that folds before ({:g}, {:g})".format(*rim_px[lost][0]), "correct it or calibrate again"
+            raise camera_error("k, p", "a distortion that can be undone in the picture", got, do)
 
     @property
     def _p_opencv(self) -> Tensor:

@@ -35,9 +35,9 @@ class ParameterCovariance:
         if not names or len(set(names)) < len(names):
             got, do = ", ".join(names) or "none", "name every parameter once"
             raise camera_error("covariance, parameters", "different names", got, do)
-        expected, got = f"{len(names)} rows of {len(names)} numbers", f"shape {tuple(matrix.shape)}"
-        if tuple(matrix.shape) != (len(names), len(names)):
-            raise camera_error("covariance, matrix", expected, got, "write one row and one column for each parameter")
+        if matrix.shape != (len(names), len(names)):
+            expected, do = f"{len(names)} rows of {len(names)} numbers", "write a row and a column for each parameter"
+            raise camera_error("covariance, matrix", expected, f"shape {tuple(matrix.shape)}", do)
         do = "calibrate again, or remove the covariance"
         if not bool(torch.isfinite(matrix).all()) or bool((matrix.diagonal() < 0).any()):
             raise camera_error("covariance, matrix", "finite numbers, none below zero on the diagonal", "others", do)
@@ -119,8 +119,7 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
     along_b = (_cross(baseline, a) * normal).sum(-1, keepdim=True) / sine2
     point = 0.5 * (rays_a.origin_lab_mm + along_a * a + rays_b.origin_lab_mm + along_b * b)
     gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
-    nan = torch.full_like(gap, torch.nan)
-    return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
+    return torch.where(crossing, point, torch.nan), torch.where(crossing, gap, torch.nan)[..., 0]
 
 
 def nearest_point(rays: Sequence[Rays]) -> tuple[Tensor, Tensor]:
@@ -172,9 +171,7 @@ def centre_lab_mm(camera: Camera) -> Tensor:
 
 
 def sphere_disk_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return middle (..., 2) and radius (...), px, of a sphere's picture at positions (..., 3), mm, lab.
-    The radius is that along the camera's x.
-    """
+    """Return middle (..., 2) and radius (...) along x, px, of a sphere's picture at positions (..., 3), mm, lab."""
     right = camera.R_cam_lab[0] * radius_mm
     centre, rim = camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
     return centre, (rim - centre).norm(dim=-1)

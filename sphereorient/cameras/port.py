@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
@@ -74,8 +74,8 @@ class Port:
         outer = air.origin_lab_mm + height / cosine * torch.where(passes, d, -normal)
         origin = outer + self.thickness_mm.to(d) * (along_wall / in_glass - normal)
         direction = (along_wall - in_fluid * normal) / n_fluid
-        nan = torch.full_like(direction, torch.nan)
-        return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
+        origin, direction = (torch.where(passes, part, torch.nan) for part in (origin, direction))
+        return Rays(origin_lab_mm=origin, direction_lab=direction)
 
     def entry_point(self, x_lab_mm: Tensor, centre_lab_mm: Tensor) -> Tensor:
         """Return where light from points (..., 3) in the liquid to a centre (3,) in air leaves the wall; lab, mm.
@@ -127,8 +127,13 @@ class PortCamera:
     camera: Camera  # as it would be in air
     port: Port
     covariance: ParameterCovariance | None = None  # of the camera's and the port's parameters together
+    image_size: tuple[int, int] = field(init=False)
+    R_cam_lab: Tensor = field(init=False)
+    T_cam_lab_mm: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
+        for name in ("image_size", "R_cam_lab", "T_cam_lab_mm"):
+            object.__setattr__(self, name, getattr(self.camera, name))
         if self.covariance is None:
             object.__setattr__(self, "covariance", self.camera.covariance)
         normal, wall = self.port.normal_lab.detach(), float(self.port.air_side_mm.detach())
@@ -142,21 +147,6 @@ class PortCamera:
             do = "write the normal towards the camera"
             got = f"normal {[round(part, 6) for part in normal.tolist()]}, away from it"
             raise camera_error("port", "a wall that the camera looks at", got, do)
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the picture, px."""
-        return self.camera.image_size
-
-    @property
-    def R_cam_lab(self) -> Tensor:
-        """(3, 3) float64, takes lab components to camera components."""
-        return self.camera.R_cam_lab
-
-    @property
-    def T_cam_lab_mm(self) -> Tensor:
-        """(3,) float64: X_cam = R_cam_lab X_lab + T_cam_lab_mm, straight through the wall."""
-        return self.camera.T_cam_lab_mm
 
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Undistort pixels (..., 2) of the camera in air."""

@@ -53,12 +53,13 @@ class Commands(typer.Typer):
 
 
 def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., None]:
-    """Give the options of a command to its record, and --force to a command that writes; `textured`: whether the
-    texture of its experiment is an input.
-    """
+    """Give a command its record of options, and --force if it writes; `textured`: its experiment's map is an input."""
     record = next((one.annotation for one in inspect.signature(function).parameters.values()), None)
     record = record if isinstance(record, type) and is_dataclass(record) else None
     options = list(inspect.signature(record or function).parameters.values())
+    options.sort(
+        key=lambda one: record is not None and one.name not in vars(record)["__annotations__"]
+    )  # own ones first
     writes = any(one.name in OUTPUTS for one in options)
 
     @wraps(function)
@@ -170,15 +171,8 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
     if not console.is_terminal:
         yield _lines(unit)
         return
-    bar = progress.Progress(
-        "{task.description:16}",
-        progress.BarColumn(),
-        "{task.fields[count]:>11}",
-        "{task.fields[rate]:>14}",
-        progress.TimeElapsedColumn(),
-        "{task.fields[left]:12}",
-        console=console,
-    )
+    columns = ("{task.description:16}", progress.BarColumn(), progress.TimeElapsedColumn(), "{task.fields[told]}")
+    bar = progress.Progress(*columns, console=console)
     tasks: dict[str, Any] = {}
     with ExitStack() as shown:
 
@@ -186,25 +180,23 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
             if not tasks:
                 shown.enter_context(bar)  # not earlier: a refusal prints one line only
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total or None, count="", rate="", left="")
+                tasks[stage] = bar.add_task(stage, total=total or None, told="")
             elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed or 0.0
-            count, rate, left = _told(done, total, elapsed, unit)
-            bar.update(tasks[stage], completed=done, total=total or None, count=count, rate=rate, left=left)
+            bar.update(tasks[stage], completed=done, total=total or None, told=_told(done, total, elapsed, unit))
 
         yield advance
 
 
-def _told(done: int, total: int, elapsed_s: float, unit: str) -> tuple[str, str, str]:
+def _told(done: int, total: int, elapsed_s: float, unit: str) -> str:
     """Return how much is done, how fast, and the time left, in words; a stage of one step has nothing to count."""
     if total == 1 or (not done and not total):
-        return "", "", ""
-    count = f"{done} of {total}" if total else f"{done}"
-    if not done or elapsed_s <= 0:
-        return count, "", ""
-    per_s = done / elapsed_s
-    rate = f"{per_s:.1f} {unit}/s" if unit and per_s >= SLOWEST else ""
-    left_s = (total - done) / per_s
-    return count, rate, f"{_duration(left_s)} left" if left_s > 0 else ""
+        return ""
+    words = [f"{done} of {total}" if total else f"{done}"]
+    if done and elapsed_s > 0:
+        per_s = done / elapsed_s
+        words += [f"{per_s:.1f} {unit}/s"] if unit and per_s >= SLOWEST else []
+        words += [f"{_duration((total - done) / per_s)} left"] if total > done else []
+    return ", ".join(words)
 
 
 def _duration(seconds: float) -> str:
@@ -225,8 +217,8 @@ def _lines(unit: str) -> Advance:
         ended = done == total > 1 and now - since > 1.0
         if ended or now - last.get(stage, -math.inf) >= LINE_S:
             last[stage] = now
-            words = ", ".join(word for word in _told(done, total, now - since, unit) if word)
-            typer.echo(f"{now - begun:6.0f} s  {stage}{': ' if words else ''}{words}", err=True)
+            told = _told(done, total, now - since, unit)
+            typer.echo(f"{now - begun:6.0f} s  {stage}{': ' if told else ''}{told}", err=True)
 
     return advance
 

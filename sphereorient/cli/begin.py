@@ -12,7 +12,7 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet
-from sphereorient.errors import ExperimentError, SettingsError, SphereOrientError, error_words, refusal
+from sphereorient.errors import ExperimentError, SettingsError, SphereOrientError, refusal
 from sphereorient.files.draft import DraftKey, draft_yaml, given, open_keys
 from sphereorient.files.whole_file import check_ending, relative_path, write_text
 from sphereorient.files.yaml_file import read_yaml
@@ -69,24 +69,19 @@ def mark(
     browser: Annotated[bool, Option(help="Open the page in the browser.")] = True,
 ) -> None:
     """Mark in the browser what hides the ball in the movies, or the fiducials where `calibrate` does not find them."""
-    from sphereorient.preflight.mark import HOST, serve
+    from sphereorient.preflight.mark import serve
     from sphereorient.preflight.mark_fiducials import FiducialMarking
     from sphereorient.preflight.mark_masks import MaskMarking
 
     content = read_yaml(file, ExperimentError)
     schema = str(content.get("schema")) if isinstance(content, dict) else ""
     marking = (FiducialMarking if schema.startswith("sphereorient-calibration/") else MaskMarking)(file)
-    try:
-        server = serve(marking, port)
-    except OSError as error:
-        do = "choose another --port"
-        raise SettingsError(refusal(f"--port {port}", expected="a free port", got=error_words(error), do=do)) from None
-    address = f"http://{HOST}:{server.server_address[1]}/{marking.token}/"
-    typer.echo(f"{address}\nCtrl-C ends it.")
+    server = serve(marking, port)
+    typer.echo(f"{server.address}\nCtrl-C ends it.")
     if browser:
         import webbrowser
 
-        webbrowser.open(address)
+        webbrowser.open(server.address)
     with server, suppress(KeyboardInterrupt):
         server.serve_forever()
 
@@ -113,10 +108,10 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
 
 
 def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
-    from sphereorient.experiment.fictrac import read_fictrac_config
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
     from sphereorient.preflight.draft import camera_keys
+    from sphereorient.preflight.fictrac import read_fictrac_config
     from sphereorient.preflight.mark_masks import drawn_mask
 
     said = read_fictrac_config(config)

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from sphereorient.bench import BenchSettings, Results, Score
 
-EXIT_WORSE = 1  # a number got worse
-LARGEST_HZ = 1e5
 PASSING_S = 0.03  # correlation time of the velocity: balls pass before each other in a short movie
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
@@ -45,10 +43,10 @@ def synth(
 ) -> None:
     """Render an experiment with exact truth."""
     check_writable(out, folder_made=True)
-    from sphereorient.methods.settings import load_synth_settings
-    from sphereorient.synth import write_synthetic_experiment
+    from sphereorient.methods.settings import read_model
+    from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
-    chosen = load_synth_settings(settings, set_ or [])
+    chosen = read_model(SynthSettings, settings, set_ or [])
     total = chosen.cameras * chosen.frames
     with progress_bar(quiet) as advance:
         done = 0
@@ -136,7 +134,7 @@ class _SceneOptions:
     def plan(self) -> "BenchSettings":
         """Return the settings: of the file, or the defaults, changed by the full run and then by the options."""
         from sphereorient.bench.scenes import FULL, BenchSettings
-        from sphereorient.methods.settings import read_flat
+        from sphereorient.methods.settings import read_model
 
         changes: dict[str, Any] = FULL.model_dump(exclude_unset=True) if self.full else {}
         if self.degradations is not None:
@@ -147,7 +145,7 @@ class _SceneOptions:
             changes["seeds"] = tuple(range(self.seeds))
         if self.frames is not None:
             changes["frames"] = self.frames
-        return read_flat(BenchSettings, self.settings, changes)
+        return read_model(BenchSettings, self.settings, **changes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,13 +199,13 @@ def balls_curve(given: _BallsOptions) -> None:
     from sphereorient.bench import BenchSettings, run_benchmarks
     from sphereorient.bench.figures import density_figure, write_table
     from sphereorient.bench.run import trackers_of
-    from sphereorient.methods.settings import read_flat
+    from sphereorient.methods.settings import read_model
     from sphereorient.report.plots.style import write_figure
 
-    plain = {"degradations": (), "seeds": tuple(range(given.seeds)), "frames": given.frames}
+    plain: dict[str, Any] = {"degradations": (), "seeds": tuple(range(given.seeds)), "frames": given.frames}
     plain |= {"paints": given.paints, "volume_mm": given.volume, "velocity_time": PASSING_S}
     plans = {
-        f"{b}-balls-{c}-cameras": read_flat(BenchSettings, None, plain | {"balls": b, "cameras": c})
+        f"{b}-balls-{c}-cameras": read_model(BenchSettings, **plain, balls=b, cameras=c)
         for c in _numbers_in("--cameras", given.cameras)
         for b in _numbers_in("--balls", given.balls)
     }
@@ -237,9 +235,7 @@ class _LiveDelayOptions:
 
 @bench.command("live")
 def live_delay(given: _LiveDelayOptions) -> None:
-    """Time `live`: from a picture in memory to its line on a socket, by another process. A truth.h5 beside the
-    experiment tells its errors.
-    """
+    """Time `live`, from a picture in memory to a line on a socket; and its errors, by a truth.h5 beside the movie."""
     from rich.table import Table
 
     from sphereorient.bench.live import COLUMNS, LiveTiming, delays, neighbours
@@ -274,7 +270,7 @@ def _rate_hz(text: str) -> float:
         rate_hz = float(text)
     except ValueError:
         rate_hz = 0.0
-    if not 1.0 <= rate_hz < LARGEST_HZ:
+    if not 1.0 <= rate_hz < 1e5:
         do = "write e.g. --rate 100,200,500"
         raise SettingsError(refusal("--rate", expected="frames a second, 1 at least", got=repr(text)[:40], do=do))
     return rate_hz
@@ -409,4 +405,4 @@ def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:
             f"{len(changes)} numbers compared: {len(worse)} worse, {len(better)} better, by more than their scatter"
         )
     if worse:
-        raise typer.Exit(EXIT_WORSE)
+        raise typer.Exit(1)

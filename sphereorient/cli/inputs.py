@@ -12,7 +12,7 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, NoCache, Overrides, Quiet, SettingsPath, frames_of
-from sphereorient.errors import MovieError, refusal
+from sphereorient.errors import MovieError
 from sphereorient.files.whole_file import check_ending, writing
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ Flip = Annotated[str, Option(help="Mirror: none, vertical (rows), horizontal (co
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
 UNEVEN = 1e-3  # of the usual time between frames
-EXIT_FAULT = 1  # a run fails, or its numbers are wrong
 COLOURS = {"ok": typer.colors.GREEN, "warning": typer.colors.YELLOW, "fault": typer.colors.RED}
 MARK, TITLE = 9, 25  # columns of the list
 
@@ -60,7 +59,7 @@ def check(
         counts = [sum(one.severity is severity for one in result.findings) for severity in Severity]
         typer.echo(f"faults: {counts[2]}, warnings: {counts[1]}, without complaint: {counts[0]}. Wrote {picture}")
     if result.severity is Severity.FAULT:
-        raise typer.Exit(EXIT_FAULT)
+        raise typer.Exit(1)
 
 
 def _print_findings(findings: "Sequence[Finding]", quiet: bool) -> None:
@@ -124,7 +123,8 @@ def convert(
 
     with writing(movie_files(source)), flipped(open_movie(source), flip) as opened:
         check_writable(target)
-        first, last = _range(frames, opened)
+        first, last = frames_of(frames, MovieError, len(opened))
+        assert last is not None  # a number of frames was given
         times_s = None if opened.times_s is None else opened.times_s[first:last]
         dead: list[int] = []
         with progress_bar(quiet) as advance:
@@ -184,15 +184,6 @@ def _frames(count: int) -> str:
 def _numbers(numbers: Sequence[int], after: str = ": ") -> str:
     more = f" and {len(numbers) - SHOWN} more" if len(numbers) > SHOWN else ""
     return _frames(len(numbers)) + after + ", ".join(map(str, numbers[:SHOWN])) + more
-
-
-def _range(text: str, opened: "Movie") -> tuple[int, int]:
-    found = frames_of(text)
-    first, last = (found[0] or 0, len(opened) if found[1] is None else found[1]) if found else (0, 0)
-    if not 0 <= first < last <= len(opened):
-        expected, do = f"A:B within 0:{len(opened)}, A below B", "correct --frames"
-        raise MovieError(refusal(f"--frames {text}", expected=expected, got=f"'{text}'", do=do))
-    return first, last
 
 
 def _pictures(opened: "Movie", first: int, last: int, dead: list[int], advance: Advance) -> "Iterator[Grey | None]":

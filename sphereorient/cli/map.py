@@ -11,18 +11,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
-from sphereorient.cli.options import (
-    Cameras,
-    ExperimentPath,
-    NoCache,
-    Overrides,
-    Quiet,
-    Resume,
-    SettingsPath,
-    cameras_of,
-    file_of,
-    settings_of,
-)
+from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, file_of
 from sphereorient.errors import PaintError, refusal
 from sphereorient.files.whole_file import check_ending
 
@@ -40,19 +29,15 @@ PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
 @dataclass(frozen=True, kw_only=True)
-class _MapOptions:
+class _MapOptions(CameraOptions):
     experiment: ExperimentPath
     out: Annotated[Path, Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")]
     init: Annotated[Path | None, Option(help="Old map: gives the body frame, and the texture never seen here.")] = None
-    cameras: Cameras = None
     photographs: Annotated[
         bool, Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
     ] = False
     resume: Resume = False
-    settings: SettingsPath = None
-    set_: Overrides = None
     no_cache: NoCache = False
-    quiet: Quiet = False
 
 
 @app.command("map")
@@ -70,18 +55,23 @@ def map_(given: _MapOptions) -> None:
     for one in outs.values():
         for path in _files_of(one):
             check_writable(path)
-    overrides = [*(given.set_ or []), *(["paint.unordered=true"] if given.photographs else [])]
-    chosen, begun = settings_of(given.settings, overrides, "map"), time.perf_counter()
+    also = ["paint.unordered=true"] if given.photographs else []
+    chosen, begun = given.chosen("map", *also), time.perf_counter()
     old = None if given.init is None else load_texture(given.init)
-    names, command = cameras_of(given.cameras), command_line()
-    request = Request(experiment=given.experiment, out=given.out, method="map", settings=chosen, cameras=names)
+    request = Request(experiment=given.experiment, out=given.out, method="map", settings=chosen, cameras=given.names)
     store = FolderStore(request.parts)
     with store.held(request, resume=given.resume), progress_bar(given.quiet, unit="iterations") as advance:
         kept = store.folder / "map.h5"
         found = learn_map(
-            given.experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command
+            given.experiment,
+            chosen,
+            init=old,
+            cameras=given.names,
+            progress=advance,
+            kept=kept,
+            command=command_line(),
         )
-        results, files = found if isinstance(found, dict) else {"": found}, []
+        results, files = found if isinstance(found, dict) else {found.paint_of: found}, []
         advance("figure", 0, len(results))
         for done, (name, result) in enumerate(results.items(), start=1):
             files += _write(result, old, outs[name])
@@ -91,7 +81,12 @@ def map_(given: _MapOptions) -> None:
         return
     echo_lines(f"note: {remark}" for remark in next(iter(results.values())).remarks)
     for name, result in results.items():
-        _print_result(name, result, given.init)
+        if name:
+            typer.echo(f"ball {name}")
+        _print(result.learnt)
+        if result.comparison is not None:
+            _print_moved(result.comparison, f"against {given.init}")
+            typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in files))
     for name, result in results.items():
@@ -102,15 +97,6 @@ def map_(given: _MapOptions) -> None:
             typer.echo(
                 f"next: write texture: {map_path.name} in {place} of the experiment{why}, then `sphereorient track`"
             )
-
-
-def _print_result(name: str, result: "MapResult", init: Path | None) -> None:
-    if name:
-        typer.echo(f"ball {name}")
-    _print(result.learnt)
-    if result.comparison is not None:
-        _print_moved(result.comparison, f"against {init}")
-        typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
 
 
 def _files_of(out: Path) -> list[Path]:
@@ -125,7 +111,7 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
 
     _, seen, learnt, figure, moved = _files_of(out)
     texture_map.write_texture(result.texture, out)
-    texture_map.write_seen(result.seen, seen)
+    texture_map.write_seen(result.seen, out)
     texture_map.write_learnt(result.learnt, result.track, learnt)
     compared = texture_map.compare_pictures(result.learnt, result.track, result.experiment, out)
     write_figure(texture_map.map_figure(result.learnt, compared), figure)

@@ -2,11 +2,14 @@
 
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
+
+from sphereorient.errors import SphereOrientError, refusal
 
 if TYPE_CHECKING:
     from sphereorient.methods.settings import Settings
@@ -40,14 +43,35 @@ Resume = Annotated[bool, Option("--resume", help="Go on with what a run that was
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no summary.")]
 
 
-def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> "Settings":
-    """Read the settings that a method reads, and print remarks on the others."""
-    from sphereorient.methods.settings import METHODS, read_settings
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """Options of a command that reads settings."""
 
-    loaded = read_settings(path, overrides or [], method if method in METHODS else None)
-    for remark in loaded.remarks:
-        typer.echo(f"note: {remark}", err=True)
-    return loaded.settings
+    settings: SettingsPath = None
+    set_: Overrides = None
+    quiet: Quiet = False
+
+    def chosen(self, method: str, *also: str) -> "Settings":
+        """Read the settings that a method reads, with further overrides, and print remarks on the others."""
+        from sphereorient.methods.settings import METHODS, read_settings
+
+        overrides = [*(self.set_ or ()), *also]
+        settings, remarks = read_settings(self.settings, overrides, method if method in METHODS else None)
+        for remark in remarks:
+            typer.echo(f"note: {remark}", err=True)
+        return settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions(CommonOptions):
+    """Options of a command that also chooses cameras."""
+
+    cameras: Cameras = None
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Names of the cameras; None: all."""
+        return cameras_of(self.cameras)
 
 
 def tracks_in(path: Path, sphere: str | None) -> "Tracks":
@@ -72,9 +96,12 @@ def file_of(out: Path, ball: str) -> Path:
     return out.with_name(f"{out.stem}_{ball}{out.suffix}") if ball else out
 
 
-def frames_of(text: str) -> tuple[int | None, int | None] | None:
-    """Return first and last + 1 of A:B, None for an omitted end; None for another text."""
+def frames_of(text: str, error: type[SphereOrientError], count: int | None = None) -> tuple[int, int | None]:
+    """Return first and last + 1 of A:B, of a movie of `count` frames; None: the last one. Raise `error` for others."""
     found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
-    if not found:
-        return None
-    return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)
+    first, last = (int(found[1] or 0), int(found[2]) if found[2] else count) if found else (0, 0)
+    if last is not None and not first < last <= (count or last):
+        within = f"A:B{'' if count is None else f' within 0:{count}'}, A below B"
+        do = "write e.g. --frames 100:200"
+        raise error(refusal(f"--frames {text}", expected=within, got=f"'{text}'", do=do))
+    return first, last

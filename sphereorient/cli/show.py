@@ -10,15 +10,14 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import (
+    CommonOptions,
     ExperimentPath,
     Quiet,
-    SettingsPath,
     SphereName,
     TrackPath,
     cameras_of,
     file_of,
     frames_of,
-    settings_of,
     tracks_in,
 )
 from sphereorient.errors import OutputError, SettingsError, TrackError, refusal
@@ -28,16 +27,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ReportOptions:
+class _ReportOptions(CommonOptions):
     tracks: Annotated[list[Path], Argument(metavar="TRACK...", help="track.h5 of `sphereorient track`.")]
     out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
     experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
-    settings: SettingsPath = None
-    set_: Annotated[
-        list[str] | None, Option("--set", help="Override one setting, e.g. --set statistics.min_frames=30.")
-    ] = None
     sphere: SphereName = None
-    quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, only warnings.")] = False
 
 
 @app.command()
@@ -47,7 +41,7 @@ def report(given: _ReportOptions) -> None:
     from sphereorient.experiment import load_experiment
     from sphereorient.report.build import write_report
 
-    chosen = settings_of(given.settings, given.set_, "report").statistics
+    chosen = given.chosen("report").statistics
     known = [load_experiment(path) for path in given.experiment or ()]
     loaded, command = _load(given.tracks, given.sphere), command_line()
     with progress_bar(given.quiet, unit="") as advance:
@@ -103,12 +97,7 @@ def overlay(given: _OverlayOptions) -> None:
         raise OutputError(refusal("overlay", expected="something to write", got="neither --out nor --worst", do=do))
     if given.out is not None:
         check_writable(given.out)
-    first, last = frames_of(given.frames) or (0, 0)
-    if first is not None and last is not None and first >= last:
-        do = "write e.g. --frames 100:200"
-        raise SettingsError(
-            refusal(f"--frames {given.frames}", expected="A:B, A below B", got=f"'{given.frames}'", do=do)
-        )
+    first, last = frames_of(given.frames, SettingsError)
     from sphereorient.experiment import load_experiment
     from sphereorient.report.gallery import worst_frames
     from sphereorient.report.overlay import FrameSelection, overlay_movie

@@ -1,7 +1,7 @@
-"""`sphereorient track`."""
+"""`sphereorient track` and `live`."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,18 +10,16 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import Cameras, NoCache, Overrides, Quiet, Resume, SettingsPath, cameras_of, settings_of
-from sphereorient.errors import OutputError, SettingsError, refusal
+from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume
+from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 
 if TYPE_CHECKING:
     from sphereorient.run import Outcome, Request
     from sphereorient.trajectory import Trajectory
 
-EXIT_SOME_FAILED = 1  # of several experiments
-
 
 @dataclass(frozen=True, kw_only=True)
-class _TrackOptions:
+class _TrackOptions(CameraOptions):
     experiments: Annotated[
         list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
     ]
@@ -29,9 +27,6 @@ class _TrackOptions:
     method: Annotated[
         str, Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
     ] = "precise"
-    settings: SettingsPath = None
-    set_: Overrides = None
-    cameras: Cameras = None
     device: Annotated[str, Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu"
     jobs: Annotated[int, Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1
     cluster: Annotated[str | None, Option(help="Dask cluster: its scheduler's address or file; or local.")] = None
@@ -41,7 +36,6 @@ class _TrackOptions:
     proposer: Annotated[str | None, Option(help="Proposer's checkpoint, or default (docs/proposer.md).")] = None
     no_learn_paint: Annotated[bool, Option("--no-learn-paint", help="Use the map even where paint differs.")] = False
     no_cache: NoCache = False
-    quiet: Quiet = False
 
 
 @app.command()
@@ -59,15 +53,15 @@ def track(given: _TrackOptions) -> None:
     from sphereorient.run.stages import with_proposer
     from sphereorient.trajectory import Tracks
 
-    overrides = [*(given.set_ or ()), *(["refine.learn_paint=false"] if given.no_learn_paint else ())]
-    chosen = with_proposer(settings_of(given.settings, overrides, given.method), given.proposer)
+    also = ["refine.learn_paint=false"] if given.no_learn_paint else []
+    chosen = with_proposer(given.chosen(given.method, *also), given.proposer)
     requests = [
         Request(
             experiment=experiment,
             out=path,
             method=given.method,
             settings=chosen,
-            cameras=cameras_of(given.cameras),
+            cameras=given.names,
             device=given.device,
             learnt=given.learnt,
             save_learnt=given.save_learnt,
@@ -117,7 +111,7 @@ def _track_side_by_side(
     for outcome in failed:
         typer.echo(f"sphereorient: {outcome.name}: {outcome.error}", err=True)
     if failed:
-        raise typer.Exit(EXIT_SOME_FAILED)
+        raise typer.Exit(1)
 
 
 def _print_table(outcomes: "Sequence[Outcome]") -> None:
@@ -145,3 +139,66 @@ def _print_summary(result: "Trajectory", name: str) -> None:
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")
     echo_lines(contradiction_lines(result))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LiveOptions(CameraOptions):
+    experiment: ExperimentPath
+    source: Annotated[
+        str, Option(help="movie: at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE.")
+    ] = "movie"
+    to: Annotated[
+        list[str] | None,
+        Option(help="Repeatable. FicTrac: tcp:PORT, udp:PORT, .dat; JSON: zmq:PORT, .jsonl; track: .h5"),
+    ] = None
+    learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
+    page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
+
+
+@app.command()
+def live(given: _LiveOptions) -> None:
+    """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
+
+    The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a
+    ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
+    """
+    from sphereorient.live.loop import open_live, run_live
+    from sphereorient.live.outputs import open_output
+    from sphereorient.live.page import LivePage, open_page
+    from sphereorient.live.sources import source_of
+    from sphereorient.live.track import TrackBlocks
+
+    chosen = given.chosen("precise")
+    source, page = source_of(given.source, _tell), None
+    with ExitStack() as opened:
+        outputs = [open_output(name, _tell) for name in given.to or ()]
+        for output, _ in outputs:
+            opened.callback(output.close)
+        if given.page is not None:
+            page = LivePage()
+            server = opened.enter_context(open_page(page, given.page))
+            opened.callback(server.shutdown)
+            typer.echo(f"page: {server.address}", err=True)
+        set_up = opened.enter_context(open_live(given.experiment, chosen, given.names, given.learnt))
+        blocks = TrackBlocks(
+            recording=set_up.recording,
+            tracker=set_up.tracker,
+            even=source.even,
+            settings=chosen,
+            command=command_line(),
+        )
+        for output, _ in outputs:
+            output.begin(blocks)
+        monitor = run_live(set_up, source, outputs, page, _tell)
+        if set_up.save_map is not None:
+            _tell("the map is finished; this takes some seconds")
+            try:
+                typer.echo(set_up.save_map())
+            except PaintError as error:
+                _tell(str(error))
+    if not given.quiet:
+        echo_lines(monitor.summary())
+
+
+def _tell(line: str) -> None:
+    typer.echo(f"note: {line}", err=True)

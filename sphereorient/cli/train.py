@@ -28,9 +28,10 @@ def train(
     """Train a network that proposes orientations (docs/proposer.md)."""
     check_writable(out, folder_made=True)
     from sphereorient.files.whole_file import check_target, write_text, writing
-    from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
+    from sphereorient.learn.settings import ProposerSettings
+    from sphereorient.methods.settings import model_yaml, read_model
 
-    settings = load_proposer_settings(config, set_ or [])
+    settings = read_model(ProposerSettings, config, set_ or [])
     from sphereorient.learn.metrics import make_examples
     from sphereorient.learn.train import CHECKPOINT, LAST, prepare, train_proposer
     from sphereorient.report.learning import examples_figure, learning_curve_figure
@@ -41,7 +42,7 @@ def train(
         for name in (CHECKPOINT, LAST, "metrics.csv"):
             check_target(out / name)
         if config.resolve() != (out / "settings.yaml").resolve():
-            write_text(out / "settings.yaml", proposer_settings_yaml(settings))
+            write_text(out / "settings.yaml", model_yaml("Training of a proposer", settings))
         trained = train_proposer(settings, out, resume=resume, progress=advance)
         curve = learning_curve_figure(trained.rows, int(trained.checkpoint.about["best_step"]))
         write_figure(curve, out / "learning_curve.png")
@@ -66,10 +67,11 @@ def evaluate(
     """Measure the recall of a proposer's checkpoint on balls that no training sees, one degradation at a time."""
     from sphereorient.learn.checkpoint import load_checkpoint
     from sphereorient.learn.metrics import benchmark_checkpoint
-    from sphereorient.methods.settings import load_proposer_settings
+    from sphereorient.learn.settings import ProposerSettings
+    from sphereorient.methods.settings import read_model
 
     loaded = load_checkpoint(checkpoint)
-    chosen = loaded.settings if config is None else load_proposer_settings(config)
+    chosen = loaded.settings if config is None else read_model(ProposerSettings, config)
     with progress_bar(quiet, unit="maps") as advance:
         found = benchmark_checkpoint(loaded, chosen.pictures, pictures, advance)
     if as_json:

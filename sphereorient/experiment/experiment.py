@@ -9,8 +9,7 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.cameras.checks import check_known
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.files.whole_file import relative_path
-from sphereorient.files.yaml_file import read_document, short, validated, write_document
+from sphereorient.files.yaml_file import read_document, short, validated
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
 from sphereorient.sphere import seen_path
 
@@ -153,14 +152,13 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     flow: FlowKeys = FlowKeys()
 
 
-def load_experiment(path: Path | str) -> Experiment:
-    """Read experiment.yaml and its cameras; movies and pictures are not opened.
-
-    Raises:
-        ExperimentError: missing, malformed or inconsistent file.
-        CameraError: missing or malformed cameras file.
+def load_experiment(source: Experiment | Path | str) -> Experiment:
+    """Read experiment.yaml and its cameras, unless it is read already; movies and pictures are not opened.
+    Raises ExperimentError (missing, malformed or inconsistent file), CameraError (likewise, of its cameras).
     """
-    path = Path(path)
+    if isinstance(source, Experiment):
+        return source
+    path = Path(source)
     if is_movie(path):
         do = f"write its experiment.yaml first: `sphereorient init {path}`"
         raise refused(str(path), "an experiment.yaml", "a movie", do)
@@ -206,43 +204,6 @@ def load_experiment(path: Path | str) -> Experiment:
         frames=keys.frames,
         flow=keys.flow.model_dump(exclude_none=True),
     )
-
-
-def write_experiment(experiment: Experiment, comment: str = "") -> Path:
-    """Write an experiment, without its cameras, to its `path`, and return the path; `comment` stands at the top.
-    Raises OutputError (file not writable).
-    """
-
-    def relative(path: Path | str) -> str:
-        return relative_path(path, experiment.folder)
-
-    def all_relative(paths: Mapping[str, Path]) -> dict[str, str]:
-        return {name: relative(path) for name, path in paths.items()}
-
-    def keys_of(sphere: Sphere) -> dict[str, Any]:
-        keys: dict[str, Any] = {"diameter": sphere.diameter_mm}
-        keys |= {} if sphere.texture_path is None else {"texture": relative(sphere.texture_path)}
-        return keys | ({"fixed": True} if sphere.fixed else {})
-
-    times, spheres = experiment.times, {sphere.name: keys_of(sphere) for sphere in experiment.spheres}
-    document: dict[str, Any] = {
-        "name": experiment.name,
-        "frame_rate": float(experiment.frame_rate_hz) if times is None else None,
-        "times": times if times in (None, MOVIES_OWN) else relative(str(times)),
-        "exposure": None if experiment.exposure_s is None else float(experiment.exposure_s),
-        **({"sphere": spheres[""]} if "" in spheres else {"spheres": spheres}),
-        "cameras": relative(experiment.cameras_path),
-        "movies": all_relative(experiment.movie_paths),
-        "masks": all_relative(experiment.mask_paths),
-        "backgrounds": all_relative(experiment.background_paths),
-        "start": {name: number for name, number in experiment.start.items() if number},
-        "frames": None if experiment.frames is None else list(experiment.frames),
-        "flip": dict(experiment.flip),
-        "flow": dict(experiment.flow),
-    }
-    document = {key: value for key, value in document.items() if value not in (None, {})}
-    write_document(experiment.path, SCHEMA, document, comment)
-    return experiment.path
 
 
 def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> dict[str, Movie]:

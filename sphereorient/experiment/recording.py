@@ -93,7 +93,7 @@ def open_recording(
     """Open an experiment, or its path, with the named cameras (None: all); without `textured`, no texture map is read.
     Raises SphereOrientError (inputs missing, unreadable or inconsistent; with `textured`, no texture map).
     """
-    experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
+    experiment = load_experiment(source)
     paths = {sphere.name: _texture_path(experiment, sphere) for sphere in experiment.spheres} if textured else {}
     loaded = {path: load_map(path) for path in dict.fromkeys(paths.values())}
     names = _chosen(experiment, cameras)

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
-from sphereorient.errors import ExperimentError, MovieError, refusal
+from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
 from sphereorient.experiment.experiment import Experiment, refused
 from sphereorient.experiment.timeline import NONE
-from sphereorient.files.picture import claimed_pixels, decoded_grey
+from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
-from sphereorient.movies import Grey, Movie, OnDemand, flipped_picture
-from sphereorient.trajectory import Reason
+from sphereorient.movies import Grey, Movie, flipped_picture
 
 Shown = TypeVar("Shown", bound=Grey | OnDemand)
 

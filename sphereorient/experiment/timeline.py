@@ -21,7 +21,6 @@ LATE_STEPS = 0.05  # frame periods: a larger median difference of stamps causes 
 EVEN_STEPS = 1e-3  # frame periods: tolerance of evenly spaced times
 ON_GRID = 0.02  # frame periods: tolerance of a regular grid
 LONGEST_PAUSE = 50  # frame periods; no motion continues over a longer pause
-TIMES_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,7 +115,7 @@ def load_times(path: Path) -> Floats:
     Raises ExperimentError (missing, too large, a line without a number, or times not increasing).
     """
     do = "write one time a line, in seconds, increasing"
-    lines = read_text(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:").splitlines()
+    lines = read_text(path, 1 << 24, "a table of times", ExperimentError, "correct times:").splitlines()
     values: list[float] = []
     for number, line in enumerate(lines, 1):
         text = line.split("#")[0].strip().rstrip(",;")

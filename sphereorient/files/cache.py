@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import secrets
 import warnings
 import zipfile
 import zlib
@@ -18,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.errors import error_words
+from sphereorient.errors import OutputError, error_words
+from sphereorient.files.whole_file import put_aside, writing
 
 # Environment variables: where this is set, nothing is kept or read; the folder in place of the user's.
 WITHOUT, FOLDER = "SPHEREORIENT_NO_CACHE", "SPHEREORIENT_CACHE"
@@ -90,19 +90,13 @@ def _read(path: Path) -> Arrays | None:
 
 def _write(path: Path, arrays: Arrays) -> None:
     """Keep arrays under their final name at once, whoever else writes; delete the oldest files over the limit."""
-    aside = path.with_name(f".{path.stem}.{secrets.token_hex(8)}.partial")
+    save: Any = np.savez  # whose types take no names
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with aside.open("xb") as file:
-            save: Any = np.savez  # whose types take no names
+        with writing(force=True), put_aside(path) as aside, aside.open("wb") as file:
             save(file, **arrays)
-        aside.replace(path)
         _trim(path.parent)
-    except OSError as error:
+    except OutputError as error:
         warn_once(f"nothing is kept in {path.parent} ({error_words(error)}): each run computes it again (--no-cache)")
-    finally:
-        with suppress(OSError):
-            aside.unlink(missing_ok=True)
 
 
 @lru_cache(maxsize=8)
@@ -114,7 +108,7 @@ def warn_once(words: str) -> None:
 def _trim(folder: Path) -> None:
     """Delete the least recently used files until the rest is below the limit; another run may delete them too."""
     files = []
-    for path in folder.glob("*.npz"):
+    for path in folder.glob("[!.]*.npz"):
         with suppress(OSError):
             files.append((path.stat().st_mtime_ns, path.stat().st_size, path))
     total = sum(size for _, size, _ in files)

@@ -4,11 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import yaml
-
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.whole_file import sealed
-from sphereorient.files.yaml_file import FAULTS, parse_yaml, refuse_unknown, short
+from sphereorient.files.yaml_file import assigned, flow, refuse_unknown, short
 
 WIDTH = 120  # characters of a line
 
@@ -28,20 +26,14 @@ def given(keys: Sequence[DraftKey], changes: Iterable[str]) -> list[DraftKey]:
     """Return keys with values `name=value`, YAML, put in; SettingsError for an unknown name or no YAML."""
     known = {key.name: key for key in keys}
     for text in changes:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise SettingsError(refusal(f"--set {text}", expected="key=value", got=short(text), do="give both"))
-        if name.strip() not in known:
-            raise SettingsError(refuse_unknown(name.strip(), known, "--set"))
-        key, do = known[name.strip()], "quote it for the shell"
-        try:
-            found = parse_yaml(value)
-        except FAULTS:
-            raise SettingsError(refusal(f"--set {name}", expected="a YAML value", got=short(value), do=do)) from None
+        name, found = assigned(text)
+        if name not in known:
+            raise SettingsError(refuse_unknown(name, known, "--set"))
+        key = known[name]
         example = key.example if key.value in (..., None) else key.value
         if found is not None and not _alike(found, example):
-            expected = f"a value like {_flow(example)[:60]}"
-            raise SettingsError(refusal(f"--set {name}", expected=expected, got=short(value), do="write such a one"))
+            expected = f"a value like {flow(example)[:60]}"
+            raise SettingsError(refusal(f"--set {name}", expected=expected, got=short(found), do="write such a one"))
         known[key.name] = replace(key, value=found)
     return list(known.values())
 
@@ -84,13 +76,8 @@ def _line(key: DraftKey, name: str, indent: str) -> list[str]:
     comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}"
     mark = indent if known else f"{indent}#"  # without the "#" the key stands where it belongs
     if isinstance(values, list) and values and isinstance(values[0], Mapping):
-        return [f"{mark}{name}:  {comment}", *(f"{mark}  - {_flow(value)}" for value in values)]
-    text = f"{mark}{name}: {_flow(values)}"
+        return [f"{mark}{name}:  {comment}", *(f"{mark}  - {flow(value)}" for value in values)]
+    text = f"{mark}{name}: {flow(values)}"
     if len(text) + len(comment) + 2 > WIDTH:
         return [f"{indent}{comment}", text]
     return [f"{text:34}  {comment}"]
-
-
-def _flow(value: Any) -> str:
-    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000, allow_unicode=True)
-    return text.strip().removesuffix("...").strip()

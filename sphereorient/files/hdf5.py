@@ -14,6 +14,9 @@ from sphereorient.files.whole_file import ROOM, put_aside
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 
 
+SPHERES = "spheres"  # group of those of several balls
+
+
 @contextmanager
 def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
     """Open an HDF5 file that replaces `path` once complete and on the disk; else OutputError with the remedy `do`."""
@@ -38,6 +41,16 @@ def digest(file: h5py.File) -> str:
     add("", file)
     file.visititems(add)
     return total.hexdigest()
+
+
+def ball_group(file: h5py.File, name: str) -> h5py.Group:
+    """Return a new group for a ball; the file itself for an only one, whose name is empty."""
+    return file.create_group(f"{SPHERES}/{name}") if name else file
+
+
+def ball_groups(file: h5py.File) -> dict[str, h5py.Group]:
+    """Return the groups that `ball_group` made, by name."""
+    return dict(file[SPHERES].items()) if SPHERES in file else {"": file}
 
 
 class GuardedFile(io.FileIO):

@@ -4,11 +4,11 @@ import json
 import secrets
 from collections.abc import Callable
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import unquote
 
-from sphereorient.errors import SphereOrientError
+from sphereorient.errors import SphereOrientError, error_words, refusal
 
 HOST = "127.0.0.1"
 
@@ -57,3 +57,15 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def log_message(self, form: str, *values: object) -> None:
         """Print nothing: the page tells what happens."""
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves a page on this machine; port 0: any free one. Raise `error`, with the `option`, for a port in use."""
+
+    def __init__(self, handler: type[PageHandler], port: int, option: str, error: type[SphereOrientError]) -> None:
+        try:
+            super().__init__((HOST, port), handler)
+        except OSError as fault:
+            do, got = f"choose another {option}", error_words(fault)
+            raise error(refusal(f"{option} {port}", expected="a free port", got=got, do=do)) from None
+        self.address = f"http://{HOST}:{self.server_address[1]}/{handler.token}/"

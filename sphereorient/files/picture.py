@@ -2,6 +2,7 @@ import itertools
 import math
 import struct
 import warnings
+from abc import ABC, abstractmethod
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,29 @@ FAULTS = (  # of damaged headers
     *(OSError, ValueError, ArithmeticError, LookupError, MemoryError, SyntaxError, TypeError, AttributeError),
     *(RuntimeError, struct.error, TiffFileError),
 )
+# Thousandths that add up to 1000: R = G = B keeps its value.
+RED, GREEN, BLUE = 299, 587, 114
 BOMB_PIXELS = 1 << 40  # reported for pictures that Pillow refuses by their size
 
 warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # callers compare the size with their own limit
+
+
+class OnDemand(ABC):
+    """Picture of which the parts that are asked for are decoded; made by `Movie.on_demand`."""
+
+    shape: tuple[int, int]  # (H, W)
+
+    @abstractmethod
+    def equals(self, other: object) -> bool:
+        """Return whether another picture on demand is the same."""
+
+    @abstractmethod
+    def ask(self, left: int, top: int, right: int, bottom: int) -> None:
+        """Begin to decode a part, right and bottom included, of this picture, and of the next one."""
+
+    @abstractmethod
+    def part(self, left: int, top: int, right: int, bottom: int) -> NDArray[Any]:
+        """Return the picture (H, W), decoded at least where asked for, right and bottom included."""
 
 
 def claimed_pixels(content: bytes) -> int | None:
@@ -58,6 +79,12 @@ def decoded_grey(content: bytes) -> NDArray[Any] | None:
     """Return the grey values of a picture file, (H, W), in its own depth; None where decoding fails."""
     picture = decoded(content, GREY)
     return None if picture is None or picture.ndim != 2 else np.asarray(picture)
+
+
+def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:
+    """Return the grey values of a colour picture (...), uint8 or uint16, by ITU-R BT.601; exact where R = G = B."""
+    total = RED * red.astype(np.uint32) + GREEN * green.astype(np.uint32) + BLUE * blue.astype(np.uint32)
+    return ((total + 500) // 1000).astype(red.dtype)
 
 
 def eight_bits(picture: NDArray[Any]) -> NDArray[np.uint8]:

@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
 
-from sphereorient.errors import SphereOrientError, refusal
+from sphereorient.errors import SettingsError, SphereOrientError, refusal
 from sphereorient.files.whole_file import MARK, TEXT_BYTES, read_text, write_text
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -30,9 +30,7 @@ FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exi
 def read_document(
     path: Path, schema: str, error: type[SphereOrientError], do: str = "correct the path"
 ) -> dict[str, Any]:
-    """Read a YAML mapping whose key `schema` must be `schema`, without this key; raise `error` for anything else.
-    `do`: what to do where there is no such file.
-    """
+    """Read a YAML mapping of this `schema`, without that key; raise `error` for others, with `do` where none is."""
     document = read_yaml(path, error, do)
     if not isinstance(document, dict):
         got = "an empty file" if document is None else short(document)
@@ -91,6 +89,24 @@ def short(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def flow(value: Any) -> str:
+    """Return a value as YAML in one line."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=1 << 20, allow_unicode=True)
+    return text.strip().removesuffix("...").strip()
+
+
+def assigned(text: str) -> tuple[str, Any]:
+    """Return the key and the value, YAML, of `key=value`, the text of an option --set; SettingsError for another."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise SettingsError(refusal(f"--set {text}", expected="key=value", got=short(text), do="give both"))
+    try:
+        return key.strip(), parse_yaml(value)
+    except FAULTS:
+        do = "quote it for the shell"
+        raise SettingsError(refusal(f"--set {text}", expected="a YAML value", got=short(value), do=do)) from None
+
+
 def yaml_words(fault: Exception) -> str:
     """Word the fault of a YAML text in one short line."""
     mark = getattr(fault, "problem_mark", None)
@@ -113,11 +129,10 @@ def with_value(text: str, place: Sequence[str | int], value: Mapping[str, Any]) 
     else, comments included, stays. An absent last key is added, in the place of one that is commented out. None where
     that could lose something: an old value in several lines, or a form that is not understood.
     """
-    line = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=1 << 20).strip()
     *above, key = place
     try:
         wanted = _changed(parse_yaml(text), place, value)
-        new = _spliced(text, _node_at(_BoundedLoader(text).get_single_node(), above), str(key), line)
+        new = _spliced(text, _node_at(_BoundedLoader(text).get_single_node(), above), str(key), flow(value))
         return new if new is not None and parse_yaml(new) == wanted else None
     except (*FAULTS, LookupError, TypeError):
         return None
@@ -221,9 +236,11 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str, also: Se
     # An unknown key first: it is often a missing one, mistyped.
     first = min(fault.errors(include_url=False), key=lambda error: error["type"] != "extra_forbidden")
     place, kind, message = first["loc"], first["type"], first["msg"]
+    if isinstance(cause := first.get("ctx", {}).get("error"), SphereOrientError):  # worded already
+        return f"{where}, {cause}"
     name = ", ".join([where, ".".join(map(str, place))]) if place else where
     if kind == "extra_forbidden":
-        return refuse_unknown(place[-1], known_keys(model, place[:-1]), ", ".join([where, *map(str, place[:-1])]))
+        return refuse_unknown(place[-1], _known_keys(model, place[:-1]), ", ".join([where, *map(str, place[:-1])]))
     if kind == "missing":
         missing = [*also, *(".".join(map(str, one["loc"])) for one in fault.errors() if one["type"] == "missing")]
         if len(missing) > 1:
@@ -234,7 +251,7 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str, also: Se
     return refusal(name, expected=expected, got=short(first["input"]), do="correct the value")
 
 
-def known_keys(model: type[BaseModel], place: Iterable[int | str]) -> list[str]:
+def _known_keys(model: type[BaseModel], place: Iterable[int | str]) -> list[str]:
     """Return the keys of a model's part at `place`, the keys that lead there."""
     for step in place:
         if str(step) in model.model_fields:  # others are names or numbers from the file, such as a camera's

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.chunk import Ahead, Chunk, Expected
 from sphereorient.follow.fixed_centre import FixedCentre
@@ -24,7 +25,6 @@ from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
 from sphereorient.pose.fitter import DisksPx, Fitter, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.poses import FittedPoses, PoseStart
-from sphereorient.trajectory import Reason
 
 Floats = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.follow.poses import Poses, supported
 from sphereorient.pose.neighbours import Neighbours
-from sphereorient.trajectory import Reason
 
 Floats = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.files.threads import side_by_side
@@ -22,7 +23,6 @@ from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.locate.outline import Outline
 from sphereorient.pose import CameraView
-from sphereorient.trajectory import Reason
 
 MOST, KEPT = 8, 2  # times the frames that are wanted: looked at, and kept
 SHOWN = 0.75  # of the frames that are wanted, in which each camera is to show the ball

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sphereorient.errors import Reason
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses, blank_parts
-from sphereorient.trajectory import Reason
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

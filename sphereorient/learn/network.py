@@ -9,13 +9,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.learn.settings import NetworkSettings
 from sphereorient.search.candidates import Candidates, check_disks, distinct
 from sphereorient.search.normalisation import rim_share
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import disk_offsets
-from sphereorient.trajectory import Reason
 
 SCALES = (0.06, 0.1, 0.16, 0.25, 0.4, 0.7)  # standard deviations of the map's blurs, rad
 WINDOW = 0.3  # of the neighbourhood mean that is subtracted, radii

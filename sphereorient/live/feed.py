@@ -15,7 +15,6 @@ from sphereorient.experiment.stream import CameraStream
 Picture = NDArray[np.generic]
 Tell = Callable[[str], object]  # gets what is wrong, in one line
 STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
-USUAL_FRAMES = 16  # over which the interval is averaged
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +76,7 @@ class Feed:
                     self.newest_s = self.newest_s if self._wait else arrival.time_s
                     if self._last_s:
                         step_s = arrival.arrived_s - self._last_s
-                        self._usual_s += (step_s - self._usual_s) / USUAL_FRAMES if self._usual_s else step_s
+                        self._usual_s += (step_s - self._usual_s) / 16 if self._usual_s else step_s
                     self._last_s = arrival.arrived_s
                     self._changed.notify_all()
                     if self._closed:

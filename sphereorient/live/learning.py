@@ -41,7 +41,6 @@ HANDED = 400  # frames that are handed over at most; the ball has shown its side
 LAST = 3  # poses from which following goes on with another map
 FEWEST = 6  # iterations of a map that is kept
 IDLE_S = 0.3  # without a frame: the ball shows nothing new
-PIPE_S = 0.004  # in which a full pipe is filled again
 SAVED_S = 120.0  # in which a map is finished
 
 
@@ -134,7 +133,7 @@ def _waiting(frames: "Queue[Any]") -> list[_Handed | None]:
     with suppress(Empty):
         found.append(frames.get(timeout=IDLE_S))
         while True:
-            found.append(frames.get(timeout=PIPE_S))
+            found.append(frames.get(timeout=0.004))  # a full pipe is filled again by then
     return found
 
 

@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.cameras import Camera
 from sphereorient.live.live import Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
 from sphereorient.trajectory.walk import arcs, fictrac_rows, rotation_vectors, turned
 
 Floats = NDArray[np.float64]
-DIGITS = 14
 
 
 class FicTracLines:
@@ -24,8 +22,8 @@ class FicTracLines:
     is the animal's frame. A frame without a pose is NaN; after it the sequence counter begins anew.
     """
 
-    def __init__(self, camera: Camera) -> None:
-        self._R_cam_lab = camera.R_cam_lab.numpy()
+    def __init__(self, R_cam_lab: Floats) -> None:
+        self._R_cam_lab = R_cam_lab  # (3, 3)
         self._before: Measured | None = None
         self._first = np.eye(3)  # R_lab_body where this stretch begins
         self._sequence = 0
@@ -68,7 +66,7 @@ class FicTracLines:
 
 def fictrac_line(columns: Floats) -> str:
     """Return the columns of a frame as FicTrac writes them to a file."""
-    return ", ".join(f"{value:.{DIGITS}g}" for value in columns.tolist())
+    return ", ".join(f"{value:.14g}" for value in columns.tolist())
 
 
 class JsonLines:

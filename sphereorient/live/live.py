@@ -9,16 +9,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.errors import Reason
 from sphereorient.follow import Appearance
 from sphereorient.follow.poses import Poses, supported
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
 from sphereorient.methods.results import fit_flags, missed_by
 from sphereorient.pose import CameraView
-from sphereorient.trajectory import Reason
 
 Floats = NDArray[np.float64]
-LOST_COVARIANCE = np.full((6, 6), np.nan)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +90,7 @@ def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: Li
         time_s=arrival.time_s,
         position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
         R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
-        covariance=poses.covariance[0].numpy() if there else LOST_COVARIANCE,
+        covariance=poses.covariance[0].numpy() if there else np.full((6, 6), np.nan),
         reason=poses.reason,
         poses=poses,
         map_number=tracker.number,

@@ -24,10 +24,8 @@ from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
-from sphereorient.sphere.texture import seen_path
 
 SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
-WAITING = 64  # frames of a camera that wait at most
 MAP = "texture.png"  # beside the experiment, where that names none
 
 
@@ -45,10 +43,8 @@ def open_live(
     source: Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
 ) -> Iterator[LiveSetUp]:
     """Open an experiment. Without a texture map, that of a ball that stays in its place is learnt meanwhile.
-
-    Raises:
-        ExperimentError: cameras that contradict each other, or no map of a ball that moves.
-        SphereOrientError: missing, unreadable or inconsistent inputs.
+    Raises SphereOrientError: missing, unreadable or inconsistent inputs; ExperimentError: cameras that contradict each
+    other, or no map of a ball that moves.
     """
     experiment = load_experiment(source)
     path = experiment.texture_path
@@ -87,7 +83,7 @@ def _learning(
             texture, seen = learner.paint()
             with writing(force=True):  # that of before, by this run
                 write_texture(texture, path)
-                write_seen(seen, seen_path(path))
+                write_seen(seen, path)
             return f"Wrote {path}"
 
         learner = MapLearner()  # its process begins while the ball is looked for
@@ -107,11 +103,11 @@ def run_live(
     """
     recording, tracker = opened.recording, opened.tracker
     views, number = tracker.appearance.fitter.views, tracker.number
-    table, json_lines = FicTracLines(views[0].camera), JsonLines(recording.experiment.fixed)
+    table, json_lines = FicTracLines(views[0].camera.R_cam_lab.numpy()), JsonLines(recording.experiment.fixed)
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
     sys.setswitchinterval(SWITCH_S)
-    feed = Feed(source.frames(recording), WAITING, wait=source.waits, tell=tell)
+    feed = Feed(source.frames(recording), most=64, wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
     if page is not None:
         page.views, page.radius_mm, page.save_map = views, recording.experiment.radius_mm, opened.save_map

@@ -9,9 +9,9 @@ from threading import Event
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.errors import Reason
 from sphereorient.live.feed import Arrival, Feed, Tell
 from sphereorient.live.live import Measured
-from sphereorient.trajectory import Reason
 from sphereorient.trajectory.walk import FICTRAC
 
 KEPT = 1000  # latencies

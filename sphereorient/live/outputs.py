@@ -16,9 +16,8 @@ from typing import IO, Any
 from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.page_server import HOST
 from sphereorient.live.feed import Tell
-from sphereorient.live.live import Measured
-from sphereorient.live.track import TrackBlocks, whole_track
-from sphereorient.trajectory import journal
+from sphereorient.live.track import TrackBlocks
+from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
 MOST_ROWS = 100_000  # likewise, for a disk: minutes
@@ -92,20 +91,6 @@ class Spool:
                 self._changed.wait_for(lambda: self._ends, self._pause_s)
 
 
-class DiskSpool(Spool):
-    """Of a file: far more may wait. `tell` gets one line where the disk takes no more, or was too slow."""
-
-    def __init__(self, path: Path, write: Callable[[list[Any]], object], tell: Tell, pause_s: float = 0.0) -> None:
-        super().__init__(write, lambda error: tell(no_room(path, error)), MOST_ROWS, pause_s)
-        self._path, self._tell = path, tell
-
-    def close(self, limit_s: float = DISK_S) -> None:
-        """Write what waits, within a limit, and end."""
-        super().close(limit_s)
-        if self.lost and not self.gone:
-            self._tell(f"{self._path}: the disk was too slow for {self.lost} frames; they are missing.")
-
-
 def no_room(path: Path, error: OSError) -> str:
     """Return the words for a file that the disk does not take."""
     do = "make room; tracking goes on without this file"
@@ -156,8 +141,7 @@ class ZmqOutput(Output):
                 self._socket.bind(f"tcp://{host}:{port}")
         except zmq.ZMQError as error:
             self._context.destroy(0)
-            do = "choose another port, or end the program that has it"
-            raise OutputError(refusal(name, expected="a free port", got=error_words(error), do=do)) from None
+            raise _taken(name, error) from None
 
     def send(self, line: str) -> None:
         """Publish a line."""
@@ -176,10 +160,7 @@ class TcpOutput(Output):
         try:
             self._server = socket.create_server((host, port))
         except OSError as error:
-            do = "choose another port, or end the program that has it"
-            raise OutputError(
-                refusal(f"tcp:{host}:{port}", expected="a free port", got=error_words(error), do=do)
-            ) from None
+            raise _taken(f"tcp:{host}:{port}", error) from None
         self.port = int(self._server.getsockname()[1])
         self._readers: list[tuple[socket.socket, Spool]] = []
         self._thread = Thread(target=self._accept, name="tcp", daemon=True)
@@ -209,87 +190,91 @@ class TcpOutput(Output):
             connection.close()
 
 
+def _taken(name: str, error: Exception) -> OutputError:
+    do = "choose another port, or end the program that has it"
+    return OutputError(refusal(name, expected="a free port", got=error_words(error), do=do))
+
+
 def _send_all(connection: socket.socket, lines: list[str]) -> None:
-    connection.sendall("".join(f"{line}\n" for line in lines).encode())
+    connection.sendall(_joined(lines))
+
+
+def _joined(lines: list[str]) -> bytes:
+    return "".join(f"{line}\n" for line in lines).encode()
 
 
 class FileOutput(Output):
     """A new text file that grows by a line a frame; what is in it survives the end of the program.
-    `tell` gets one line where the disk takes no more.
+    `tell` gets one line where the disk takes no more, after which nothing is written, or was too slow.
     Raise OutputError: there is such a file, or no folder for it.
     """
 
-    def __init__(self, path: Path, tell: Tell) -> None:
+    def __init__(self, path: Path, tell: Tell, pause_s: float = 0.0) -> None:
         check_new(path)
-        self._path = path
+        self._path, self._tell = path, tell
         self._file: IO[bytes] | None = None
-        self._spool = DiskSpool(path, self._write, tell)
+        self._spool = Spool(self._write, lambda error: tell(no_room(path, error)), MOST_ROWS, pause_s)
 
-    def send(self, line: str) -> None:
-        """Take a line; after a fault nothing more is written."""
-        self._spool.send(f"{line}\n".encode())
+    def send(self, thing: Any) -> None:
+        """Take a line."""
+        self._spool.send(thing)
 
-    def _write(self, lines: list[bytes]) -> None:
-        if self._file is None:
-            self._file = self._path.open("xb")
-        self._file.write(b"".join(lines))
+    def _bytes(self, things: list[Any]) -> bytes:
+        return _joined(things)
+
+    def _write(self, things: list[Any]) -> None:
+        self._file = self._file or self._path.open("xb")
+        self._file.write(self._bytes(things))
         self._file.flush()
 
     def close(self) -> None:
         """Write what waits, and close the file."""
-        self._spool.close()
+        self._spool.close(DISK_S)
+        if self._spool.lost and not self._spool.gone:
+            self._tell(f"{self._path}: the disk was too slow for {self._spool.lost} frames; they are missing.")
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
 
 
-class TrackOutput(Output):
-    """A new track.h5 (docs/data-format.md): rows in a journal beside it until it is written whole at the end.
-    `tell` gets one line where the disk takes no more; the frames go on.
-    Raise OutputError: there is such a file or journal, or no folder for it.
-    """
+class TrackOutput(FileOutput):
+    """A new track.h5 (docs/data-format.md): rows in a journal beside it until it is written whole at the end."""
 
     def __init__(self, path: Path, tell: Tell) -> None:
-        self._path, self._tell, self._journal = path, tell, journal.journal_path(path)
         check_new(path)
-        check_new(self._journal)
-        self._file: IO[bytes] | None = None
-        self._spool: DiskSpool | None = None
+        self._track = path
+        self._blocks: TrackBlocks | None = None
+        super().__init__(journal.journal_path(path), tell, BLOCK_S)
 
     def begin(self, blocks: TrackBlocks) -> None:
         """Begin the journal; raise OutputError if it cannot be written."""
+        self._blocks = blocks
         try:
-            self._file = self._journal.open("xb")
+            self._file = self._path.open("xb")
             self._file.write(journal.head(blocks.head()))
             self._file.flush()
         except OSError as error:
-            raise OutputError(no_room(self._journal, error)) from None
+            raise OutputError(no_room(self._path, error)) from None
 
-        def write(frames: list[Measured]) -> None:
-            assert self._file is not None
-            self._file.write(journal.rows(blocks.block(frames)))
-            self._file.flush()
-            os.fsync(self._file.fileno())  # also a power cut leaves what is older than a second
+    def _bytes(self, frames: list[Any]) -> bytes:
+        assert self._blocks is not None  # no frame comes before it
+        return journal.rows(self._blocks.block(frames))
 
-        self._spool = DiskSpool(self._journal, write, self._tell, BLOCK_S)
-
-    def send(self, now: Measured) -> None:
-        """Take a frame; after a fault nothing more is written."""
-        if self._spool is not None:
-            self._spool.send(now)
+    def _write(self, frames: list[Any]) -> None:
+        super()._write(frames)
+        assert self._file is not None
+        os.fsync(self._file.fileno())  # also a power cut leaves what is older than a second
 
     def close(self) -> None:
         """Write the track, and remove the journal; where that fails, tell it and keep the journal."""
-        if self._spool is None or self._file is None:
+        super().close()
+        if self._file is None:
             return
-        self._spool.close()
-        with suppress(OSError):
-            self._file.close()
         try:
-            whole_track(self._journal).save(self._path)
-            self._journal.unlink()
+            Trajectory.load(self._path).save(self._track)
+            self._path.unlink()
         except (SphereOrientError, OSError) as error:
-            self._tell(f"{error} What was measured is in {self._journal}.")
+            self._tell(f"{error} What was measured is in {self._path}.")
 
 
 def check_new(path: Path) -> None:

@@ -4,7 +4,6 @@ import base64
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from http.server import ThreadingHTTPServer
 from itertools import islice
 from pathlib import Path
 from threading import Thread
@@ -15,8 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.errors import OutputError, error_words, refusal
-from sphereorient.files.page_server import HOST, PageHandler, new_token
+from sphereorient.errors import OutputError, refusal
+from sphereorient.files.page_server import PageHandler, PageServer, new_token
 from sphereorient.files.picture import eight_bits
 from sphereorient.live.lines import without_nan
 from sphereorient.live.monitor import Monitor, Seen
@@ -25,7 +24,6 @@ from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
 
 PAGE = Path(__file__).with_name("page.html")
 WIDEST = 640  # px, of a picture that is sent
-BARS = 40  # of the histogram
 STEPS = 1000  # of the path
 Json = dict[str, Any]
 
@@ -48,7 +46,7 @@ class LivePage:
         seen, now = monitor.newest, monitor.newest.now
         latency = np.array(monitor.latency_ms.copy())
         told_s = monitor.told_s.copy()
-        counts, edges = np.histogram(latency, BARS, (0.0, max(float(np.quantile(latency, 0.99)) * 1.2, 1.0)))
+        counts, edges = np.histogram(latency, 40, (0.0, max(float(np.quantile(latency, 0.99)) * 1.2, 1.0)))
         middle, slow = np.quantile(latency, (0.5, 0.99))
         steps = monitor.path.copy()
         path = list(islice(steps, 0, None, max(1, len(steps) // STEPS)))
@@ -114,7 +112,7 @@ def _jpeg(picture: NDArray[Any] | None) -> str | None:
     return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
 
 
-def open_page(page: LivePage, port: int) -> ThreadingHTTPServer:
+def open_page(page: LivePage, port: int) -> PageServer:
     """Serve a page on this machine in threads; raise OutputError for a port in use. Port 0: any free one."""
 
     class Handler(PageHandler):
@@ -139,16 +137,6 @@ def open_page(page: LivePage, port: int) -> ThreadingHTTPServer:
                 case _:
                     self.send_error(HTTPStatus.NOT_FOUND)
 
-    try:
-        server = ThreadingHTTPServer((HOST, port), Handler)
-    except OSError as error:
-        do = "choose another --page"
-        raise OutputError(refusal(f"--page {port}", expected="a free port", got=error_words(error), do=do)) from None
-    server.daemon_threads = True
+    server = PageServer(Handler, port, "--page", OutputError)
     Thread(target=server.serve_forever, name="page", daemon=True).start()
     return server
-
-
-def address(page: LivePage, server: ThreadingHTTPServer) -> str:
-    """Return where the page is."""
-    return f"http://{HOST}:{server.server_address[1]}/{page.token}/"

@@ -32,7 +32,6 @@ NEXT_S = 0.0002  # between looks for a new frame
 # No look before this share of the usual interval has passed: each holds up the thread that computes. From one frame to
 # the next that interval changes by these factors at most.
 NO_LOOK, SHRINKS, GROWS = 0.7, 0.5, 1.2
-MOST_SLOTS = 1 << 16
 
 
 class SharedFrames:
@@ -105,7 +104,7 @@ def _read(memory: mmap.mmap, path: Path, file_number: int, layout: FrameBytes) -
 
     slots, size = word(SLOTS), word(SIZE)
     first = WORD * (HEAD + slots)  # of the frames
-    right = memory[:WORD] == MAGIC and 0 < slots <= MOST_SLOTS and len(memory) == first + slots * size
+    right = memory[:WORD] == MAGIC and 0 < slots <= 1 << 16 and len(memory) == first + slots * size
     if not right or size != layout.size:
         got = f"{size} bytes a frame" if right else "another file"
         do = "write the pictures of all cameras, of the size and type of the experiment's movies"

@@ -17,9 +17,9 @@ import numpy as np
 from sphereorient.errors import MovieError, SettingsError, error_words, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream
+from sphereorient.files.picture import luma
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
 from sphereorient.live.shared import shared_frames
-from sphereorient.movies.movie import luma
 
 AGAIN_S = 1.0  # between attempts to open a camera
 WAIT_S = 1.0  # of one call of a GenICam driver; a camera that waits for its trigger is asked again
@@ -62,9 +62,7 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
 def camera_pictures(
     device: int | str, open_device: Callable[..., cv2.VideoCapture] = cv2.VideoCapture
 ) -> Iterator[Picture]:
-    """Yield grey pictures of a camera that OpenCV knows by number or address, until it gives none.
-    Raise MovieError: no such camera.
-    """
+    """Yield grey pictures of OpenCV's camera of a number or address while it gives some; MovieError: no such camera."""
     capture = open_device(device)
     try:
         if not capture.isOpened():
@@ -155,8 +153,7 @@ def device_frames(
 
 
 def _stdin(recording: Recording) -> Iterator[Arrival]:
-    rate_hz = float(1 / np.median(np.diff(recording.timeline.time_s)))
-    return raw_frames(sys.stdin.buffer, recording.streams, rate_hz)
+    return raw_frames(sys.stdin.buffer, recording.streams, 1 / recording.timeline.frame_s)
 
 
 def _genicam(where: str, tell: Tell) -> Source:

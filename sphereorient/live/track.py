@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from sphereorient.live.live import LiveTracker, Measured
 from sphereorient.methods.results import measured_track
 from sphereorient.methods.settings import Settings, settings_yaml
 from sphereorient.pose.lasting import with_lasting_errors
-from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory, journal
+from sphereorient.trajectory import Flag, Reason, Trajectory
 
 MOST_MISSING = 100_000  # frames between two that are written as missing
 REMARK = "measured frame by frame by `sphereorient live`: no smoother ran, so no smooth poses and no velocities"
@@ -82,9 +81,3 @@ class TrackBlocks:
         track = with_lasting_errors(track, learnt.lasting)
         segment, flags = np.array(marks, np.int64).T
         return replace(track, segment=segment, flags=track.flags | flags.astype(np.uint32))
-
-
-def whole_track(path: Path) -> Trajectory:
-    """Return the track of a journal; what is not in it takes no memory."""
-    with path.open("rb") as file:
-        return Trajectory(**journal.read_journal(file, Trajectory, CameraTrack, journal.nothing))

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.errors import Reason
 from sphereorient.experiment.stream import EVERY, CameraStream, uniform
-from sphereorient.movies import OnDemand
-from sphereorient.trajectory import Reason
+from sphereorient.files.picture import OnDemand
 
 Picture = NDArray[Any]
 # A pixel's noise is a quantile of its deviations over that of a unit normal. Measured mean: glitter is in more frames

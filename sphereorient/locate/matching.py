@@ -10,10 +10,10 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.stats import chi2
 
 from sphereorient.cameras import Camera, nearest_point
+from sphereorient.errors import Reason
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.position import Positions, find_positions
 from sphereorient.locate.sightings import sightings_of
-from sphereorient.trajectory import Reason
 
 Numbers = NDArray[np.int64]
 Floats = NDArray[np.float64]

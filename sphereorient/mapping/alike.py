@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import PaintError
+from sphereorient.experiment.recording import Progress
 from sphereorient.mapping.compare import MapComparison, compare_maps, fit_levels, turned_map
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.mapping.learn import LearntMap
@@ -22,12 +23,13 @@ class SharedMap:
     correlation: float  # with the map of `first`; 1 for itself
 
 
-def shared_maps(learnt: Mapping[str, LearntMap]) -> dict[str, SharedMap]:
+def shared_maps(learnt: Mapping[str, LearntMap], progress: Progress) -> dict[str, SharedMap]:
     """Return the maps of balls, by name; those that show one paint are joined into one, in the frame of the first."""
     found: dict[str, SharedMap] = {}
     for name, one in learnt.items():
         found[name] = SharedMap(learnt=one, first=name, correlation=1.0)
         for first in [other for other in found if found[other].first == other != name]:
+            progress("balls of one paint", len(found), len(learnt))
             try:
                 compared = compare_maps(one.texture, learnt[first].texture)
             except PaintError:

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from sphereorient import locate
 from sphereorient.cameras import R_cam_view
-from sphereorient.errors import PaintError, refusal
+from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
 from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of
@@ -28,7 +28,6 @@ from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels, stacked
 from sphereorient.search.normalisation import Blur, crop_disk, rim_share
 from sphereorient.sphere.view import perspective_view
-from sphereorient.trajectory import Reason
 
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk

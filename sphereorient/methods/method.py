@@ -15,7 +15,7 @@ import torch
 
 from sphereorient.errors import TrackError, error_words, refusal
 from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.files.hdf5 import digest, whole_hdf5
+from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses
@@ -29,13 +29,20 @@ from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
-from sphereorient.trajectory.trajectory import SPHERES
 
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
-OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
-WHETHER = ("together", "second_ball", "sharper")
+SCORES, WHETHER = ("score_min", "right_score", "usual_apart_rad"), ("together", "second_ball", "sharper")
+OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn")  # fields that `Learnt` shares with it
+BLURS = ("blur_px", "limb_blur_px", "still_blur_px", "still_limb_blur_px")
+# Fields that are attributes of the file, and their types; tensors are datasets.
+KINDS: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys((*SCORES, *BLURS, "most_hidden", "widest_px", "acceleration_rad_s2"), float),
+    **dict.fromkeys(WHETHER, bool),
+    "instants": int,
+    "majority": lambda cameras: tuple(map(int, cameras)),
+}
+TENSORS = ("limb_px", "worn")
 LASTING = ("covariance", "own_rad2", "alone")
-NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,19 +51,19 @@ class Learnt:
 
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
     light: Light
-    limb_px: torch.Tensor | None  # (C,), see `SphereModel`; None: of an older version
     lasting: Lasting
     blur_px: float  # of the paint
     limb_blur_px: float
     still_blur_px: float  # of frames whose motion is not known
     still_limb_blur_px: float
-    instants: int  # of the exposure that fits render
-    most_hidden: float  # share of a disk that occluders may cover
     widest_px: float
     score_min: float
     right_score: float
     usual_apart_rad: float
-    together: bool
+    limb_px: torch.Tensor | None = None  # (C,), see `SphereModel`; None: of an older version
+    instants: int = 1  # of the exposure that fits render
+    most_hidden: float = 0.0  # share of a disk that occluders may cover
+    together: bool = False
     majority: tuple[int, ...] = ()  # see `Appearance`
     second_ball: bool = False
     sharper: bool = False
@@ -83,8 +90,7 @@ class Learnt:
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
-            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER, "majority")},
-            worn=study.worn,
+            **{name: getattr(study, name) for name in OF_APPEARANCE},
             process=process,
             acceleration_rad_s2=acceleration_rad_s2 if told else None,
         )
@@ -114,33 +120,17 @@ class Learnt:
         if self.instants > 1:
             optics = Optics(paint, self.blur_px, widest, self.limb_blur_px)
             fitter = replace(still, optics=optics, instants=self.instants)
-        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "majority", "worn")}
+        told = {name: getattr(self, name) for name in OF_APPEARANCE}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
-
-    def save(self, path: Path) -> None:
-        """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
-        save_learnt({"": self}, path)
-
-    @classmethod
-    def load(cls, path: Path) -> "Learnt":
-        """Read what `save` wrote; raise TrackError if it is missing, damaged, of several balls or another schema."""
-        found = load_learnt(path)
-        if list(found) != [""]:
-            do, got = "pass what was learnt of one ball", f"that of {', '.join(found)}"
-            raise TrackError(refusal(str(path), expected="what was learnt of one ball", got=got, do=do))
-        return found[""]
 
 
 def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:
     """Write what was learnt of each ball, by name, as HDF5, atomically; OutputError if the file cannot be written."""
     with whole_hdf5(path) as file:
-        if list(learnt) == [""]:
-            _write(learnt[""], file)
-        else:
-            file.attrs["schema"] = SCHEMA_OF_SEVERAL
-            _write_scenes(next(iter(learnt.values())), file)
-            for name, one in learnt.items():
-                _write(one, file.create_group(f"{SPHERES}/{name}"), scenes=False)
+        _write_scenes(next(iter(learnt.values())), file)
+        for name, one in learnt.items():
+            _write(one, ball_group(file, name))
+        file.attrs["schema"] = SCHEMA_OF_SEVERAL if SPHERES in file else SCHEMA
         file.attrs["sha256"] = digest(file)
 
 
@@ -157,9 +147,7 @@ def load_learnt(path: Path) -> dict[str, Learnt]:
             if file.attrs.get("sha256") not in (None, digest(file)):  # None: of an older version
                 raise ValueError("a checksum that does not fit")
             scenes = _read_scenes(file)
-            if schema == SCHEMA:
-                return {"": _read(file, scenes)}
-            return {str(name): _read(group, _scenes_of(group, scenes)) for name, group in file[SPHERES].items()}
+            return {name: _read(group, scenes) for name, group in ball_groups(file).items()}
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         expected, got = "a whole file of what was learnt", error_words(error)
         raise TrackError(refusal(str(path), expected=expected, got=got, do=do)) from error
@@ -192,7 +180,6 @@ class Method:
     # Instead of learn, with what is known of each ball; None: it learns nothing.
     resume: Callable[[Job, Mapping[str, Learnt]], Follower] | None
     join: Callable[[Job, Follower | None, Iterable[Measured], Progress], dict[str, Joined]]
-    several: bool = True  # whether it tracks several balls
 
 
 @contextmanager
@@ -217,35 +204,21 @@ def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
 
 
-def _write(learnt: Learnt, file: h5py.Group, *, scenes: bool = True) -> None:
+def _write(learnt: Learnt, file: h5py.Group) -> None:
     file.attrs["schema"] = SCHEMA
-    for name in NUMBERS:
-        file.attrs[name] = getattr(learnt, name)
-    file.attrs["most_hidden"] = learnt.most_hidden
-    for name in WHETHER:
-        file.attrs[name] = getattr(learnt, name)
-    file.attrs["limb_blur_px"] = learnt.limb_blur_px
-    if learnt.instants > 1:
-        file.attrs["instants"] = learnt.instants
-        file.attrs["still_blur_px"], file.attrs["still_limb_blur_px"] = learnt.still_blur_px, learnt.still_limb_blur_px
-    if learnt.acceleration_rad_s2 is not None:
-        file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
-    if learnt.majority:
-        file.attrs["majority"] = learnt.majority
-    if scenes:
-        _write_scenes(learnt, file)
-    else:
-        file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
+    for name in KINDS:
+        if (value := getattr(learnt, name)) not in (None, ()):
+            file.attrs[name] = value
+    file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
     for part, values in learnt.light.parts().items():
         light.create_dataset(part, data=values.numpy(), track_times=False)
-    if learnt.limb_px is not None:
-        file.create_dataset("limb_px", data=learnt.limb_px.numpy(), track_times=False)
-    for part in LASTING:
-        file.create_dataset(f"lasting/{part}", data=getattr(learnt.lasting, part).numpy(), track_times=False)
-    if learnt.worn is not None:
-        file.create_dataset("worn", data=learnt.worn.numpy(), track_times=False)
+    tensors = {name: getattr(learnt, name) for name in TENSORS}
+    tensors |= {f"lasting/{part}": getattr(learnt.lasting, part) for part in LASTING}
+    for name, tensor in tensors.items():
+        if tensor is not None:
+            file.create_dataset(name, data=tensor.numpy(), track_times=False)
     if learnt.process is not None:
         group = file.create_group("process")
         group.attrs["frame_s"] = learnt.process.frame_s
@@ -270,40 +243,26 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
     return scenes
 
 
-def _scenes_of(group: h5py.Group, scenes: Mapping[str, CameraScene]) -> dict[str, CameraScene]:
-    """Return the scenes with the diameters of one ball of several."""
-    sizes = zip(scenes.items(), group.attrs["diameter_px"], strict=True)
-    return {name: replace(scene, diameter_px=float(px)) for (name, scene), px in sizes}
-
-
 def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
+    """Read what was learnt of one ball; of several, each has its own diameters in the cameras' scenes."""
+    sizes = file.attrs.get("diameter_px", [scene.diameter_px for scene in scenes.values()])
+    scenes = {
+        name: replace(scene, diameter_px=float(px)) for (name, scene), px in zip(scenes.items(), sizes, strict=True)
+    }
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting.none(len(scenes))
     if "lasting" in file:
         kept = {part: torch.from_numpy(values[()]) for part, values in file["lasting"].items()}
         lasting = Lasting.of_older(**kept) if "alone" not in kept else Lasting(**kept)
-    acceleration = file.attrs.get("acceleration_rad_s2")
-    told: dict[str, Any] = {name: bool(file.attrs.get(name, False)) for name in WHETHER}
-    told |= {name: float(file.attrs[name]) for name in NUMBERS}
-    still_blur_px = float(file.attrs.get("still_blur_px", file.attrs["blur_px"]))
-    limb_blur_px = float(file.attrs.get("limb_blur_px", file.attrs["blur_px"]))  # an older version knew one blur
-    of_limb = limb_blur_px if still_blur_px == told["blur_px"] else still_blur_px
+    told = {name: kind(file.attrs[name]) for name, kind in KINDS.items() if name in file.attrs}
+    told = {"still_blur_px": told["blur_px"], "limb_blur_px": told["blur_px"]} | told  # an older version knew one blur
+    of_limb = "limb_blur_px" if told["still_blur_px"] == told["blur_px"] else "still_blur_px"
+    told.setdefault("still_limb_blur_px", told[of_limb])
+    told |= {name: torch.from_numpy(file[name][()]) for name in TENSORS if name in file}
+    process = _process(file["process"]) if "process" in file else None
     return Learnt(
-        scenes=scenes,
-        limb_blur_px=limb_blur_px,
-        still_blur_px=still_blur_px,
-        still_limb_blur_px=float(file.attrs.get("still_limb_blur_px", of_limb)),
-        instants=int(file.attrs.get("instants", 1)),
-        most_hidden=float(file.attrs.get("most_hidden", 0.0)),  # an older version sought none
-        light=light_of(parts, bool(light.attrs["known"])),
-        limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
-        lasting=lasting,
-        worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,
-        majority=tuple(int(k) for k in file.attrs.get("majority", ())),
-        process=_process(file["process"]) if "process" in file else None,
-        acceleration_rad_s2=None if acceleration is None else float(acceleration),
-        **told,
+        scenes=scenes, light=light_of(parts, bool(light.attrs["known"])), lasting=lasting, process=process, **told
     )
 
 

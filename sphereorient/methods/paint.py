@@ -101,21 +101,15 @@ def open_paints(job: Job, progress: Progress) -> list[Paint]:
         for names, base, (search, bank) in zip(kinds, tables, searches, strict=True):
             bank.result()
             views = [of_camera[names[0]] for of_camera in each]
-            first = Initialiser(
-                fitter=first_fitter(views, recording.of(names[0]).experiment.radius_mm, base.result(), blur_px),
-                proposers=search.by_camera(views, blur_px),
-                locating=settings.locate,
-                candidates=settings.refine.candidates,
-            )
+            fitter = first_fitter(views, recording.of(names[0]).experiment.radius_mm, base.result(), blur_px)
+            first = search.start(fitter, blur_px)
             paints.append(Paint(names=names, base=base.result(), search=search, first=first))
     return paints
 
 
 def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Paint]) -> Iterator[Study]:
     """Yield the frames from which the appearance of each paint is estimated.
-
-    Raises:
-        ExperimentError: no frame shows a ball that the others mostly leave to all cameras that see it.
+    Raises ExperimentError: no frame shows a ball that the others mostly leave to all cameras that see it.
     """
     first = {name: paint.first for paint in paints for name in paint.names}
     if len(first) == 1:
@@ -158,7 +152,7 @@ def _alone(recording: Recording, refine: RefineSettings, paint: Paint) -> Study:
         # Only blurred pictures need blurred templates; sharp ones share one first guess.
         if defocus_radii(blur_px, paint.search.diameter_px):
             fitter = first_fitter(views, first.fitter.radius_mm, paint.base, blur_px)
-            first = replace(first, fitter=fitter, proposers=paint.search.by_camera(views, blur_px))
+            first = paint.search.start(fitter, blur_px, score_min=UNPROVEN, known=first.known)
     return Study(first=first, frames=frames, places=places)
 
 

@@ -13,6 +13,7 @@ from sphereorient import assemble, locate, motion
 from sphereorient.calibration.comparison import Seen
 from sphereorient.calibration.contradictions import majority
 from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.errors import Reason
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.follow.follower import Follower
@@ -22,7 +23,6 @@ from sphereorient.methods.method import Job, Joined, Measured, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
 from sphereorient.search import Candidates, Proposer, crop_disk
-from sphereorient.trajectory import Reason
 
 CHUNK = 64  # frames held at once; a result does not depend on it
 
@@ -62,7 +62,7 @@ def track(job: Job, follower: Follower | None, measured: Iterable[Measured], pro
     )
     tracks = {name: results.paper_camera(sightings[name], candidates[name], paths[name]) for name in cameras}
     whole = results.paper_track(grid.experiment, clock, positions, fused, moved, tracks)
-    return {"": (whole if len(whole) == len(place) else whole.at(place), None)}
+    return {grid.experiment.sphere.name: (whole if len(whole) == len(place) else whole.at(place), None)}
 
 
 def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> Sightings:
@@ -88,9 +88,7 @@ def propose_orientations(
     settings: Settings,
     progress: Progress,
 ) -> Candidates:
-    """Propose orientations, lab frame, for every frame in which one camera has the sphere.
-    `proposer_of` makes the proposer for disks of a size, px.
-    """
+    """Propose orientations, lab, where a camera has the sphere; `proposer_of`: the proposer for disks of a size, px."""
     stage = f"{stream.name}: orient"
     total = len(stream)
     progress(stage, 0, total)
@@ -124,4 +122,4 @@ def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Cand
     return replace(proposals, R_lab_view=camera.R_cam_lab.mT @ R_cam_view(direction_cam))
 
 
-PAPER = Method(learn=learn, resume=None, join=track, several=False)
+PAPER = Method(learn=learn, resume=None, join=track)

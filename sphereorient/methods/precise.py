@@ -17,13 +17,12 @@ from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
-from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import PoseTable, exchanged, pose_tables
 from sphereorient.follow.tracker import Tracker
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
 from sphereorient.methods.paint import alike, following, open_paints, studies_of
-from sphereorient.methods.proposers import BlurMatchedSearch, sizes_of
+from sphereorient.methods.proposers import BlurMatchedSearch
 from sphereorient.trajectory import Flag, Trajectory
 
 Floats = NDArray[np.float64]
@@ -58,7 +57,7 @@ def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:
     appearances = {name: learnt[name].appearance(job.recording.of(name)) for name in names}
     searches: dict[str, BlurMatchedSearch] = {}
     for same in alike(job.recording):
-        sizes = sizes_of(appearances[same[0]].fitter.views)
+        sizes = [(view.camera, view.diameter_px) for view in appearances[same[0]].fitter.views]
         searches |= dict.fromkeys(same, BlurMatchedSearch(job.recording.of(same[0]).texture, job.settings, sizes))
     return follower(job, appearances, searches)
 
@@ -67,13 +66,7 @@ def follower(job: Job, appearances: Mapping[str, Appearance], searches: Mapping[
     """Choose how to follow frames: all balls in all cameras together, or one by one the cameras that disagree."""
     balls: dict[str, BallTracker] = {}
     for name, one in appearances.items():
-        begin = Initialiser(
-            fitter=one.still,
-            proposers=searches[name].by_camera(one.fitter.views, one.fitter.optics.blur_px),
-            locating=job.settings.locate,
-            candidates=job.settings.refine.candidates,
-            score_min=one.clear_score,
-        )
+        begin = searches[name].start(one.still, one.fitter.optics.blur_px, score_min=one.clear_score)
         if not one.together:
             apart = PerCameraTracker(name, one.on(job.device), begin, job.settings.refine)
             return Follower(recording=job.recording, appearances=appearances, tracker=apart)

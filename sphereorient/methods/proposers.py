@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 from sphereorient.files.cache import cached
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.methods.settings import Settings
-from sphereorient.pose import CameraView, base_table
+from sphereorient.pose import Fitter, base_table
 from sphereorient.pose.camera_view import defocus_radii
 from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateBank
 from sphereorient.search.settings import GreySearchSettings, ProposeSettings
@@ -26,15 +27,11 @@ Search = TypeVar("Search", GreySearch, TemplateBank)
 
 def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> Proposer:
     """Return the proposer of the precise method for a map (H, 2 H), 0 black .. 1 white, and a blur, radii (0: sharp).
-
     Raise CheckpointError if the checkpoint cannot be used with this map.
     """
-    return _proposer(texture, settings.propose, lambda: _grey_search(texture, settings, blur))
-
-
-def _grey_search(texture: Tensor, settings: Settings, blur: float) -> GreySearch:
     make = partial(GreySearch, texture, settings.search, blur)
-    return _with_bank("bank", (texture, settings.search.model_dump_json(), blur), make)
+    inputs = texture, settings.search.model_dump_json(), blur
+    return _proposer(texture, settings.propose, lambda: _with_bank("bank", inputs, make))
 
 
 def _with_bank(kind: str, inputs: Iterable[Tensor | str | float], make: Callable[..., Search]) -> Search:
@@ -73,14 +70,15 @@ class BlurMatchedSearch:
             self._made[blur] = precise_proposer(self._texture, self._settings, blur)
         return self._made[blur]
 
-    def by_camera(self, views: Sequence[CameraView], blur_px: float) -> dict[str, Proposer]:
-        """Return the proposer of each camera, by name, for pictures of a blur, px."""
-        return dict.fromkeys((view.name for view in views), self.of(blur_px))
-
-
-def sizes_of(views: Sequence[CameraView]) -> list[tuple[Camera, float]]:
-    """Return the cameras of views, each with the expected diameter of the sphere, px."""
-    return [(view.camera, view.diameter_px) for view in views]
+    def start(self, fitter: Fitter, blur_px: float, **more: Any) -> Initialiser:
+        """Return who finds poses without history in pictures of a blur, px; `more`: its other fields."""
+        return Initialiser(
+            fitter=fitter,
+            proposers=dict.fromkeys((view.name for view in fitter.views), self.of(blur_px)),
+            locating=self._settings.locate,
+            candidates=self._settings.refine.candidates,
+            **more,
+        )
 
 
 def as_near(settings: GreySearchSettings, diameters_px: Sequence[tuple[Camera, float]]) -> GreySearchSettings:
@@ -94,9 +92,7 @@ def as_near(settings: GreySearchSettings, diameters_px: Sequence[tuple[Camera, f
 
 
 def _distance_radii(camera: Camera, diameter_px: float) -> float | None:
-    """Return how far a camera is from a ball of this diameter in the middle of its picture, radii; None where that is
-    so far that perspective is nothing.
-    """
+    """Return the distance, radii, of a ball of this diameter in the middle of a picture; None without perspective."""
     middle = (torch.tensor(camera.image_size, dtype=torch.float64) - 1) / 2
     aside = torch.tensor([diameter_px / 2, 0.0], dtype=torch.float64)
     rim = camera.rays(torch.stack([middle - aside, middle + aside])).direction_lab
@@ -108,18 +104,15 @@ def _distance_radii(camera: Camera, diameter_px: float) -> float | None:
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
     """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
     make = partial(TemplateBank, texture, size_px, settings.orient)
-
-    def templates() -> Proposer:
-        return _with_bank("templates", (texture, size_px, settings.orient.model_dump_json()), make)
-
-    return _proposer(texture, settings.propose, templates)
+    inputs = texture, size_px, settings.orient.model_dump_json()
+    return _proposer(texture, settings.propose, lambda: _with_bank("templates", inputs, make))
 
 
 def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:
     network = trained_network(texture, settings)
-    if network is not None and settings.when == "always":
-        return network
-    return templates() if network is None else FallbackProposer(templates(), network, settings.sure)
+    if network is None:
+        return templates()
+    return network if settings.when == "always" else FallbackProposer(templates(), network, settings.sure)
 
 
 def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | None:

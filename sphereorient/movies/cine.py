@@ -8,7 +8,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, luma, mapped, refused
+from sphereorient.files.picture import luma
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, refused
 
 FILE_HEADER = struct.Struct("<2s3HiIiI3IQ")
 BITMAP_HEADER = struct.Struct("<IiiHHIIiiII")

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import av
 import numpy as np
 
-from sphereorient.movies.movie import Grey, OnDemand
+from sphereorient.files.picture import OnDemand
+from sphereorient.movies.movie import Grey
 
 TRAILER = 8  # bytes after each slice: 3 its size, 1 a status, 4 the check sum
 # FFV1 computes its CRC from the most significant bit on, zlib from the least: they agree on bit-reversed bytes.

@@ -1,5 +1,4 @@
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.files.picture import OnDemand
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FRAMES_A_MAP = 64
@@ -16,28 +16,8 @@ OTHERS = "ask for frames that the movie has"
 MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
 LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value; no real picture exceeds it
-# Thousandths that add up to 1000: R = G = B keeps its value.
-RED, GREEN, BLUE = 299, 587, 114
 COLOUR_REMARK = "colour, made grey (0.299 R + 0.587 G + 0.114 B)"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
-
-
-class OnDemand(ABC):
-    """Picture of which the parts that are asked for are decoded; made by `Movie.on_demand`."""
-
-    shape: tuple[int, int]  # (H, W)
-
-    @abstractmethod
-    def equals(self, other: object) -> bool:
-        """Return whether another picture on demand is the same."""
-
-    @abstractmethod
-    def ask(self, left: int, top: int, right: int, bottom: int) -> None:
-        """Begin to decode a part, right and bottom included, of this picture, and of the next one."""
-
-    @abstractmethod
-    def part(self, left: int, top: int, right: int, bottom: int) -> Grey:
-        """Return the picture (H, W), decoded at least where asked for, right and bottom included."""
 
 
 class Movie:
@@ -160,12 +140,6 @@ def mapped(
         if place % FRAMES_A_MAP == 0:
             values = np.memmap(path, dtype, "r", offset, shape)
         yield number, values
-
-
-def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:
-    """Return the grey values of a colour picture (...), uint8 or uint16, by ITU-R BT.601; exact where R = G = B."""
-    total = RED * red.astype(np.uint32) + GREEN * green.astype(np.uint32) + BLUE * blue.astype(np.uint32)
-    return ((total + 500) // 1000).astype(red.dtype)
 
 
 def refused(name: object, expected: str, got: str, do: str) -> MovieError:

@@ -10,17 +10,8 @@ import cv2
 import numpy as np
 
 from sphereorient.errors import MovieError
-from sphereorient.files.picture import claimed_pixels, decoded
-from sphereorient.movies.movie import (
-    COLOUR_REMARK,
-    LARGEST_RATIO,
-    MOST_MISSING,
-    MOST_PIXELS,
-    Grey,
-    Movie,
-    luma,
-    refused,
-)
+from sphereorient.files.picture import claimed_pixels, decoded, luma
+from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, MOST_MISSING, MOST_PIXELS, Grey, Movie, refused
 from sphereorient.movies.tiff import TiffMovie
 
 TIFF = (".tif", ".tiff")

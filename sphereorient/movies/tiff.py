@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tifffile import TiffFile, TiffFileError
 
 from sphereorient.errors import error_words
-from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, luma, mapped, refused
+from sphereorient.files.picture import luma
+from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, mapped, refused
 
 # What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (

@@ -13,8 +13,9 @@ import av
 import numpy as np
 
 from sphereorient.errors import MovieError, error_words
+from sphereorient.files.picture import OnDemand, luma
 from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, OnDemand, luma, refused
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
 Found = TypeVar("Found")

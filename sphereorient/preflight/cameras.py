@@ -67,7 +67,7 @@ def track_stretch(
         request = Request(
             experiment=replace(experiment, frames=(first, first + len(stretch[0].frame))),
             settings=settings,
-            learnt=replace(learnt, together=False, majority=()),
+            learnt=dict.fromkeys(experiment.names, replace(learnt, together=False, majority=())),
         )
         track = one_track(run(request, MemoryStore()))
     except SphereOrientError as error:

@@ -7,7 +7,6 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
-from http.server import ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
 from typing import Any, ClassVar
@@ -16,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.files.page_server import HOST, PageHandler, new_token
+from sphereorient.errors import SettingsError, SphereOrientError, refusal
+from sphereorient.files.page_server import PageHandler, PageServer, new_token
 from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text, writing
 from sphereorient.files.yaml_file import FAULTS, parse_yaml, with_value, yaml_words
 
@@ -74,8 +73,8 @@ def png(picture: NDArray[np.uint8]) -> bytes:
     return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
-def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
-    """Return a server of the page on this machine; call `serve_forever`. Port 0: any free one."""
+def serve(marking: Marking, port: int = 0) -> PageServer:
+    """Return a server of the page; call `serve_forever`. Raise SettingsError for a port in use."""
 
     class Handler(PageHandler):
         token = marking.token
@@ -114,4 +113,4 @@ def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
         def _file(self, name: str, kind: str) -> None:
             self._send(Path(__file__).with_name(name).read_bytes(), kind)
 
-    return ThreadingHTTPServer((HOST, port), Handler)
+    return PageServer(Handler, port, "--port", SettingsError)

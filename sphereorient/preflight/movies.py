@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.experiment import Experiment, outside_paths
+from sphereorient.errors import Reason
+from sphereorient.experiment.experiment import Experiment, outside_paths
 from sphereorient.experiment.timeline import NONE, Timeline
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
-from sphereorient.trajectory import Reason
 
 MANY = 0.5  # share of bad frames above which a movie is a fault
 BALL_SEEN = 0.8  # share of the frames in which the ball should be found

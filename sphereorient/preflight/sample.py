@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
-from sphereorient.errors import MovieError, refusal
+from sphereorient.errors import MovieError, Reason, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.experiment.stream import CameraStream, given_scene, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
@@ -26,7 +26,6 @@ from sphereorient.locate import (
 )
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.outline import Outline
-from sphereorient.trajectory import Reason
 
 SPREAD = 25  # frames all over the movie: enough for a background
 EVERY = 3  # of these, each third one is read with the next frame, for motion and repeated frames

@@ -27,6 +27,7 @@ from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import contrast, crop, lit_picture
 from sphereorient.report.overlay_page import crop_side
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note, spread
+from sphereorient.sphere.texture import seen_path
 from sphereorient.trajectory import Trajectory
 
 EXTENT = -180, 180, -90, 90  # of the axes of a map, degrees
@@ -54,9 +55,9 @@ def write_texture(texture: Tensor, path: Path) -> None:
     write_picture(path, grey.round().clamp(0, 255).byte().numpy())
 
 
-def write_seen(seen: Tensor, path: Path) -> None:
-    """Write counts (H, 2 H) as 8-bit picture, limited to 255; may raise OutputError."""
-    write_picture(path, seen.clamp(0, MOST).byte().numpy())
+def write_seen(seen: Tensor, texture: Path) -> None:
+    """Write counts (H, 2 H) beside a texture map as 8-bit picture, limited to 255; may raise OutputError."""
+    write_picture(seen_path(texture), seen.clamp(0, MOST).byte().numpy())
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:

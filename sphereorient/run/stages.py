@@ -18,16 +18,14 @@ from sphereorient.files.provenance import provenance, sha256
 from sphereorient.files.whole_file import check_folder, check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
+from sphereorient.methods.kinds import METHODS
 from sphereorient.methods.method import Job, Learnt, Method, load_learnt, one_thread, save_learnt
-from sphereorient.methods.paper import PAPER
-from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
 from sphereorient.pose.lasting import Lasting, with_lasting_errors
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Tracks, Trajectory
 
-METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}
 TASK_BATCHES = 16  # at most in one task of a worker; a worker that dies loses less than one batch
 TASKS_A_WORKER = 2  # of a short movie: so that no worker waits long for the last one
 
@@ -55,7 +53,7 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
                 tasks = todo.send([work.do(task) for task in tasks])
             except StopIteration as end:
                 tracks: Tracks = end.value
-                return tracks[""] if list(tracks) == [""] else tracks
+                return tracks.get("", tracks)
 
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
@@ -143,11 +141,7 @@ class Work:
 def opened(request: Request, store: Store, progress: Progress = silent) -> Iterator[Work]:
     """Open the inputs of a request; raise SphereOrientError if they are missing, unreadable or inconsistent."""
     method = check_method(request)
-    given = request.learnt
-    if isinstance(given, Path):
-        given = load_learnt(given)
-    elif isinstance(given, Learnt):
-        given = {"": given}
+    given = load_learnt(request.learnt) if isinstance(request.learnt, Path) else request.learnt
     device = torch_device(request.device)
     with open_recording(request.experiment, request.cameras) as recording, one_thread():
         job = Job(recording=recording, settings=request.settings, device=device, given=given)
@@ -174,8 +168,7 @@ def track_movies(
         device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
         progress: called with stage, frames done and frames in all.
 
-    Raises:
-        SphereOrientError: missing, unreadable or inconsistent inputs.
+    Raises SphereOrientError: missing, unreadable or inconsistent inputs.
     """
     try:
         source = experiment if isinstance(experiment, Experiment) else Path(experiment)
@@ -215,8 +208,9 @@ def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | N
     return replace(track, method=request.method, settings=settings_yaml(settings), provenance=origin)
 
 
-def with_proposer(settings: Settings, proposer: str | Path | None) -> Settings:
-    """Return settings with a checkpoint as proposer; unchanged for None."""
+def with_proposer(settings: Settings | None, proposer: str | Path | None) -> Settings:
+    """Return settings (None: the defaults) with a checkpoint as proposer; unchanged for None."""
+    settings = settings or Settings()
     if proposer is None:
         return settings
     return settings.model_copy(update={"propose": settings.propose.model_copy(update={"checkpoint": str(proposer)})})

@@ -15,9 +15,9 @@ import torch
 from filelock import FileLock, Timeout
 
 from sphereorient import __version__
-from sphereorient.errors import OutputError, TrackError, error_words, refusal
+from sphereorient.errors import OutputError, Reason, TrackError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files, load_experiment
-from sphereorient.files.hdf5 import DAMAGE, digest, whole_hdf5
+from sphereorient.files.hdf5 import DAMAGE, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.files.whole_file import is_forced, write_text, writing
 from sphereorient.follow.follower import Batch
 from sphereorient.follow.poses import Poses
@@ -25,8 +25,6 @@ from sphereorient.methods.method import Learnt, load_learnt, save_learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 from sphereorient.pose.poses import POSE_PARTS
-from sphereorient.trajectory import Reason
-from sphereorient.trajectory.trajectory import SPHERES
 
 SCHEMA = "sphereorient-poses/1"
 LOCK, PROCESS = "lock", "process"  # files in the folder of a run
@@ -44,7 +42,7 @@ class Request:
     settings: Settings = field(default_factory=Settings)
     cameras: tuple[str, ...] | None = None
     device: str = "cpu"
-    learnt: Path | Learnt | Mapping[str, Learnt] | None = None  # what another run learnt, to measure with
+    learnt: Path | Mapping[str, Learnt] | None = None  # what another run learnt, to measure with
     save_learnt: Path | None = None
     command: str = "sphereorient.run"
     force: bool = field(default_factory=is_forced)  # whether files without this program's mark may be replaced
@@ -65,16 +63,14 @@ class Request:
 @contextmanager
 def writing_of(request: Request) -> Iterator[None]:
     """Within this context no input of the request is replaced."""
-    given = request.experiment
-    experiment = given if isinstance(given, Experiment) else load_experiment(given)
+    experiment = load_experiment(request.experiment)
     with writing([experiment.path, *(path for path, _ in _files(request, experiment))], force=request.force):
         yield
 
 
 def fingerprint(request: Request) -> dict[str, str]:
     """Return the identity of a run: inputs by size and time, text of experiment.yaml, settings, version."""
-    given = request.experiment
-    experiment = given if isinstance(given, Experiment) else load_experiment(given)
+    experiment = load_experiment(request.experiment)
     found = {
         "version": __version__,
         "method": request.method,
@@ -244,7 +240,7 @@ class FolderStore:
         with writing(force=True), whole_hdf5(self.poses(batch), do) as file:
             file.attrs["schema"] = SCHEMA
             for ball, of_ball in poses.items():
-                _write_poses(of_ball, file.create_group(f"{SPHERES}/{ball}") if ball else file)
+                _write_poses(of_ball, ball_group(file, ball))
             file.attrs["sha256"] = digest(file)
 
     def read(self, batch: Batch) -> dict[str, list[Poses]]:
@@ -287,8 +283,7 @@ def read_poses(path: Path) -> dict[str, list[Poses]] | None:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file):
                 return None
-            groups = {str(name): group for name, group in file[SPHERES].items()} if SPHERES in file else {"": file}
-            return {name: _read_poses(group) for name, group in groups.items()}
+            return {name: _read_poses(group) for name, group in ball_groups(file).items()}
     except MemoryError:
         raise
     except DAMAGE:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sphereorient.errors import ShapeError, check_finite, check_tail, refusal, tensor_of
-from sphereorient.trajectory import Reason
+from sphereorient.errors import Reason, ShapeError, check_finite, check_tail, refusal, tensor_of
 
 SAME_DEG = 12.0  # proposals of two proposers nearer than this are one
 

@@ -9,13 +9,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.extraction import extract_paint
 from sphereorient.search.settings import OrientSettings
 from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import STEPS
 from sphereorient.sphere.view import disk_offsets
-from sphereorient.trajectory import Reason
 
 # Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
 BATCH = 32

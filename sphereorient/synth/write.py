@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.files.hdf5 import ball_group, whole_hdf5
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
@@ -229,8 +229,9 @@ def write_truth(path: Path, truths: Mapping[str, Motion6D], cameras: Mapping[str
     """Write truth.h5 (docs/data-format.md) of balls by name; the name of an only one is empty."""
     with whole_hdf5(path) as file:
         for name, truth in truths.items():
+            group = ball_group(file, name)
             for key, value in _true_values(truth, cameras).items():
-                file.create_dataset(f"spheres/{name}/{key}" if name else key, data=value.numpy())
+                group.create_dataset(key, data=value.numpy())
 
 
 def _true_values(truth: Motion6D, cameras: Mapping[str, Camera]) -> dict[str, Tensor]:

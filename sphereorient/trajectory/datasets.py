@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sphereorient.errors import ShapeError, TrackError, refusal
 
 KEY = "column"
-LONGEST_NAME = 100  # characters
 LARGEST_RATIO = 1200  # compression ratio; a dataset that claims more is not in the file
 
 
@@ -122,7 +121,7 @@ def inside(group: h5py.Group, place: str) -> Any:
 def named_group(parent: h5py.Group, name: str) -> h5py.Group:
     """Return a group in another one; TrackError for a link, a dataset, or a name that no message could show."""
     group = inside(parent, name)
-    if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > LONGEST_NAME:
+    if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > 100:
         label, do = f"{parent.file.filename}: {parent.name.strip('/')}", "write the track again"
         raise TrackError(refusal(label, expected="groups with names", got=repr(name)[:60], do=do))
     return group

@@ -6,7 +6,7 @@ lies behind the last whole row is ignored.
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,7 +18,6 @@ from sphereorient.trajectory.reasons import reasons_of
 
 SCHEMA = "sphereorient-journal/1"
 MARK = f'{{"schema": "{SCHEMA}"'.encode()
-LONGEST_HEAD = 10_000_000  # bytes
 # What is known of a frame without those that come later.
 OF_FRAME = (
     *("time", "valid", "position", "position_cov", "orientation", "orientation_cov", "segment", "flags"),
@@ -26,7 +25,6 @@ OF_FRAME = (
 )
 OF_CAMERA = ("centre_px", "centre_sigma_px", "radius_px", "orientation", "orientation_cov", "score")
 ABOUT = ("method", "settings", "experiment", "length_unit", "provenance")
-Blank = Callable[[type[Any], int], dict[str, NDArray[Any]]]
 
 
 def journal_path(track: Path) -> Path:
@@ -70,11 +68,11 @@ def is_journal(path: Path) -> bool:
         return file.read(len(MARK)) == MARK
 
 
-def read_journal(file: BinaryIO, track: type[Any], camera: type[Any], blank: Blank = blank_datasets) -> dict[str, Any]:
-    """Return the fields of the track of a journal, as far as it was written; `blank` gives what is not in it.
+def read_journal(file: BinaryIO, track: type[Any], camera: type[Any]) -> dict[str, Any]:
+    """Return the fields of the track of a journal, as far as it was written; what is not in it is read-only.
     Raises LookupError, TypeError, ValueError: its first line is damaged; OSError: it cannot be read.
     """
-    about = json.loads(file.readline(LONGEST_HEAD))
+    about = json.loads(file.readline(10_000_000))
     kind = row_type(track, camera, about["cameras"])
     fields: dict[str, Any] = {name: about[name] for name in ABOUT}
     fields["frame_rate"] = math.nan if about["frame_rate"] is None else float(about["frame_rate"])
@@ -83,9 +81,9 @@ def read_journal(file: BinaryIO, track: type[Any], camera: type[Any], blank: Bla
     found: dict[str, Any] = {}
     for name in about["cameras"]:
         own = table["cameras"][name]
-        parts = blank(camera, len(table)) | {column: np.ascontiguousarray(own[column]) for column in OF_CAMERA}
+        parts = nothing(camera, len(table)) | {column: np.ascontiguousarray(own[column]) for column in OF_CAMERA}
         found[name] = camera(reason=reasons_of(own["reason"]), **parts)
-    parts = blank(track, len(table)) | {name: np.ascontiguousarray(table[name]) for name in OF_FRAME}
+    parts = nothing(track, len(table)) | {name: np.ascontiguousarray(table[name]) for name in OF_FRAME}
     return fields | parts | {"cameras": found}
 
 

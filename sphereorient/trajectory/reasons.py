@@ -1,5 +1,7 @@
-from enum import IntFlag, StrEnum
+from enum import IntFlag
 from typing import Any
+
+from sphereorient.errors import Reason
 
 
 class Flag(IntFlag):
@@ -16,26 +18,6 @@ class Flag(IntFlag):
     EXTRAPOLATED = 256
     CONTRADICTION = 512
     IDENTITY = 1024  # of several spheres: it may be another one, see the dataset `identity`
-
-
-class Reason(StrEnum):
-    """Why a camera has no orientation in a frame; `OK` if it has one."""
-
-    OK = "ok"
-    NOT_FOUND = "not_found"
-    OUTLINE = "outline"
-    DARK = "dark"
-    SATURATED = "saturated"
-    REPEATED = "repeated"
-    RUNAWAY = "runaway"
-    LOW_SCORE = "low_score"
-    UNSEEN = "unseen"  # it shows paint that the texture map does not know
-    AMBIGUOUS = "ambiguous"
-    CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
-    SECOND_BALL = "second_ball"  # likewise, in a movie with two balls: it may show the other one
-    HIDDEN = "hidden"  # another sphere covers it
-    UNDECODABLE = "undecodable"
-    MISSING = "missing"
 
 
 def reasons_of(texts: Any) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
-from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
+from sphereorient.files.hdf5 import DAMAGE, SPHERES, whole_hdf5
 from sphereorient.trajectory import datasets, journal
 from sphereorient.trajectory.datasets import in_length, stored, stored_fields
 from sphereorient.trajectory.reasons import Flag, Reason, reasons_of
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 SCHEMA = "sphereorient-track/1"
 SCHEMA_MINOR = 1  # `score` of the precise method: evidence for the painted ball
 SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME each
-SPHERES = "spheres"
 TEXTS = ("method", "settings", "experiment")
 HELD = 0.1  # of the position's stated error
 AGAIN = "write the track again"
@@ -79,9 +78,9 @@ class CameraTrack:
         """Return the frames of increasing `rows`, with their candidates."""
         counts = np.diff(self.candidate_offset)
         kept = np.isin(np.repeat(np.arange(len(counts)), counts), rows)
-        parts = {}
-        for name, c in stored_fields(type(self)):
-            parts[name] = getattr(self, name)[kept if c.rows == "candidates" else rows]
+        parts = {
+            name: getattr(self, name)[kept if c.rows == "candidates" else rows] for name, c in stored_fields(type(self))
+        }
         parts["candidate_offset"] = np.concatenate([[0], np.cumsum(counts[rows])])
         return replace(self, **parts, reason=tuple(self.reason[k] for k in rows.tolist()))
 

@@ -289,7 +289,7 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
     config.write_text("level: [2]\n")
     code, _, said = run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)
     assert (code, len(said.strip().splitlines())) == (2, 1)
-    assert "did you mean levels" in said
+    assert "write 'levels'" in said
 
 
 def test_compare_as_a_command(tmp_path, monkeypatch, capsys):

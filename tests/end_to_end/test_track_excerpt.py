@@ -297,7 +297,7 @@ def test_bad_input_is_one_clear_line_and_leaves_no_file(copy, refused, case):
     ("arguments", "word"),
     [
         (["--out", "/dev/null/track.h5"], "/dev/null"),
-        (["--out", "track.h5", "--method", "paper", "--set", "orient.fine_stp_deg=2"], "orient.fine_step_deg"),
+        (["--out", "track.h5", "--method", "paper", "--set", "orient.fine_stp_deg=2"], "fine_step_deg"),
         (["--out", "track.h5", "--method", "paper", "--set", "orient.fine_step_deg=wide"], "wide"),
         (["--out", "track.h5", "--method", "guess"], "paper"),
         (["--out", "track.h5", "--cameras", "cam7"], "cam1 or cam2"),

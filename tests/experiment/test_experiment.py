@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import SHARED
 from experiment_examples import FULL, HEIGHT, SHORT, WIDTH, make_folder, save_movie, written
+from experiment_file import write_experiment
 from PIL import Image
 
 from sphereorient.errors import CameraError, ExperimentError, MovieError, OutputError
@@ -18,10 +19,9 @@ from sphereorient.experiment import (
     input_files,
     load_experiment,
     open_movies,
-    outside_paths,
     recording,
-    write_experiment,
 )
+from sphereorient.experiment.experiment import outside_paths
 from sphereorient.sphere import load_texture
 
 
@@ -65,12 +65,12 @@ def test_what_is_left_out_has_its_default(folder):
 @pytest.mark.parametrize("text", [FULL, SHORT], ids=["full", "short"])
 def test_a_written_experiment_is_read_back_the_same(folder, text):
     experiment = load_experiment(written(folder, text))
-    path = write_experiment(dataclasses.replace(experiment, path=folder / "again.yaml"), comment="made by a test")
+    path = write_experiment(dataclasses.replace(experiment, path=folder / "again.yaml"))
     again = load_experiment(path)
     for part in dataclasses.fields(Experiment):
         if part.name not in ("path", "cameras"):
             assert getattr(again, part.name) == getattr(experiment, part.name), part.name
-    assert path.read_text().startswith("# made by sphereorient\n# made by a test\nschema: sphereorient-experiment/1\n")
+    assert path.read_text().startswith("# made by sphereorient\nschema: sphereorient-experiment/1\n")
     assert str(folder) not in path.read_text()
 
 

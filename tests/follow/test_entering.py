@@ -12,7 +12,7 @@ from run_examples import EXCERPT, SHORT
 from sphereorient import so3
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.poses import no_pose
-from sphereorient.methods.method import Learnt
+from sphereorient.methods.method import load_learnt
 from sphereorient.methods.settings import load_settings
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.trajectory import Reason
@@ -55,9 +55,6 @@ def test_frames_before_the_first_one_that_a_search_finds_are_followed_back(known
 @pytest.mark.slow
 def test_a_disk_may_be_larger_than_those_that_were_studied(known):
     right, path = known
-    learnt = Learnt.load(path)
-    track = run(
-        Request(experiment=EXCERPT, settings=SETTINGS, learnt=replace(learnt, widest_px=0.9 * learnt.widest_px)),
-        MemoryStore(),
-    )
+    learnt = {name: replace(one, widest_px=0.9 * one.widest_px) for name, one in load_learnt(path).items()}
+    track = run(Request(experiment=EXCERPT, settings=SETTINGS, learnt=learnt), MemoryStore())
     assert_same_poses(track, right)

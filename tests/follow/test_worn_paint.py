@@ -11,7 +11,7 @@ from run_examples import off_deg, rms_sigmas
 
 from sphereorient.bench.scenes import BenchmarkScene, write_scene
 from sphereorient.cli import main
-from sphereorient.methods.method import Learnt
+from sphereorient.methods.method import load_learnt
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text, worn_share
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
@@ -39,7 +39,7 @@ def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
     told = [line for line in track.provenance["remarks"] if "differs from the texture map" in line]
     assert len(told) == 1
     assert not any("differs" in line for line in asis.provenance["remarks"])
-    cells = Learnt.load(known).worn
+    cells = load_learnt(known)[""].worn
     assert 0.04 < worn_share(cells) < 0.2  # not all of it was in sight
     assert torch.equal(worn_of_text(track.provenance[UNUSED_PAINT]), cells)
     assert UNUSED_PAINT not in asis.provenance

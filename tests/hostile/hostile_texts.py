@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from sphereorient.cameras import load_cameras, load_covariance
 from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par
 from sphereorient.experiment import load_experiment
-from sphereorient.methods.settings import load_settings, load_synth_settings
+from sphereorient.methods.settings import load_settings, read_model
+from sphereorient.synth import SynthSettings
 
 Generated = SearchStrategy[Case]
 
@@ -350,13 +352,13 @@ def openptv_family(suffix: str) -> Family:
 def text_families() -> dict[str, Family]:
     """All families of texts by name."""
     settings_tree = load_settings().model_dump(mode="json")
-    synth_tree = load_synth_settings().model_dump(mode="json")
+    synth_tree = SynthSettings().model_dump(mode="json")
     families = [
         yaml_family("experiment.yaml", "experiment.yaml", load_experiment, experiment_documents(), write_cameras),
         yaml_family("cameras.yaml", "cameras.yaml", use_cameras, cameras_documents()),
         yaml_family("calibration.yaml", "calibration.yaml", load_calibration, calibration_documents()),
         yaml_family("settings", "settings.yaml", use_settings(load_settings), [settings_tree]),
-        yaml_family("synth settings", "synth.yaml", use_settings(load_synth_settings), [synth_tree]),
+        yaml_family("synth settings", "synth.yaml", use_settings(partial(read_model, SynthSettings)), [synth_tree]),
         points_family(),
         *(opencv_family(suffix) for suffix in OPENCV),
         *(openptv_family(suffix) for suffix in ("ori", "addpar", "par")),

@@ -20,7 +20,7 @@ from sphereorient.errors import SphereOrientError
 from sphereorient.learn.checkpoint import Checkpoint, save_checkpoint
 from sphereorient.learn.metrics import LEVELS
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
+from sphereorient.methods.settings import model_yaml, read_model
 
 LENGTH = ["--set", "training.epochs=2", "--set", "training.steps=3", "--set", "pictures.validation=32"]
 
@@ -69,7 +69,7 @@ def test_a_training_leaves_the_files_that_the_docs_name(trained):
 
 
 def test_the_settings_beside_it_are_those_that_were_used(trained, config):
-    again = load_proposer_settings(trained[0] / "settings.yaml")
+    again = read_model(ProposerSettings, trained[0] / "settings.yaml")
     assert again.training.epochs == 2
     assert again.network == tiny().network
     assert again.pictures.disks == tiny().pictures.disks
@@ -98,10 +98,10 @@ def test_quiet_says_nothing_and_resume_goes_on(trained, tmp_path):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("training.step=3", "did you mean training.steps"),
-        ("network.chanels=3", "did you mean network.channels"),
-        ("pictures.disks.size=3", "did you mean pictures.disks.size_px"),
-        ("trainig.steps=3", "did you mean training"),
+        ("training.step=3", "write 'steps'"),
+        ("network.chanels=3", "write 'channels'"),
+        ("pictures.disks.size=3", "write 'size_px'"),
+        ("trainig.steps=3", "write 'training'"),
         ("training.steps=0", "greater than or equal to 1"),
         ("network.size_px=32", "pictures.disks.size_px"),
         ("pictures.kinds=[stripes]", "blobs, dots, patches"),
@@ -120,7 +120,7 @@ def test_a_config_that_is_none_is_one_line(tmp_path):
     assert "none.yaml" in refused("train", tmp_path / "none.yaml", "--out", tmp_path / "out")
     path = tmp_path / "odd.yaml"
     path.write_text("training: {step: 3}\n")
-    assert "did you mean training.steps" in refused("train", path, "--out", tmp_path / "out")
+    assert "write 'steps'" in refused("train", path, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -177,12 +177,12 @@ def test_a_checkpoint_of_one_ball_is_tried_on_that_ball_alone(tmp_path):
 def test_settings_written_are_settings_read(tmp_path):
     path = tmp_path / "settings.yaml"
     for settings in (ProposerSettings(), tiny(minutes=3.5, start="a: b.ckpt")):
-        path.write_text(proposer_settings_yaml(settings))
-        assert load_proposer_settings(path) == settings
+        path.write_text(model_yaml("Training", settings))
+        assert read_model(ProposerSettings, path) == settings
 
 
 def test_the_committed_settings_are_the_defaults():
-    assert load_proposer_settings(REPO / "configs" / "train_proposer.yaml") == ProposerSettings()
+    assert read_model(ProposerSettings, REPO / "configs" / "train_proposer.yaml") == ProposerSettings()
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from sphereorient.live.live import measured
 from sphereorient.live.loop import open_live
 from sphereorient.live.outputs import TrackOutput
 from sphereorient.live.sources import movie_frames
-from sphereorient.live.track import REMARK, TrackBlocks, whole_track
+from sphereorient.live.track import REMARK, TrackBlocks
 from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Flag, Reason, Trajectory, journal
 from sphereorient.trajectory.datasets import stored_fields
@@ -134,7 +134,7 @@ def test_a_journal_that_was_cut_anywhere_is_the_track_until_there(run, tmp_path)
         for name, camera in track.cameras.items():
             assert camera.reason == whole[:frames].cameras[name].reason
         assert track.provenance == head.provenance
-    lean = whole_track(journal.journal_path(path))
+    lean = Trajectory.load(journal.journal_path(path))
     assert lean.velocity.strides[0] == 0  # nothing measured takes no memory
     lean.save(path)
     assert len(Trajectory.load(path)) == 40

@@ -19,7 +19,7 @@ from sphereorient.live.live import Measured, measured
 from sphereorient.live.loop import open_live
 from sphereorient.live.monitor import LOST_S, Monitor
 from sphereorient.live.sources import movie_frames
-from sphereorient.methods.method import Learnt
+from sphereorient.methods.method import Learnt, save_learnt
 from sphereorient.methods.settings import Settings
 from sphereorient.report.texture_map import write_texture
 from sphereorient.synth.textures import blobs
@@ -104,7 +104,7 @@ def test_the_likely_cause_is_told(reason, found, cause):
 def test_the_map_of_another_ball_is_told(tmp_path):
     folder = Path(shutil.copytree(EXCERPT, tmp_path / "excerpt"))
     with open_live(EXCERPT / "experiment.yaml", Settings(), ["cam1"], None) as opened:
-        Learnt.of(opened.tracker.appearance).save(tmp_path / "learnt.h5")
+        save_learnt({"": Learnt.of(opened.tracker.appearance)}, tmp_path / "learnt.h5")
     (folder / "texture.png").unlink()
     write_texture(blobs(256, torch.Generator().manual_seed(5)), folder / "texture.png")
     said: list[str] = []

@@ -26,7 +26,7 @@ from sphereorient.files.page_server import HOST
 from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.lines import FicTracLines
 from sphereorient.live.monitor import Monitor
-from sphereorient.live.page import LivePage, address, open_page
+from sphereorient.live.page import LivePage, open_page
 from sphereorient.live.sources import movie_frames
 from sphereorient.trajectory import Reason
 
@@ -58,7 +58,7 @@ def shown(recording, arrivals: list[Arrival], count: int) -> LivePage:
     """A page after some frames."""
     views = [SimpleNamespace(name=name, camera=camera) for name, camera in recording.cameras.items()]
     monitor = Monitor(Feed(iter(arrivals), 100, wait=True))
-    lines = FicTracLines(views[0].camera)
+    lines = FicTracLines(views[0].camera.R_cam_lab.numpy())
     for _, now, _ in zip(monitor, poses(), range(count), strict=False):
         monitor.saw(now, lines.columns(now))
     return LivePage(monitor=monitor, views=views, radius_mm=recording.experiment.radius_mm)
@@ -109,7 +109,7 @@ def test_a_frame_without_a_pose_has_a_reason_and_no_outline(recording, arrivals)
 def served(recording, arrivals) -> Iterator[tuple[LivePage, str]]:
     page = shown(recording, arrivals, 20)
     server = open_page(page, 0)
-    yield page, address(page, server)
+    yield page, server.address
     server.shutdown()
     server.server_close()
 
@@ -147,7 +147,7 @@ def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recor
     page = LivePage()
     server = open_page(page, 0)
     try:
-        assert json.loads(ask(f"{address(page, server)}look")[1]) == {"begun": False}
+        assert json.loads(ask(f"{server.address}look")[1]) == {"begun": False}
         with pytest.raises(OutputError, match="expected a free port"):
             open_page(LivePage(), server.server_address[1])
     finally:

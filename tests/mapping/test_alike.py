@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sphereorient import so3
+from sphereorient.experiment.recording import silent
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.alike import shared_maps
 from sphereorient.mapping.compare import turned_map
@@ -44,7 +45,7 @@ def maps():
     ]
     turned = turned_map(paints[0], Q.mT)
     of = {"a": learnt(paints[0], 0), "b": learnt(paints[1], 1), "c": learnt(turned, 2)}
-    return paints, of, shared_maps(of)
+    return paints, of, shared_maps(of, silent)
 
 
 def test_those_of_one_paint_share_a_map_and_its_frame(maps):

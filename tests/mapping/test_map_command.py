@@ -170,7 +170,7 @@ def test_an_old_map_that_is_none_is_refused_before_any_work(copy, tmp_path, monk
 def test_unknown_cameras_and_settings_are_refused(copy, tmp_path, monkeypatch, capsys):
     out = tmp_path / "map.png"
     assert "cam1 or cam2" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--cameras", "cam3")
-    assert "paint.rounds" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
+    assert "write 'rounds'" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
 
 
 def test_track_without_a_map_says_how_to_get_one(copy, tmp_path, monkeypatch, capsys):
@@ -207,7 +207,7 @@ def test_maps_on_disk_say_what_was_never_seen(tmp_path):
     texture = torch.tensor([[0.0, 1.0, 0.25, torch.nan]] * 2).repeat(4, 4)
     counts = torch.tensor([[3, 300, 1, 0]] * 2).repeat(4, 4)
     write_texture(texture, tmp_path / "map.png")
-    write_seen(counts, tmp_path / "map_seen.png")
+    write_seen(counts, tmp_path / "map.png")
     assert cv2.imread(str(tmp_path / "map.png"), cv2.IMREAD_UNCHANGED)[0, :4].tolist() == [0, 255, 64, 128]
     seen = read_seen(seen_path(tmp_path / "map.png"))
     assert seen is not None
@@ -237,5 +237,5 @@ def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     assert told["moved_rms_deg"] < 0.2
     assert told["changed_share"] < 0.01
     assert cv2.imread(str(tmp_path / "moved.png")).shape[1] > 500
-    write_seen(torch.zeros(96, 192), tmp_path / "new_seen.png")
+    write_seen(torch.zeros(96, 192), tmp_path / "new.png")
     assert run(monkeypatch, capsys, *arguments)[0] == 2  # nothing known in one of them: nothing to compare

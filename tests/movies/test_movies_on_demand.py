@@ -8,7 +8,8 @@ import av
 import numpy as np
 import pytest
 
-from sphereorient.movies import OnDemand, open_movie
+from sphereorient.files.picture import OnDemand
+from sphereorient.movies import open_movie
 from sphereorient.movies.ffv1 import SliceDecoder, split_slices, stub_slice
 
 SHAPE = (97, 131)

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sphereorient.preflight.mark import HOST, Marking, serve
+from sphereorient.files.page_server import HOST
+from sphereorient.preflight.mark import Marking, serve
 
 
 @contextmanager

@@ -27,11 +27,11 @@ from sphereorient.cli import app
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import ExperimentKeys
-from sphereorient.experiment.fictrac import read_fictrac_config
 from sphereorient.files.draft import DraftKey, draft_yaml, given
 from sphereorient.files.whole_file import has_mark
 from sphereorient.movies import open_movie
 from sphereorient.preflight.draft import experiment_keys
+from sphereorient.preflight.fictrac import read_fictrac_config
 from sphereorient.preflight.first_look import FirstLook, look_at
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 

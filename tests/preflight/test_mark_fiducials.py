@@ -182,8 +182,13 @@ def test_a_person_clicks_the_fiducials(marking, address, browser: Any, tmp_path:
 @pytest.mark.parametrize(("name", "kind"), [("calibration.yaml", FiducialMarking), ("experiment.yaml", MaskMarking)])
 def test_the_command_tells_the_files_apart(marking, name, kind, monkeypatch):
     seen = []
-    monkeypatch.setattr(kind, "__init__", lambda self, path: seen.append(path))
-    monkeypatch.setattr("sphereorient.preflight.mark.serve", lambda *_: (_ for _ in ()).throw(OSError("in use")))
+
+    def begin(self, path: Path) -> None:
+        seen.append(path)
+        self.token = "known"
+
+    monkeypatch.setattr(kind, "__init__", begin)
+    monkeypatch.setattr("socketserver.TCPServer.__init__", lambda *_: (_ for _ in ()).throw(OSError("in use")))
     path = marking.path.with_name(name)
     if kind is MaskMarking:
         path.write_text("schema: sphereorient-experiment/1\n")

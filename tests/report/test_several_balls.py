@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from experiment_file import write_experiment
 from overlay_examples import RADIUS_MM, command, excerpt, true_track
 
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment import Experiment, write_experiment
+from sphereorient.experiment import Experiment
 from sphereorient.report.build import match_experiments, surroundings_of
 from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import outline_px

@@ -79,12 +79,8 @@ def _entry(kind: type[CameraModel]) -> type[CameraEntry]:
     fields: dict[str, Any] = dict.fromkeys(kind.ALSO, (float | None, None))
     for key in kind.KEYS:
         holds = HOLDS[len(key.parts)]
-        if key.optional:
-            fields[key.name] = (holds | None, None)
-        elif key.default is None:
-            fields[key.name] = (holds, ...)
-        else:
-            fields[key.name] = (holds, (key.default,) * len(key.parts) if key.parts else key.default)
+        usual = (key.default,) * len(key.parts) if key.parts else key.default
+        fields[key.name] = (holds | None, None) if key.optional else (holds, ... if key.default is None else usual)
     return create_model(f"{kind.__name__}Entry", __base__=CameraEntry, **fields)
 
 
@@ -98,9 +94,7 @@ def add_model(kind: type[CameraModel]) -> None:
 
 def load_cameras(path: Path | str) -> dict[str, Camera]:
     """Read all cameras of a cameras.yaml (docs/cameras.md), in its order; a camera with a `port` becomes a PortCamera.
-
-    Raises:
-        CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
+    Raises CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
     """
     path = Path(path)
     document = read_document(path, SCHEMA, CameraError, "write it with `sphereorient calibrate`, or correct the path")
@@ -125,11 +119,9 @@ def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> Paramete
     if entry is None:
         return _independent(cameras)
     where = f"{path}, covariance"
-    try:
-        whole = validated(CovarianceEntry, entry, where, CameraError).covariance()
-    except CameraError as error:
-        raise CameraError(str(error) if str(error).startswith(where) else f"{path}, {error}") from None
-    own = whole.of(cameras)
+    checked = validated(CovarianceEntry, entry, where, CameraError)
+    with named(str(path)):
+        own = checked.covariance().of(cameras)
     known = [f"{name}.{parameter}" for name, camera in cameras.items() for parameter in parameter_names(camera)]
     check_known(() if own is None else own.names, known, f"{where}, parameters")
     return own
@@ -140,10 +132,7 @@ def save_cameras(
 ) -> None:
     """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
     `comment` stands at its top; `covariance` is that of a joint fit.
-
-    Raises:
-        CameraError: a camera of a model that is not in MODELS.
-        OutputError: the file cannot be written.
+    Raises CameraError (a model that is not in MODELS), OutputError (a file that cannot be written).
     """
     document: dict[str, Any] = {"cameras": {name: _described(camera) for name, camera in cameras.items()}}
     write_document(Path(path), SCHEMA, document | _covariance_keys(covariance), comment)

@@ -12,7 +12,7 @@ from sphereorient import so3
 from sphereorient.calibration.comparison import Seen, limits_of
 from sphereorient.calibration.contradictions import compare_cameras, majority
 from sphereorient.cameras import centre_lab_mm, triangulate
-from sphereorient.errors import ExperimentError, refusal
+from sphereorient.errors import ExperimentError, Reason, refusal
 from sphereorient.follow.appearance.presence import nothing, proven
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table
@@ -20,7 +20,6 @@ from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import Picture, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.poses import FittedPoses, PoseStart
-from sphereorient.trajectory import Reason
 
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one

@@ -170,7 +170,7 @@ def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
 @pytest.mark.slow
 def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
     paths = [save_map(learnt(k), tmp_path / f"movie{k}.png") for k in range(3)]
-    write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0_seen.png")
+    write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0.png")
     code, said, err = run(monkeypatch, capsys, "--series", *paths, "--out", tmp_path / "wear.png")
     assert code == 0, err
     assert "place 1 at longitude 20°, latitude 15°" in said
