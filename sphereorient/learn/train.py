@@ -89,10 +89,8 @@ class ProposerModule(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return the optimiser; `on_train_batch_start` sets its learning rate."""
-        training = self.settings.training
-        return torch.optim.AdamW(
-            self.network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
-        )
+        of = self.settings.training
+        return torch.optim.AdamW(self.network.parameters(), lr=of.learning_rate, weight_decay=of.weight_decay)
 
     def learning_rate(self) -> float:
         """Return the rate of the next step: a linear rise, then a cosine of the share of steps or time that is done."""
@@ -130,11 +128,10 @@ class ProposerModule(LightningModule):
 
     def training_metrics(self) -> Row:
         """Return loss and recall on training pictures since the last call."""
-        row: Row = {}
-        if self._losses:
-            row["train_nll"] = float(torch.stack(self._losses).mean())
-        if self._right:
-            row["train_recall_1"] = float(torch.cat(self._right).double().mean())
+        if not self._losses:
+            return {}
+        recall = torch.cat(self._right).double().mean()
+        row = {"train_nll": float(torch.stack(self._losses).mean()), "train_recall_1": float(recall)}
         self._losses, self._right = [], []
         return row
 
@@ -192,8 +189,7 @@ class CheckpointCallback(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state."""
-        for key, value in state_dict.items():
-            setattr(self, key, value)
+        vars(self).update(state_dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -233,7 +229,7 @@ def train_proposer(
     own = settings.pictures.texture
     checkpoint = Checkpoint(
         settings=settings,
-        state={name: tensor.detach().clone() for name, tensor in network.state_dict().items()},
+        state=kept.best,
         temperature=temperature,
         texture_sha256=None if own is None else texture_sha256(load_texture(Path(own))),
         about={
@@ -294,12 +290,12 @@ def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, t
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
     training = module.settings.training
-    loggers = {name: logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")}
-    levels = {name: logger.level for name, logger in loggers.items()}
+    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric")]
+    levels = [logger.level for logger in loggers]
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
-            for logger in loggers.values():
+            for logger in loggers:
                 logger.setLevel(logging.ERROR)
             trainer = Trainer(
                 accelerator="gpu" if torch.cuda.is_available() else "cpu",
@@ -323,5 +319,5 @@ def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, t
     finally:
         if main:
             signal.signal(signal.SIGINT, before)
-        for name, logger in loggers.items():
-            logger.setLevel(levels[name])
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

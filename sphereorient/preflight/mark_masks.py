@@ -60,12 +60,11 @@ class MaskMarking(Marking):
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Save the mask of a camera, of `shapes` and `keep`."""
-        match steps:
-            case ["save", name]:
-                if not {"shapes", "keep"} <= set(asked):
-                    raise _refused("request", "shapes and keep, as JSON", "another thing")
-                return self.save(name, asked["shapes"], keep=bool(asked["keep"]))
-        return None
+        if len(steps) != 2 or steps[0] != "save":
+            return None
+        if not {"shapes", "keep"} <= set(asked):
+            raise _refused("request", "shapes and keep, as JSON", "another thing")
+        return self.save(steps[1], asked["shapes"], keep=bool(asked["keep"]))
 
     def state(self) -> Json:
         """Return what the page begins with."""
@@ -90,10 +89,8 @@ class MaskMarking(Marking):
 
     def mask(self, name: str) -> bytes:
         """Return what is hidden now as PNG: red, half transparent, where the mask is black."""
-        height, width = self._movie(name).frame_shape
-        shown = self.masks[name]
-        picture = np.zeros((height, width, 4), np.uint8)
-        if shown is not None:
+        picture = np.zeros((*self._movie(name).frame_shape, 4), np.uint8)
+        if (shown := self.masks[name]) is not None:
             picture[~shown] = (0, 0, 255, 110)
         return png(picture)
 
@@ -153,22 +150,17 @@ class MaskMarking(Marking):
         `keep`: what the old mask hides stays hidden. Raises ExperimentError (impossible shapes, or nothing would be
         shown), OutputError (a file cannot be written).
         """
-        height, width = self._movie(name).frame_shape
-        old = self.masks[name] if keep else None
-        shown = drawn_mask((height, width), shapes, old)
+        shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
         flip = self.experiment.flip.get(name, "none")
         file = self.path.parent / f"{name}_mask.png"
         with self.lock:
             write_picture(file, flipped_picture(np.where(shown, 255, 0).astype(np.uint8), flip))
-            self._name_mask(name, file.name)
+            masks = dict((self.read() or {}).get("masks") or {})
+            if masks.get(name) != file.name:
+                self.write(["masks"], masks | {name: file.name}, f"write masks: {{{name}: {file.name}}} there")
             self.masks[name] = shown
             vars(self).pop("looks", None)
         return {"file": str(file), "hidden": 100 * float(np.mean(~shown))}
-
-    def _name_mask(self, name: str, file: str) -> None:
-        masks = dict((self.read() or {}).get("masks") or {})
-        if masks.get(name) != file:
-            self.write(["masks"], masks | {name: file}, f"write masks: {{{name}: {file}}} there")
 
     def _movie(self, name: str) -> Movie:
         if name not in self.movies:

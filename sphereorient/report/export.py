@@ -16,17 +16,6 @@ from sphereorient.report import columns as table
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.walk import fictrac_rows
 
-SUFFIXES = {
-    ".csv": "csv",
-    ".parquet": "parquet",
-    ".pq": "parquet",
-    ".mat": "mat",
-    ".dat": "fictrac",
-    ".tum": "tum",
-    ".vtkhdf": "vtk",
-    ".nwb": "nwb",
-    ".nc": "netcdf",
-}
 ROWS = 50_000  # written at once
 TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
 Floats = NDArray[np.float64]
@@ -42,24 +31,25 @@ def export_track(
 ) -> None:
     """Write a track for other programs, whole or not at all; NaN stays NaN.
 
-    `to` is a key of `WRITERS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
+    `to` is a key of `FORMATS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
     for an unknown format, a package that is not installed, or a file that cannot be written.
     """
-    write = WRITERS[format_of(path, to)]
+    write, *_ = FORMATS[format_of(path, to)]
     with put_aside(path) as aside:
         write(Export(track=track, path=aside, progress=progress, camera=camera))
 
 
 def format_of(path: Path, to: str | None) -> str:
     """Return the format, from `to`, or from the suffix if None; OutputError if unknown or contradictory."""
-    by_name, known = SUFFIXES.get(path.suffix.lower()), ", ".join(WRITERS)
-    if to is not None and to not in WRITERS:
+    suffixes = {suffix: name for name, (_, *own) in FORMATS.items() for suffix in own}
+    by_name, known = suffixes.get(path.suffix.lower()), ", ".join(FORMATS)
+    if to is not None and to not in FORMATS:
         do = "write --to with one of these"
         raise OutputError(refusal("--to", expected=f"one of {known}", got=repr(to)[:60], do=do))
     if to is None and by_name is None:
         do = f"add --to with one of {known}, or end the name in one of these"
         got = f"'{path.suffix}'"
-        raise OutputError(refusal(f"--out {path}", expected=" ".join(SUFFIXES), got=got, do=do))
+        raise OutputError(refusal(f"--out {path}", expected=" ".join(suffixes), got=got, do=do))
     if to is not None and by_name not in (None, to):
         do = "let --to and the name agree"
         raise OutputError(refusal(f"--out {path}", expected=f"a name for {to}", got=f"'{path.suffix}'", do=do))
@@ -261,13 +251,13 @@ def _write_netcdf(job: Export) -> None:
     data.to_netcdf(job.path, engine="scipy")
 
 
-WRITERS: dict[str, Callable[[Export], None]] = {
-    "csv": _write_csv,
-    "parquet": _write_parquet,
-    "mat": _write_mat,
-    "fictrac": _write_fictrac,
-    "tum": _write_tum,
-    "vtk": _write_vtk,
-    "nwb": _write_nwb,
-    "netcdf": _write_netcdf,
+FORMATS: dict[str, tuple[Any, ...]] = {  # what writes it (of an `Export`), and the suffixes of its files
+    "csv": (_write_csv, ".csv"),
+    "parquet": (_write_parquet, ".parquet", ".pq"),
+    "mat": (_write_mat, ".mat"),
+    "fictrac": (_write_fictrac, ".dat"),
+    "tum": (_write_tum, ".tum"),
+    "vtk": (_write_vtk, ".vtkhdf"),
+    "nwb": (_write_nwb, ".nwb"),
+    "netcdf": (_write_netcdf, ".nc"),
 }

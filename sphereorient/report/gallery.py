@@ -40,9 +40,6 @@ class GalleryFrame:
     """The picture of one frame; a part of `Gallery`."""
 
     k: int  # row of the track
-    number: int  # the experiment's
-    time_s: float
-    status: int  # index in frame_warnings.STATUS_WORDS
     rank: int  # 0: chosen first, the worst
     words: tuple[str, ...]  # why it was chosen
     jpeg: bytes
@@ -79,7 +76,6 @@ def gallery(
     why = chosen_frames(track, count)
     rows = np.array(sorted(why), dtype=np.int64)
     rank = {k: place for place, k in enumerate(why)}
-    status = quality.status_of(track)
     frames = []
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, None, opened)
@@ -88,16 +84,7 @@ def gallery(
             _draw_pairs(canvas, page, k, pictures, (0, 0))
             # No subsampling: it blurs thin coloured lines.
             Image.fromarray(canvas.finished()).save(jpeg, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
-            frame = GalleryFrame(
-                k=k,
-                number=int(page.numbers[k]),
-                time_s=float(track.time[k]),
-                status=int(status[k]),
-                rank=rank[k],
-                words=why[k],
-                jpeg=jpeg.getvalue(),
-            )
-            frames.append(frame)
+            frames.append(GalleryFrame(k=k, rank=rank[k], words=why[k], jpeg=jpeg.getvalue()))
             progress(done, len(rows))
     return Gallery(frames=tuple(frames), numbers=page.numbers, cameras=page.cameras, size=_pairs_size(page))
 

@@ -10,25 +10,16 @@ from typing import Any
 import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined, Template
-from numpy.typing import NDArray
 
 from sphereorient.files.provenance import versions
 from sphereorient.report import frame_warnings as quality
-from sphereorient.report.gallery import Gallery, GalleryFrame
+from sphereorient.report.gallery import Gallery
 from sphereorient.report.plots.style import SYMBOLS, decimals, superscript
 from sphereorient.report.tables import Table
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
 from sphereorient.trajectory import Trajectory
 
-CONTENTS = (
-    ("summary", "Summary"),
-    ("numbers", "Numbers"),
-    ("figures", "Figures"),
-    ("frames", "Frame by frame"),
-    ("tables", "Tables"),
-    ("settings", "Settings and provenance"),
-)
 MOST_STRETCHES = 200  # rows of the table
 UNFOLDED = 12  # pictures that are visible without JavaScript
 Cell = tuple[str, str]  # a number or words, and the interval
@@ -52,7 +43,6 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
     page = {
         "title": f"{what}: {_some(names)}" if names else what,
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
-        "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
         "each": _each(tables["tracks"]) if len(tracks) > 1 else None,
         "grids": [grid for grid in (*_moments(summary), _flow(tables)) if grid["rows"]],
@@ -88,15 +78,17 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     Without JavaScript it shows a table of the bad stretches and the pictures; with it, interactive strips.
     """
     numbers = quality.frame_numbers(track) if gallery is None else gallery.numbers
-    strip, found = quality.strip_of(track, numbers), quality.bad_stretches(track, numbers)
+    found = quality.bad_stretches(track)
     ranked = [] if gallery is None else sorted(gallery.frames, key=lambda frame: frame.rank)
     return _template("strip.html.j2").render(
         name=name,
-        strip=strip,
-        worst=_worst(track, numbers),
+        numbers=numbers,
+        time_s=track.time,
+        status=quality.status_of(track),
+        strip=quality.strip_of(track, numbers),
+        worst=quality.choose_worst(track, 1),
         stretches=found[:MOST_STRETCHES],
         more=found[MOST_STRETCHES:],
-        reasons=_reasons,
         gallery=gallery,
         unfolded=ranked[:UNFOLDED],
         folded=sorted(ranked[UNFOLDED:], key=lambda frame: frame.k),
@@ -104,20 +96,10 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     )
 
 
-def _worst(track: Trajectory, numbers: NDArray[np.int64]) -> dict[str, Any] | None:
-    found = quality.choose_worst(track, 1).items()
-    shown = [{"k": k, "number": int(numbers[k]), "time_s": float(track.time[k]), "words": why} for k, why in found]
-    return shown[0] if shown else None
-
-
-def _reasons(stretch: quality.BadStretch) -> str:
-    return "; ".join(f"{words} ({count})" for words, count in stretch.reasons) or "no reason given"
-
-
-def _caption(frame: GalleryFrame) -> str:
-    status = quality.STATUS_WORDS[frame.status]
-    words = [words for words in frame.words if words != status]
-    return "; ".join(words if words and words[0].startswith(status) else [status, *words])
+def _caption(status: int, why: Sequence[str]) -> str:
+    good = quality.STATUS_WORDS[status]
+    words = [words for words in why if words != good]
+    return "; ".join(words if words and words[0].startswith(good) else [good, *words])
 
 
 def _some(names: Sequence[str], most: int = 4) -> str:

@@ -1,7 +1,8 @@
 """Figures of distributions and correlations: PDFs, increments, autocorrelations, durations of the segments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -24,6 +25,23 @@ CURVE_POINTS = 401
 SHORTEST = 4.0  # bars of shifted PDFs end at this part of the value
 SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or lags of the first zero
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
+
+
+def figures(of: look.Reported) -> Iterator[look.Plan]:
+    """Yield the figures of this file in a report."""
+    summary, _, _ = of
+    if (more := summary.distributions) is None:
+        return
+    caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
+    draw = partial(densities_figure, summary, list(more.densities))
+    yield "densities", "PDFs (Figures 11 and 12 of the paper)", caption, draw
+    caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
+    yield "increments", "Increments (Figure 11 of the paper)", caption, partial(increments_figure, more, summary.table)
+    caption = "Autocorrelations and integral times."
+    yield "correlations", "Correlations", caption, partial(correlations_figure, more.correlations)
+    if more.durations is not None:
+        draw = partial(durations_figure, more.durations)
+        yield "durations", "Durations (Figure 9 of the paper)", "Of the segments.", draw
 
 
 @look.in_style

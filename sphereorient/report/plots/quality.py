@@ -1,6 +1,7 @@
 """Figures of isotropy and of what limits the measurement: orientations, noise, kernel widths, camera distances."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -25,6 +26,26 @@ WIDTHS_OF = ("acceleration", "alpha_lab")
 TOO_WIDE = 15.0  # medians: even bins with a longer range show the smaller distances as one bar
 NEAREST = 30.0  # the smaller median over the first of the geometric bins
 GEOMETRIC_BINS = 36
+
+
+def figures(of: look.Reported) -> Iterator[look.Plan]:
+    """Yield the figures of this file in a report."""
+    summary, _, distances = of
+    if any(len(one.distance_rad) for one in distances):
+        title = "Distance of the cameras (Figure 8 of the paper)"
+        caption = "PDF of the angle between two cameras' own orientations."
+        yield "camera_distance", title, caption, partial(camera_distance_figure, distances)
+    if summary.ensemble.segments:
+        caption = "Share of each variance that is noise, or was smoothed away."
+        yield "noise", "Noise", caption, partial(noise_figure, summary.table, summary.ensemble.error)
+    if (more := summary.distributions) is None:
+        return
+    caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
+    yield "kernel_widths", "Kernel widths", caption, partial(widths_figure, more.widths)
+    caption = "Euler angles against the law of uniform attitudes."
+    yield "angles", "Angles (Figure 10 of the paper)", caption, partial(angles_figure, more.angles, more.uniformity)
+    caption = "Shares of the components in the variance, in the lab and in the body."
+    yield "isotropy", "Isotropy", caption, partial(isotropy_figure, more.isotropies)
 
 
 @look.in_style

@@ -2,7 +2,7 @@
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from sphereorient.files.whole_file import put_aside
-from sphereorient.statistics import Interval
+from sphereorient.statistics import Interval, Summary
+from sphereorient.statistics.cameras import CameraDistance
+from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.trajectory import COLOURS
 
 Floats = NDArray[np.float64]
+Plan = tuple[str, str, str, Callable[[], Figure]]  # a figure of a report: name, title, caption, function
+Tracks = Mapping[str, Trajectory]  # by file name
+Reported = tuple[Summary, Tracks, Sequence[CameraDistance]]  # what a report is of
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
@@ -168,6 +173,11 @@ def say_empty(axes: Any, words: str = "nothing measured") -> None:
     """Write into an empty panel why it is empty."""
     write = axes.text2D if hasattr(axes, "text2D") else axes.text
     write(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
+
+
+def of_tracks(names: Iterable[str], tracks: Tracks) -> str:
+    """Return the label of some of the tracks in a title; empty if there is only one."""
+    return "" if len(tracks) == 1 else f" of {', '.join(names)}"
 
 
 def in_frame(quantity: str) -> str:

@@ -1,6 +1,8 @@
 """A track in six dimensions against time, and its path through space with the sphere's axes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -38,6 +40,21 @@ RATES = {
 TRIPODS = 14
 TRIPOD_SIZE = 0.09  # of the path's largest extent
 THINNEST = 0.35  # of the largest extent: the least length of the box's shortest side
+
+
+def figures(of: look.Reported) -> Iterator[look.Plan]:
+    """Yield the tracks of the recording with most valid frames, and their path."""
+    _, tracks, _ = of
+    name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
+    recording = name.removesuffix(track.sphere)
+    together = {key: one for key, one in tracks.items() if key.removesuffix(one.sphere) == recording}
+    caption, paper = "As measured (dots) and smooth, with bands of two standard errors.", " (Figure 7 of the paper)"
+    for number, (key, one) in enumerate(together.items(), start=1):
+        label, title = ("track", paper) if number == 1 else (f"track_{number}", "")
+        yield label, f"Track{look.of_tracks([key], tracks)}{title}", caption, partial(track_figure, one)
+    if not track.held:
+        draw = partial(path_figure, *together.values())
+        yield "path", f"Path{look.of_tracks(together, tracks)}", "With the sphere's axes.", draw
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
