@@ -54,11 +54,11 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint on the CPU without executing code; raise CheckpointError if file or weights are invalid."""
     name = f"checkpoint {path}"
-    content = io.BytesIO(read_whole(path, LARGEST_BYTES, "a file of weights", CheckpointError, DO))
+    content = read_whole(path, LARGEST_BYTES, "a file of weights", CheckpointError, DO)
     _check_archive(content, name)
     try:
         # weights_only accepts tensors, numbers, texts and containers; any other name in the pickle is refused.
-        tree = torch.load(content, map_location="cpu", weights_only=True)
+        tree = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # damaged pickles raise nearly anything
         code = "Weights only load failed" in str(error) or "Unsupported" in str(error)
         got = "other objects or code, which were not loaded" if code else "a damaged file"
@@ -92,10 +92,10 @@ def _refuse(name: str, expected: str, got: str, do: str, cause: Exception | None
     raise CheckpointError(refusal(name, expected=expected, got=got, do=do)) from cause
 
 
-def _check_archive(content: io.BytesIO, name: str) -> None:
+def _check_archive(content: bytes, name: str) -> None:
     """Refuse a file that is not torch's archive, or that expands when it is read."""
     try:
-        entries = zipfile.ZipFile(content).infolist()
+        entries = zipfile.ZipFile(io.BytesIO(content)).infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         _refuse(name, "a file of weights", "another file, or the beginning of one", DO, error)
     # torch does not compress. Compressed or overlapping entries can expand to any size.

@@ -173,9 +173,8 @@ class Modes(NamedTuple):
 
 
 def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) -> Modes:
-    """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3).
-    The temperature divides the logits for probabilities and order only; orientations are means of the density as
-    learnt.
+    """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3). The
+    temperature divides the logits for probabilities and order only; orientations are means of the density as learnt.
     """
     flat = grid.flatten(1)
     probability = logits.softmax(-1)

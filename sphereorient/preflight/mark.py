@@ -1,5 +1,4 @@
 """The server of the pages on which people mark what pictures show: masks, or fiducials of a plate.
-
 It answers this machine alone, to who knows the random token of its address.
 """
 

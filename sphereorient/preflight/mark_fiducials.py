@@ -91,9 +91,8 @@ class FiducialMarking(Marking):
         }
 
     def save(self, picture: Picture, points: Any) -> Json:
-        """Write clicked places into the file; return the view with them.
-        Raises CameraError (impossible places, places that do not tie the picture, or a file that cannot be changed
-        safely), OutputError (the file cannot be written).
+        """Write clicked places into the file; return the view with them. Raises CameraError (impossible places, places
+        that do not tie the picture, or a file that cannot be changed safely), OutputError (the file cannot be written).
         """
         clicked = self._checked(picture, points).round(1)
         view = self.view(picture, clicked)

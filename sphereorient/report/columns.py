@@ -27,7 +27,6 @@ FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadshe
 
 def to_arrow(track: Trajectory) -> "pa.Table":
     """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
-
     Raise OutputError if pyarrow is not installed.
     """
     arrow = package("pyarrow", "table")
@@ -43,10 +42,9 @@ def to_arrow(track: Trajectory) -> "pa.Table":
 
 def to_xarray(track: Trajectory) -> "xr.Dataset":
     """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
-
     Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
-    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN.
-    Raise OutputError if xarray is not installed.
+    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN. Raise
+    OutputError if xarray is not installed.
     """
     xarray = package("xarray", "table")
     own = {dataset.name: dataset for dataset in frame_wise(track)}
@@ -111,7 +109,6 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
 
 def columns(track: Trajectory) -> Iterator[Dataset]:
     """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
-
     Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
     """
     for dataset in frame_wise(track):

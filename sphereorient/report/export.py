@@ -30,7 +30,6 @@ def export_track(
     camera: Camera | None = None,
 ) -> None:
     """Write a track for other programs, whole or not at all; NaN stays NaN.
-
     `to` is a key of `FORMATS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
     for an unknown format, a package that is not installed, or a file that cannot be written.
     """

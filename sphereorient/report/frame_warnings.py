@@ -94,7 +94,6 @@ def stated_error(cov: Floats) -> Floats:
 
 def choose_worst(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     """Choose at most `count` of the worst frames; return the reasons by row, worst first, the kinds of problem in turn.
-
     Of frames less than three apart one is taken. If fewer frames are bad, those with the lowest scores follow.
     """
     kinds = [list(ranked) for ranked in _kinds(track)]
@@ -198,7 +197,6 @@ class BadStretch:
 
 def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
     """Return the quality of n bins of frames, each represented by its worst one, for JSON; None where unknown.
-
     `numbers` (N,) are the experiment's; None: by the times. A bin is one frame, or more of a long track.
     """
     size = max(1, -(-len(track) // MOST_BINS))

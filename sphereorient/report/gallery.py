@@ -69,7 +69,6 @@ def gallery(
     track: Trajectory, experiment: Experiment, count: int = COUNT, progress: Progress = lambda done, total: None
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
-
     Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another
     experiment, MovieError for a movie that cannot be opened.
     """
@@ -91,7 +90,6 @@ def gallery(
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
-
     The worst frame is first, then the middles of the longest stretches. Two thirds are bad frames; good ones, spread
     evenly, serve to compare.
     """
@@ -143,7 +141,6 @@ def worst_frames(
     progress: Progress = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
     """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
-
     Raise the errors of `gallery`, and OutputError for another suffix or a file that cannot be written.
     """
     check_ending(path, "--worst", SUFFIXES)

@@ -67,10 +67,9 @@ def overlay_movie(
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
-    All spheres, by name, are drawn into the same frames.
-
-    Raise ExperimentError for a camera that track or experiment do not have, TrackError if no frame of the track is in
-    the range, OutputError for a suffix that is not a movie's, or a file that cannot be written.
+    All spheres, by name, are drawn into the same frames. Raise ExperimentError for a camera that track or experiment do
+    not have, TrackError if no frame of the track is in the range, OutputError for a suffix that is not a movie's, or a
+    file that cannot be written.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
@@ -118,7 +117,6 @@ def streams_of(
     track: Trajectory, experiment: Experiment, names: Sequence[str], opened: ExitStack
 ) -> tuple[Rows, dict[str, CameraStream]]:
     """Find a track's frames by time: their numbers (N,), and the streams by camera; `opened` closes them.
-
     Raise TrackError if no frame is found.
     """
     movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
@@ -186,7 +184,6 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
-
     Raise OutputError for a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
     check_ending(path, "--out", FORMATS)

@@ -195,7 +195,6 @@ class Ball:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Page:
     """Draws frames of the tracks of a recording, all in one layout; made by `overlay.prepared`.
-
     Beside the frame of each camera, every sphere has a row of panels: crop, re-rendered, residual.
     """
 

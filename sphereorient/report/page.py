@@ -28,7 +28,6 @@ Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells;
 
 def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, **parts: Any) -> str:
     """Return the page of a report, from statistics, tracks by the name of their file, and the command that made it.
-
     `parts`: verdicts; figures (name, title, caption, png in base64, width in px); tables that were written, and the
     suffixes of their files; strips, HTML of `strip_html`.
     """
@@ -74,7 +73,6 @@ def strip_assets() -> tuple[str, str]:
 
 def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     """Return the HTML section (text escaped) with the quality of every frame of a track; needs `strip_assets`.
-
     Without JavaScript it shows a table of the bad stretches and the pictures; with it, interactive strips.
     """
     numbers = quality.frame_numbers(track) if gallery is None else gallery.numbers

@@ -47,7 +47,6 @@ def figures(of: look.Reported) -> Iterator[look.Plan]:
 @look.in_style
 def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS)) -> Figure:
     """Draw the PDFs of the components of some quantities, in standard deviations, with the fit and the Gaussian.
-
     Raise TrackError if there is a single segment, which has no densities.
     Source: the paper, section IV; Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245.
     """

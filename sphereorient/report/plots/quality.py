@@ -136,7 +136,6 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
 @look.in_style
 def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
     """Draw rms, flatness and share of noise of a and alpha, else of velocity, against the kernel's width.
-
     Filled markers are corrected for the expected noise; their plateau over several widths is the motion's value.
     Source: Voth et al. 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
@@ -184,7 +183,6 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
 @look.in_style
 def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
     """Draw the PDF of the distance of the cameras' orientations and its median, a panel for each pair of cameras.
-
     Both axes are logarithmic if even bins would show the smaller distances as one bar; the PDF is per degree.
     Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
     """

@@ -104,7 +104,6 @@ def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) 
 @in_style
 def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ...]:
     """Write a figure, the same bytes for the same figure, and return the files.
-
     Without a suffix `path` gets PNG and PDF; its folder must exist. Raise OutputError if a file cannot be written.
     """
     undated: dict[str, dict[str, Any]] = {".png": {"Software": None}, ".pdf": {"CreationDate": None}}

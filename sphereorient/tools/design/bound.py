@@ -22,7 +22,6 @@ SAMPLING = Sampling(supersampling=6)
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
     """Least covariance of delta of R = exp([delta]x) R_view_body, view, rad (3), centre (u, v), px, and radius, px.
-
     Made by `cramer_rao_bound`. Undetermined unknowns have infinite variance, and covariance 0 with the others.
     """
 

@@ -1,5 +1,4 @@
 """Gores: a texture map as strips from pole to pole (sinusoidal projection) that wrap a ball, printed at true size.
-
 Sheet: x right, y up, mm, first strip at longitude -180 degrees; north up and east right, seen from outside.
 """
 

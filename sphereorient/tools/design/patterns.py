@@ -42,13 +42,11 @@ def facing(direction_body: Tensor) -> Tensor:
 
 def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) -> Tensor:
     """Draw a map (height, 2 height) float32, 0 black .. 1 white, with patches about `size_deg` wide.
-
     `kind`: blobs (wavy), patches (polygons), dots (black on white). Raise PaintError if kind or size is invalid.
     """
     if kind not in PATTERNS:
-        raise PaintError(
-            refusal("kind of texture", expected=" or ".join(PATTERNS), got=f"'{kind}'", do="name one of them")
-        )
+        expected, do = " or ".join(PATTERNS), "name one of them"
+        raise PaintError(refusal("kind of texture", expected=expected, got=f"'{kind}'", do=do))
     low, high = SIZES_DEG
     if not low <= size_deg <= high:
         expected, do = f"{low:g} .. {high:g} degrees", "choose a size in this range"
@@ -65,17 +63,12 @@ def stroke_deg(texture: Tensor) -> float:
     points, white = directions.numpy(), (sample_texture(texture.double(), directions) >= 0.5).numpy()
     if white.all() or not white.any():
         return BRUSHES_DEG[-1]
-    trees = {side: cKDTree(points[white == side]) for side in (False, True)}
     depth = np.empty(len(points))
     for side in (False, True):
-        chord, _ = trees[not side].query(points[white == side])
+        chord, _ = cKDTree(points[white != side]).query(points[white == side])
         depth[white == side] = 2 * np.arcsin(np.clip(chord / 2, 0, 1))
-    best = 0.0
-    for width in BRUSHES_DEG:
-        if _lost(points, white, depth, math.radians(width / 2)) > LOST_SHARE:
-            break
-        best = width
-    return best
+    too_wide = (k for k, w in enumerate(BRUSHES_DEG) if _lost(points, white, depth, math.radians(w / 2)) > LOST_SHARE)
+    return (0.0, *BRUSHES_DEG)[next(too_wide, len(BRUSHES_DEG))]
 
 
 def border_length(texture: Tensor) -> float:
@@ -90,15 +83,11 @@ def border_length(texture: Tensor) -> float:
 def _lost(points: NDArray[np.float64], white: NDArray[np.bool_], depth: NDArray[np.float64], radius: float) -> float:
     """Return the share of points that a brush of this radius does not reach within its own colour."""
     # The nearest point of the other colour lies half a step of the lattice beyond the border.
-    middle = depth >= radius + 0.5 * math.sqrt(4 * math.pi / POINTS)
-    lost = 0
+    half_step = 0.5 * math.sqrt(4 * math.pi / POINTS)
+    reach, lost = 2 * math.sin(min(radius, math.pi) / 2) + half_step, 0
     for side in (False, True):
-        own, middles = points[white == side], points[(white == side) & middle]
-        if len(middles):
-            reach = 2 * math.sin(min(radius, math.pi) / 2) + 0.5 * math.sqrt(4 * math.pi / POINTS)
-            lost += int((np.asarray(cKDTree(middles).query(own)[0]) > reach).sum())
-        else:
-            lost += len(own)
+        own, middles = points[white == side], points[(white == side) & (depth >= radius + half_step)]
+        lost += int((np.asarray(cKDTree(middles).query(own)[0]) > reach).sum()) if len(middles) else len(own)
     return lost / len(points)
 
 

@@ -90,7 +90,6 @@ class WearSeries:
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
     """Compare maps (H, 2 H), 0 black .. 1 white, NaN unknown, in time order with the first, in its body frame.
-
     `turned`: find the rotations between body frames. Raise PaintError for other balls, ShapeError if not 2:1.
     """
     if len(maps) < 2:
@@ -137,12 +136,12 @@ def _figures(now: Wear, before: Wear | None) -> WearFigures:
         return float(area[part & whole].sum()) / total if total else math.nan
 
     worn = share(now.worn, now.known)
-    known = float(area[now.known].sum())
-    if before is None:
-        return WearFigures(known=known, worn=worn, grown=worn, stays=math.nan)
-    both = now.known & before.known
-    grown = share(now.worn, both) - share(before.worn, both)
-    return WearFigures(known=known, worn=worn, grown=grown, stays=share(now.worn, before.worn & now.known))
+    grown, stays = worn, math.nan
+    if before is not None:
+        both = now.known & before.known
+        grown = share(now.worn, both) - share(before.worn, both)
+        stays = share(now.worn, before.worn & now.known)
+    return WearFigures(known=float(area[now.known].sum()), worn=worn, grown=grown, stays=stays)
 
 
 def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
