@@ -121,15 +121,6 @@ def camera_findings(
     yield from tracked.findings
 
 
-def outlines_of(samples: Sequence[MovieSample]) -> Seen:
-    """Return what the outlines of the sampled frames say."""
-    return Seen.of_outlines(
-        {one.name: one.camera for one in samples},
-        torch.stack([one.sightings.centre_px for one in samples], 1),
-        torch.stack([one.sightings.radius_px for one in samples], 1),
-    )
-
-
 def sample_positions(samples: Sequence[MovieSample]) -> Tensor:
     """Return the positions (n, 3), lab, mm, of the ball in the frames sampled by two cameras or more."""
     return nearest_point([one.camera.rays(one.sightings.centre_px) for one in samples])[0]
@@ -137,7 +128,10 @@ def sample_positions(samples: Sequence[MovieSample]) -> Tensor:
 
 def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> Finding:
     """Judge the distance between the lines of sight; `in_step_px`: the gap after synchronising the movies."""
-    title, seen, names = "lines of sight", outlines_of(samples), [one.name for one in samples]
+    title, names = "lines of sight", [one.name for one in samples]
+    centre_px = torch.stack([one.sightings.centre_px for one in samples], 1)
+    radius_px = torch.stack([one.sightings.radius_px for one in samples], 1)
+    seen = Seen.of_outlines({one.name: one.camera for one in samples}, centre_px, radius_px)
     pairs = {pair: seen.gaps(pair) for pair in seen.pairs}
     counts = {pair: int(torch.isfinite(gaps.signed_mm).sum()) for pair, gaps in pairs.items()}
     k, m = min(counts, key=lambda pair: counts[pair])

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from sphereorient.cameras import PinholeCamera
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
-from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.files.threads import side_by_side
@@ -61,14 +60,13 @@ def look_at(
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
     """Look at the movie of a camera; `shown` (H, W) is False where something hides the ball."""
     settings, stream = LocateSettings(), _stream(name, movie, shown)
-    sample = sample_movie(stream, _unknown(movie), None, settings)
+    sample = sample_movie(stream, None, settings)
     outlines = [outline for _, outline in sample.balls]
     with_ball = [k for k, (outline, _) in enumerate(sample.found) if outline is not None]
     readable = [k for k, picture in enumerate(sample.picture) if picture is not None]
-    k = with_ball[len(with_ball) // 2] if with_ball else readable[0]
+    k, looked = with_ball[len(with_ball) // 2] if with_ball else readable[0], len(readable)
     picture, outline = sample.picture[k], sample.found[k][0]
     assert picture is not None
-    looked = sum(one is not None for one in sample.picture)
     seen, stays = len(outlines) >= SEEN * looked, None
     if seen:
         places = np.array([(one.u_px, one.v_px) for one in outlines])
@@ -103,15 +101,3 @@ def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraS
     lens: dict[str, Any] = {"f_px": 2.0 * height, "centre_px": middle_of_picture((width, height))}
     camera = PinholeCamera(image_size=(width, height), **lens, **pose)
     return CameraStream(name=name, camera=camera, movie=movie, rows=np.arange(len(movie)), shown=shown)
-
-
-def _unknown(movie: Movie) -> Experiment:
-    path = Path(movie.path)
-    return Experiment(
-        name=path.stem,
-        path=path.parent / "experiment.yaml",
-        frame_rate_hz=float("nan"),
-        cameras_path=path.parent / "cameras.yaml",
-        cameras={},
-        movie_paths={},
-    )

@@ -80,13 +80,13 @@ class FiducialMarking(Marking):
             dots = self.dots[picture]
         view = index_dots(dots, self.plate, picture.path.name, clicked)
         tied = view.state == "tied"
-        at = [np.flatnonzero((view.index == mark).all(axis=1)) if tied else [] for mark in self.plate.fiducials]
+        at = [view.uv_px[tied & (view.index == mark).all(axis=1)] for mark in self.plate.fiducials]
         return {
             "tied": tied,
             "reason": view.reason,
             "dots": np.column_stack([dots.uv_px, np.sqrt(dots.area_px / np.pi)]).round(2).tolist(),
             "points": view.uv_px.round(2).tolist() if tied else [],
-            "fiducials": [view.uv_px[k[0]].round(2).tolist() if len(k) else None for k in at],
+            "fiducials": [uv_px[0].round(2).tolist() if len(uv_px) else None for uv_px in at],
             "clicked": None if clicked is None else clicked.tolist(),
         }
 

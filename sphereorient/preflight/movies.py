@@ -53,10 +53,9 @@ def frames(experiment: Experiment, timeline: Timeline) -> Finding:
 def outside(experiment: Experiment) -> list[Finding]:
     """Report files outside the folder of the experiment."""
     paths = [os.path.relpath(path, experiment.folder) for path in outside_paths(experiment)]
-    if not paths:
-        return []
     measured = f"not in the folder of {experiment.path.name}: {', '.join(paths)}"
-    return [warning("files elsewhere", measured, "check these paths if somebody else made the experiment")]
+    found = warning("files elsewhere", measured, "check these paths if somebody else made the experiment")
+    return [found] if paths else []
 
 
 def movie_file(sample: MovieSample) -> Finding:
@@ -92,13 +91,13 @@ def ball(sample: MovieSample) -> Finding:
     """Count the frames with a ball, and the reasons for those without."""
     usable = [k for k, reason in enumerate(sample.screen) if reason in (Reason.OK, Reason.REPEATED)]
     reasons = Counter(sample.found[k][1] for k in usable)
-    title, seen = f"ball {sample.name}", reasons.pop(Reason.OK, 0)
+    seen = reasons.pop(Reason.OK, 0)
     measured = f"found in {seen} of {len(usable)} frames"
     if reasons:
-        measured += " (" + ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) + ")"
+        measured += f" ({', '.join(f'{count} {reason}' for reason, count in reasons.most_common())})"
     remedy = REMEDY[reasons.most_common(1)[0][0] if reasons else Reason.NOT_FOUND]
     few = seen < BALL_SEEN * len(usable)
-    return judged(title, measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
+    return judged(f"ball {sample.name}", measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
 
 
 def background(sample: MovieSample, experiment: Experiment) -> Finding:
@@ -190,11 +189,9 @@ def _profiles(
     last = share.shape[1] - 1 - (share[:, ::-1] > 0.5).argmax(1)
     shifted = []
     for one, k in zip(share, last, strict=True):
-        if not 0 < k < len(offset) - 1:
-            continue
-        crossing = offset[k] + FINE * (one[k] - 0.5) / max(one[k] - one[k + 1], 1e-9)
-        if abs(crossing) < 2.5:
-            shifted.append(np.interp(offset + crossing, offset, one))
+        if 0 < k < len(offset) - 1:
+            crossing = offset[k] + FINE * (one[k] - 0.5) / max(one[k] - one[k + 1], 1e-9)
+            shifted += [np.interp(offset + crossing, offset, one)] if abs(crossing) < 2.5 else []
     return np.asarray(shifted).reshape(-1, len(offset))
 
 

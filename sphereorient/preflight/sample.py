@@ -11,8 +11,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
 from sphereorient.errors import MovieError, refusal
-from sphereorient.experiment import Experiment
-from sphereorient.experiment.stream import CameraStream, given_scene, pictures_of, spread_frames, uniform
+from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,
@@ -94,10 +93,14 @@ def frames_to_sample(count: int) -> list[int]:
 
 
 def sample_movie(
-    stream: CameraStream, experiment: Experiment, diameter_px: float | None, settings: LocateSettings
+    stream: CameraStream,
+    diameter_px: float | None,
+    settings: LocateSettings,
+    empty: Grey | None = None,
+    fixed: bool = False,
 ) -> MovieSample:
-    """Sample one camera's frames, background and ball; measure its diameter if None.
-    Raises MovieError (no sampled frame can be decoded), ExperimentError (a background picture cannot be used).
+    """Sample one camera's frames, background and ball; measure its diameter if None; `empty`: a picture without it.
+    Raises MovieError: no sampled frame can be decoded.
     """
     frame = np.asarray(frames_to_sample(len(stream)), np.int64)
     picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
@@ -107,10 +110,9 @@ def sample_movie(
         do = "check that it plays; export it again if not"
         raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
-    empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
 
     def at_size(size_px: float) -> MovieSample:
-        if empty is None and experiment.fixed:
+        if empty is None and fixed:
             background = replace(_surroundings(some), shown=stream.shown)
         else:
             background = learn_background(some, size_px, settings, empty, stream.shown)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -52,13 +53,14 @@ def look_at_scene(
     spheres = recording.experiment.spheres
     missing = [one for one in spheres if one.texture_path is None or not one.texture_path.exists()]
     if missing:
-        return (), [_no_map(sphere.name, None if (p := sphere.texture_path) is None else str(p)) for sphere in missing]
+        return (), [_no_map(sphere.name, sphere.texture_path) for sphere in missing]
     loaded = {path: load_map(path) for path in dict.fromkeys(one.texture_path for one in spheres) if path is not None}
     maps = {one.name: loaded[one.texture_path] for one in spheres if one.texture_path is not None}
     job = Job(recording=replace(recording, maps=maps), settings=settings, device=torch.device("cpu"))
     first = {name: paint.first for paint in open_paints(job, progress) for name in paint.names}
     balls = {name: first[name] for name in recording.experiment.names}
-    frames, places = sample_frames(job.recording, next(iter(balls.values())).fitter.views, FRAMES)
+    cameras = next(iter(balls.values())).fitter.views
+    frames, places = sample_frames(job.recording, cameras, FRAMES)
     start, found, disks = SceneStart(balls), [], []
     for k, shots in enumerate(frames):
         progress("balls", k, len(frames))
@@ -66,7 +68,6 @@ def look_at_scene(
         found.append(start(shots, list(balls), {}))
     progress("balls", len(frames), len(frames))
     best = max(range(len(frames)), key=lambda k: sum(len(one) > 0 for one in found[k].values()))
-    cameras = next(iter(balls.values())).fitter.views
     seen = tuple(
         SceneView(
             name=view.name,
@@ -89,7 +90,7 @@ def look_at_scene(
     return seen, [*_counts(disks, balls), *_found(found, balls), *sizes, *contrasts.values(), *one_paint]
 
 
-def _no_map(name: str, path: str | None) -> Finding:
+def _no_map(name: str, path: Path | None) -> Finding:
     measured = "no texture map is given" if path is None else f"no texture map: {path} is not there"
     do = f"learn it with `sphereorient map`, or correct spheres.{name}.texture"
     return judged(f"paint of ball {name}", measured, (True, FAULT, do))
@@ -114,9 +115,9 @@ def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[lis
     """Return the disks in the pictures of one instant."""
     each, found = list(balls.values()), []
     for c, shot in enumerate(shots):
-        views = [one.fitter.views[c] for one in each]
-        sizes = [view.diameter_px for view in views]
-        found.append(find_disks(shot.picture, views[0].background, sizes, each[0].locating) if shot.usable else [])
+        sizes = [one.fitter.views[c].diameter_px for one in each]
+        background = each[0].fitter.views[c].background
+        found.append(find_disks(shot.picture, background, sizes, each[0].locating) if shot.usable else [])
     return found
 
 
@@ -136,12 +137,8 @@ def _counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, In
         measured = f"{median(counts):g} disks in the usual frame ({min(counts)} to {max(counts)}), {len(balls)} named"
         more = "name the other balls under `spheres`; mask what is round and no ball (`sphereorient mark`)"
         fewer = "leave out of `spheres` what is not there; give backgrounds: where the balls hardly move"
-        yield judged(
-            f"balls {view.name}",
-            measured,
-            (median(counts) > len(balls), WARNING, more),
-            (max(counts) < len(balls), WARNING, fewer),
-        )
+        complaints = (median(counts) > len(balls), WARNING, more), (max(counts) < len(balls), WARNING, fewer)
+        yield judged(f"balls {view.name}", measured, *complaints)
 
 
 def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
@@ -189,5 +186,5 @@ def _sizes(
 
 def _exchanged(one: str, other: str, measured: Mapping[str, float], named: Mapping[str, float]) -> bool:
     """Return whether two balls of unlike diameters each have about that of the other."""
-    apart = abs(named[one] / named[other] - 1) > BAD
-    return apart and all(abs(measured[a] / named[b] - 1) < BAD for a, b in ((one, other), (other, one)))
+    swapped = all(abs(measured[a] / named[b] - 1) < BAD for a, b in ((one, other), (other, one)))
+    return swapped and abs(named[one] / named[other] - 1) > BAD

@@ -121,8 +121,7 @@ def increments_figure(distributions: Distributions, table: Mapping[str, Moments]
     lag_ms = 1e3 * steps.lag_s
     for i, style in enumerate(FOUR):
         of = steps.flatness.part((slice(None), i))
-        right.plot(lag_ms, of.value, marker=style.marker, label=style.name, **style.drawn)
-        look.band(right, lag_ms, of.low, of.high, style)
+        look.curve(right, lag_ms, of, style, marker=style.marker, label=style.name)
     right.set(xscale="log", xlabel="lag (ms)", ylabel="flatness of increments of ω, lab (–)")
     levels = {"Gaussian": (3.0, look.SECOND.line)}
     for name, key, line in (("ω lab", "omega_lab", (0, (1, 1.5))), ("α lab", "alpha_lab", (0, (8, 2)))):
@@ -165,12 +164,10 @@ def correlations_figure(correlations: Mapping[str, Correlation]) -> Figure:
     figure, panels = look.panel_grid(len(correlations), 3.0, 0.4)
     for axes, (quantity, correlation) in zip(panels, correlations.items(), strict=True):
         _correlation_panel(axes, correlation)
-        axes.set_ylabel(f"autocorrelation of {look.SYMBOLS.get(quantity, quantity)} (–)")
-        axes.set_xlabel("lag (ms)")
+        axes.set(xlabel="lag (ms)", ylabel=f"autocorrelation of {look.SYMBOLS.get(quantity, quantity)} (–)")
     figure.align_ylabels()
-    look.note(
-        figure, "markers below the line of zero: integral times with intervals; each panel has its own range of lags"
-    )
+    words = "markers below the line of zero: integral times with intervals; each panel has its own range of lags"
+    look.note(figure, words)
     return figure
 
 
@@ -178,22 +175,20 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
     lag_ms = 1e3 * correlation.lag_s
     axes.axhline(0.0, color="#444444", linewidth=0.6)
     for i, style in enumerate(FOUR):
-        of = correlation.value.part((slice(None), i))
         words = look.interval_text(correlation.integral_time_s.part(i), "ms", 1e3)
         if words != "unknown" and not correlation.reached_zero[i]:
             words = f"above {words}, no zero"
-        axes.plot(lag_ms, of.value, label=f"{style.name}: {words}", **style.drawn)
-        look.band(axes, lag_ms, of.low, of.high, style)
+        look.curve(axes, lag_ms, correlation.value.part((slice(None), i)), style, label=f"{style.name}: {words}")
     for i, style in enumerate(FOUR):
         time = correlation.integral_time_s.part(i).scaled(1e3)
         place = np.array([-0.05 * (1 + i)])  # one below the other, since they are close together
         axes.plot([float(time.value)], place, marker=style.marker, linestyle="none", color=style.colour, label="_")
         axes.hlines(place, [float(time.low)], [float(time.high)], color=style.colour, linewidth=0.9)
     below = np.flatnonzero((correlation.value.value <= 0).any(1))
-    zero = float(lag_ms[below[0]]) if len(below) else float(lag_ms[-1])
+    zero = float(lag_ms[below[0] if len(below) else -1])
     longest = float(np.nanmax(1e3 * correlation.integral_time_s.value, initial=0.0))
-    axes.set_xlim(0.0, max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3))
-    axes.set_ylim(bottom=min(axes.get_ylim()[0], -0.3), top=1.05)
+    end = max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3)
+    axes.set(xlim=(0.0, end), ylim=(min(axes.get_ylim()[0], -0.3), 1.05))
     look.legend_above(axes, title="integral time")
 
 

@@ -56,13 +56,10 @@ def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Fig
     for axes, angle, style in zip(panels, angles, look.COMPONENTS, strict=True):
         edges_deg = np.rad2deg(angle.edges_rad)
         look.points(axes, (edges_deg[1:] + edges_deg[:-1]) / 2, angle.pdf.scaled(np.pi / 180), style, angle.name)
-        law = {"color": look.SECOND.colour, "linestyle": look.SECOND.line, "linewidth": 1.1}
-        axes.stairs(angle.uniform * np.pi / 180, edges_deg, baseline=None, **law)
-        axes.set_xlabel(rf"$\theta_{angle.name[-1]}$ (degrees)")
-        step = 45 if edges_deg[-1] < 100 else 90
-        axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=np.arange(edges_deg[0], edges_deg[-1] + 1, step))
-    panels[0].set_ylabel("PDF (1/degree)")
-    panels[0].set_ylim(bottom=0.0)
+        axes.stairs(angle.uniform * np.pi / 180, edges_deg, baseline=None, **look.SECOND.drawn)
+        ticks = np.arange(edges_deg[0], edges_deg[-1] + 1, 45 if edges_deg[-1] < 100 else 90)
+        axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=ticks, xlabel=rf"$\theta_{angle.name[-1]}$ (degrees)")
+    panels[0].set(ylabel="PDF (1/degree)", ylim=(0.0, None))
     bins = look.PLAIN.handle("bins with intervals", marker="o", linestyle="none")
     look.legend_of_figure(figure, [bins, look.SECOND.handle("all attitudes equally likely")], ncols=2)
     words = "uniformity of the attitudes could not be tested"
@@ -87,8 +84,7 @@ def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
     labels = [f"{look.in_frame(name)}\n{look.p_value_text(one.p_value)}" for name, one in isotropies.items()]
     axes.set_xticks(np.arange(len(labels)), labels)
     axes.grid(visible=False, axis="x")
-    axes.set_xlabel("vector and its frame, p-value of isotropy (–)")
-    axes.set_ylabel("share in the variance (%)")
+    axes.set(xlabel="vector and its frame, p-value of isotropy (–)", ylabel="share in the variance (%)")
     if isotropies:
         axes.set_xlim(-0.5, len(labels) - 0.5)
     else:
@@ -119,8 +115,7 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
     limit = axes.axhline(100 * WARN_SHARE, label=f"{100 * WARN_SHARE:.0f} %: worth a warning", **look.SECOND.drawn)
     axes.set_xticks(np.arange(len(table)), [look.in_frame(name) for name in table])
     axes.grid(visible=False, axis="x")
-    axes.set_xlabel("vector and its frame (–)")
-    axes.set_ylabel(NOISE_WORDS[error])
+    axes.set(xlabel="vector and its frame (–)", ylabel=NOISE_WORDS[error])
     top = max([100 * WARN_SHARE, *(float(np.nan_to_num([s.value, s.high]).max()) for s in shares)])
     if floor:
         axes.set(yscale="log", ylim=(floor, 1.5 * top))
@@ -161,10 +156,8 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     open_ = {"markerfacecolor": "white", "linestyle": "none"}
     for i, style in enumerate(look.COMPONENTS):
         x, column = width_ms + (i - 1) * nudge, (slice(None), i)
-        for axes, corrected, measured in (
-            (rms, curve.corrected_rms, curve.rms),
-            (flatness, curve.corrected_flatness, curve.flatness),
-        ):
+        for axes, kind in ((rms, "rms"), (flatness, "flatness")):
+            corrected, measured = getattr(curve, f"corrected_{kind}"), getattr(curve, kind)
             look.points(axes, x, corrected.part(column), style, f"{style.name}, corrected", joined=True)
             label = f"{style.name}, measured"
             axes.plot(x, measured.value[column], marker=style.marker, color=style.colour, label=label, **open_)
@@ -173,11 +166,9 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     if (curve.noise_share.value > 0).any():
         share.set_yscale("log")
         look.plain_logarithms(share.yaxis)
-    rms.set_ylim(bottom=0.0)  # a plateau looks level only above zero
-    rms.set_ylabel(f"rms of {symbol} ({unit})")
+    rms.set(ylim=(0.0, None), ylabel=f"rms of {symbol} ({unit})")  # a plateau looks level only above zero
     flatness.set_ylabel(f"flatness of {symbol} (–)")
-    share.set_ylabel(f"noise in the variance of {symbol} (%)")
-    share.set_xlabel("kernel width σ (ms)")
+    share.set(xlabel="kernel width σ (ms)", ylabel=f"noise in the variance of {symbol} (%)")
 
 
 @look.in_style
@@ -200,12 +191,11 @@ def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
 def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
     names = " and ".join(distance.cameras)
     corrected = "distance" if distance.uncorrected_rad is None else "perspective corrected"
-    laws: list[tuple[Floats, Floats, look.LineStyle, str]] = [
-        (distance.distance_rad, distance.pdf, look.ALL, corrected)
+    known: list[tuple[Any, Any, look.LineStyle, str]] = [
+        (distance.distance_rad, distance.pdf, look.ALL, corrected),
+        (distance.uncorrected_rad, distance.uncorrected_pdf, look.SECOND, "not corrected"),
     ]
-    if distance.uncorrected_rad is not None and distance.uncorrected_pdf is not None:
-        laws.append((distance.uncorrected_rad, distance.uncorrected_pdf, look.SECOND, "not corrected"))
-    laws = [(np.rad2deg(values), pdf, style, what) for values, pdf, style, what in laws if len(values)]
+    laws = [(np.rad2deg(of), pdf, style, what) for of, pdf, style, what in known if of is not None and len(of)]
     if not laws:
         look.say_empty(axes, f"no frame in which {names} both have an orientation")
         return
@@ -225,8 +215,7 @@ def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
         axes.stairs(pdf, edges, color=style.colour, linestyle=style.line, linewidth=1.2, label=label)
         axes.axvline(median, color=style.colour, linestyle=style.line, linewidth=0.8)
     if even:
-        axes.set_xlim(0.0, float(edges[-1]))
-        axes.set_ylim(bottom=0.0)
+        axes.set(xlim=(0.0, float(edges[-1])), ylim=(0.0, None))
     else:
         axes.set(xscale="log", yscale="log", xlim=(edges[0], 1.2 * edges[-1]))
         look.plain_logarithms(axes.xaxis)

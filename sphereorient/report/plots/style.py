@@ -131,21 +131,19 @@ def band(axes: Axes, x: Floats, low: Floats, high: Floats, style: LineStyle) -> 
         axes.fill_between(x, low, high, where=there.tolist(), color=style.colour, alpha=BAND, linewidth=0)
 
 
+def curve(axes: Axes, x: Floats, of: Interval, style: LineStyle, **more: Any) -> None:
+    """Draw a curve (K,) with its intervals; `more` are arguments of `Axes.plot`."""
+    axes.plot(x, of.value, **style.drawn, **more)
+    band(axes, x, of.low, of.high, style)
+
+
 def legend_above(axes: Axes, ncols: int = 1, handles: Sequence[Any] | None = None, title: str | None = None) -> None:
     """Put the legend above the axes, where it covers no data."""
     handles = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
     if handles:
-        axes.legend(
-            handles=handles,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            ncols=ncols,
-            title=title,
-            alignment="left",
-            borderaxespad=0.2,
-            columnspacing=1.2,
-            labelspacing=0.25,
-        )
+        place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "alignment": "left"}
+        space: dict[str, Any] = {"borderaxespad": 0.2, "columnspacing": 1.2, "labelspacing": 0.25}
+        axes.legend(handles=handles, ncols=ncols, title=title, **place, **space)
 
 
 def legend_of_figure(figure: Figure, handles: Sequence[Any], ncols: int) -> None:

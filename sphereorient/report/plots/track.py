@@ -23,12 +23,7 @@ Floats = NDArray[np.float64]
 MOST_FRAMES = 2000  # more are not distinguishable on a page
 GAP = 1.5  # typical steps: a longer one is a gap
 SIGMAS = 2.0  # half width of the bands
-NOT_VALID: Final[dict[str, Any]] = {
-    "facecolor": "#E8E8E8",
-    "edgecolor": look.SHADE,
-    "hatch": "//////",
-    "linewidth": 0.0,
-}
+NOT_VALID: Final[dict[str, Any]] = {"facecolor": "#E8E8E8", "edgecolor": look.SHADE, "hatch": "//////", "linewidth": 0}
 LATE_S, LONG_S = 10.0, 2.0  # from here on times are given in seconds
 WRAP_DEG = 90.0  # no sphere turns so far from frame to frame: the angle has wrapped, or passed its pole
 RATES = {
@@ -101,12 +96,11 @@ def track_figure(track: Trajectory) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel(f"time ({unit})")
     figure.align_ylabels()
+    band: dict[str, Any] = {"color": look.COMPONENTS[0].colour, "alpha": look.BAND, "linewidth": 0}
     handles = [
         *(style.handle(style.name) for style in look.COMPONENTS),
         look.PLAIN.handle("measured", marker=".", linestyle="none"),
-        Patch(
-            color=look.COMPONENTS[0].colour, alpha=look.BAND, linewidth=0, label=f"± {SIGMAS:.0f} standard deviations"
-        ),
+        Patch(label=f"± {SIGMAS:.0f} standard deviations", **band),
         Patch(label="frame not valid", **NOT_VALID),
     ]
     look.legend_of_figure(figure, handles, ncols=6)
@@ -141,10 +135,8 @@ def path_figure(*tracks: Trajectory) -> Figure:
         look.say_empty(axes)
     start = look.ALL.handle("start", marker="o", linestyle="none", markersize=5)
     paths = [style.handle(name, linewidth=1.0) for _, style, name in named]
-    arms = [
-        style.handle(f"body axis {style.name}", linestyle="-", marker=style.marker, linewidth=1.6)
-        for style in look.COMPONENTS
-    ]
+    arm: dict[str, Any] = {"linestyle": "-", "linewidth": 1.6}
+    arms = [style.handle(f"body axis {style.name}", marker=style.marker, **arm) for style in look.COMPONENTS]
     look.legend_of_figure(figure, [*paths, start, *arms], ncols=5)
     words = "the sphere's axes are not to scale"
     look.note(figure, f"{parts[0].words}; {words}" if parts[0].words else words)
