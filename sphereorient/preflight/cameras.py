@@ -140,7 +140,7 @@ def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> 
         measured = f"{who} the ball in {count} of {len(samples[0].frame)} frames sampled"
         return warning(title, measured, f"{SEE_BALL}, and check start: the movies must show the same time")
     by_pair = {pair: gaps.typical_px for pair, gaps in pairs.items()}
-    k, m = max(by_pair, key=lambda pair: by_pair[pair])
+    k, m = max(by_pair, key=by_pair.__getitem__)
     gap_px, gap_mm = by_pair[k, m], float(pairs[k, m].signed_mm.abs().nanmedian())
     who = "they miss" if len(samples) == 2 else f"those of {names[k]} and {names[m]} miss"
     measured = f"{who} each other by {gap_mm:.3f} mm, {gap_px:.2f} px (median of {counts[k, m]} frames)"
@@ -217,8 +217,8 @@ def ball_size_px(sample: MovieSample) -> Finding:
     seen = 2 * radius[torch.isfinite(radius)]
     if not len(seen):
         return warning(title, "unknown: no ball was found", SEE_BALL)
-    least, usual, most = (float(size) for size in (seen.min(), seen.median(), seen.max()))
-    measured = f"{usual:.1f} px across ({least:.1f} .. {most:.1f})"
+    usual = float(seen.median())
+    measured = f"{usual:.1f} px across ({float(seen.min()):.1f} .. {float(seen.max()):.1f})"
     if sample.expected_px is None:
         advice = f"set locate.diameter_px to {usual:.0f} (--set, or in the settings file)"
         return warning(title, measured + "; none expected", advice)

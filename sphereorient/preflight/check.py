@@ -137,8 +137,8 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         yield warning("paint", measured, do if path else f"{do}; then write it under sphere: as texture:")
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
-    default = seen.samples[0].diameter_px / 2
-    yield (paint := texture_map.contrast(seen.measures, min((r for r in radii if not math.isnan(r)), default=default)))
+    least_px = min((r for r in radii if not math.isnan(r)), default=seen.samples[0].diameter_px / 2)
+    yield (paint := texture_map.contrast(seen.measures, least_px))
     if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
     yield texture_map.look_alikes(seen.similar)

@@ -140,16 +140,15 @@ def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
     found: list[Found] = []
     rows = sample.row
     for k, (row, picture) in enumerate(zip(rows, sample.picture, strict=True)):
-        if picture is None:
-            reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
-        else:  # a repeated picture is known only if its neighbour was read
+        reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
+        ball: Found | None = None
+        if picture is not None:  # a repeated picture is known only if its neighbour was read
             neighbour = sample.picture[k - 1] if k > 0 and row == rows[k - 1] + 1 else None
             reason = screened(picture, neighbour, sample.background).reason
+            if reason in (Reason.OK, Reason.REPEATED):
+                ball = find_ball(picture, sample.background, sample.diameter_px, settings)
         screen.append(reason)
-        if picture is None or reason not in (Reason.OK, Reason.REPEATED):
-            found.append((None, reason))
-        else:
-            found.append(find_ball(picture, sample.background, sample.diameter_px, settings))
+        found.append(ball or (None, reason))
     return replace(sample, screen=tuple(screen), found=tuple(found))
 
 

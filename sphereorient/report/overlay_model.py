@@ -89,10 +89,9 @@ class CropWindow:
 
 def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
     """Return a picture within a window, (side, side) grey levels; NaN outside the picture."""
-    at = window.grid_px().astype(np.float32)
-    u, v, nan = at[..., 0], at[..., 1], float("nan")
+    u, v = window.grid_px().astype(np.float32).transpose(2, 0, 1)
     grey = picture.astype(np.float32)
-    found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
+    found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
     return np.asarray(found, np.float32)
 
 

@@ -100,9 +100,9 @@ def _caption(status: int, why: Sequence[str]) -> str:
     return "; ".join(words if words and words[0].startswith(good) else [good, *words])
 
 
-def _some(names: Sequence[str], most: int = 4) -> str:
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return ", ".join(names[:4]) + more
 
 
 def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str, str]]:
@@ -202,12 +202,10 @@ def _settings(summary: Summary) -> str:
 def _provenance(name: str, track: Trajectory) -> dict[str, Any]:
     entries = [("experiment", track.experiment), ("method", track.method), ("frame rate, Hz", f"{track.frame_rate:g}")]
     for key, value in track.provenance.items():
+        text = str(value)
         if isinstance(value, Mapping):
             text = ", ".join(f"{inner} {entry}" for inner, entry in value.items())
         elif isinstance(value, list | tuple):
             text = "; ".join(map(str, value))
-        else:
-            text = str(value)
-        if text:
-            entries.append((str(key), text))
+        entries += [(str(key), text)] if text else []
     return {"name": name, "entries": entries, "settings": track.settings.rstrip()}

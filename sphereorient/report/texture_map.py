@@ -64,19 +64,15 @@ def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
     with put_aside(path, also=(RuntimeError,)) as aside:
         track.save(aside)
         with h5py.File(aside, "a") as file:
-            _write_map(learnt, file.create_group("map"))
-
-
-def _write_map(learnt: LearntMap, group: h5py.Group) -> None:
-    for name, description in LEARNT.items():
-        _put(group, name, getattr(learnt, name).numpy(), "1", description)
-    if learnt.rounds:
-        names = [field.name for field in fields(learnt.rounds[0])]
-        table = np.array([[getattr(one, name) for name in names] for one in learnt.rounds], np.float64)
-        _put(group, "rounds", table, "as named", f"one row a round: {', '.join(names)}")
-    for field in fields(learnt.closure):
-        group.attrs[field.name] = getattr(learnt.closure, field.name)
-    group.attrs["blur_px"], group.attrs["arrived"] = learnt.blur_px, learnt.arrived
+            group = file.create_group("map")
+            for name, description in LEARNT.items():
+                _put(group, name, getattr(learnt, name).numpy(), "1", description)
+            if learnt.rounds:
+                names = [field.name for field in fields(learnt.rounds[0])]
+                table = np.array([[getattr(one, name) for name in names] for one in learnt.rounds], np.float64)
+                _put(group, "rounds", table, "as named", f"one row a round: {', '.join(names)}")
+            for name, value in (vars(learnt.closure) | {"blur_px": learnt.blur_px, "arrived": learnt.arrived}).items():
+                group.attrs[name] = value
 
 
 def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, description: str) -> None:
