@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.learn.settings import NetworkSettings
-from sphereorient.search.candidates import Candidates, check_disks, distinct
+from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import rim_share
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -220,24 +220,17 @@ def probability_of(score: Tensor) -> Tensor:
     return 2.0 * score - 1.0
 
 
-class LearnedProposer:
+class LearnedProposer(DiskSearch):
     """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
     At most `CANDIDATES` for each disk; `temperature` divides the logits, for calibrated probabilities.
     """
 
     def __init__(self, correlator: Correlator, texture: Tensor, *, temperature: float = 1.0) -> None:
+        super().__init__()
         self._network, self._temperature = correlator.eval(), temperature
+        self.size_px = correlator.settings.size_px
         with torch.inference_mode():
             self._bank = correlator.bank(map_blurs(texture.float()[None], correlator.settings.nodes)[0])
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._network.settings.size_px
-
-    def likeness(self, disks: Tensor) -> Tensor:
-        """Return the best score of each disk, (F,)."""
-        return self.propose(disks).best_score
 
     @torch.inference_mode()
     def propose(self, disks: Tensor) -> Candidates:

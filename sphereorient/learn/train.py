@@ -58,9 +58,9 @@ class TrainingData(LightningDataModule):
 
     def training_batch(self, epoch: int, step: int) -> TrainingBatch:
         """Draw the batch of a step."""
-        training = self._settings.training
-        rng = generator_of(training.seed, TRAINING, epoch, step)
-        return draw_batch(self.textures, self._settings.pictures, rng, (training.maps, training.groups, training.group))
+        of = self._settings.training
+        rng = generator_of(of.seed, TRAINING, epoch, step)
+        return draw_batch(self.textures, self._settings.pictures, rng, (of.maps, of.groups, of.group))
 
     def train_dataloader(self) -> DataLoader[int]:
         """Return the batches of the coming epoch; Lightning calls this in every epoch."""

@@ -49,13 +49,9 @@ def write_report(
     command: str = "",
 ) -> list[Verdict]:
     """Write the report of tracks, by file name, whole or not at all, and return its findings.
-
     `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
-
-    Raises:
-        TrackError: no valid frame, or tracks of kernels and of smoothers together.
-        ExperimentError: an experiment without a track, or experiments that contradict each other.
-        OutputError: `out` cannot be written, or contains something else.
+    Raises TrackError (no valid frame, or tracks of kernels and of smoothers together), ExperimentError (one without a
+    track, or two that contradict each other), OutputError (`out` cannot be written, or contains something else).
     """
     known = match_experiments(tracks, experiments)
     around = surroundings_of([experiment for experiment in known.values() if experiment is not None])
@@ -85,11 +81,8 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track by its name, or None, of its sphere alone; a single one belongs to a single
-    track.
-
-    Raises:
-        ExperimentError: an experiment without a track or without its sphere, or two of one name.
+    """Return the experiment of each track, of its sphere alone, or None; a single one belongs to a single track.
+    Raises ExperimentError: an experiment without a track or without its sphere, or two of one name.
     """
     if len(tracks) == 1 and len(experiments) == 1:
         return {name: experiments[0].of(track.sphere) for name, track in tracks.items()}
@@ -117,12 +110,10 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
     one recording that differ in size, no diameter is known.
     """
     known: dict[str, float] = {}
-    sizes: dict[Path, set[float | None]] = {}
-    for experiment in experiments:
-        sizes.setdefault(experiment.path, set()).add(experiment.diameter_mm)
+    sizes = {(one.path, one.diameter_mm) for one in experiments}
     for experiment in experiments:
         found = {FLOW_KEYS[key]: value for key, value in experiment.flow.items() if key in FLOW_KEYS}
-        if experiment.diameter_mm is not None and len(sizes[experiment.path]) == 1:
+        if experiment.diameter_mm is not None and sum(path == experiment.path for path, _ in sizes) == 1:
             found["diameter_mm"] = experiment.diameter_mm
         for key, value in found.items():
             if known.setdefault(key, value) != value:

@@ -77,7 +77,7 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     """
     numbers = quality.frame_numbers(track) if gallery is None else gallery.numbers
     found = quality.bad_stretches(track)
-    ranked = [] if gallery is None else sorted(gallery.frames, key=lambda frame: frame.rank)
+    shown = () if gallery is None else gallery.frames
     return _template("strip.html.j2").render(
         name=name,
         numbers=numbers,
@@ -88,8 +88,8 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
         stretches=found[:MOST_STRETCHES],
         more=found[MOST_STRETCHES:],
         gallery=gallery,
-        unfolded=ranked[:UNFOLDED],
-        folded=sorted(ranked[UNFOLDED:], key=lambda frame: frame.k),
+        unfolded=shown[:UNFOLDED],
+        folded=sorted(shown[UNFOLDED:], key=lambda frame: frame.k),
         caption=_caption,
     )
 

@@ -63,17 +63,15 @@ class Gores:
         """Return the closed cutting line of each strip, (2 points, 2), mm."""
         latitude = np.linspace(-math.pi / 2, math.pi / 2, points)
         half = math.pi / self.count * np.cos(latitude)
-        edges = [np.column_stack([side * half, latitude]) for side in (-1, 1)]
-        loop = np.concatenate([edges[1], edges[0][::-1]])
+        loop = np.column_stack([[*half, *-half[::-1]], [*latitude, *latitude[::-1]]])
         return [0.5 * self.diameter_mm * (loop + np.array([middle, 0.0])) for middle in self.middles_rad()]
 
 
 def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return x (columns), y (rows), mm, and texture (rows, columns) of one strip, continued beyond its outline."""
-    radius = 0.5 * gores.diameter_mm
+    radius, middle_rad = 0.5 * gores.diameter_mm, gores.middles_rad()[strip]
     step = min(STEP_MM, radius * STEP_RAD)
     height, half = gores.size_mm[1], math.pi * radius / gores.count
-    middle_rad = gores.middles_rad()[strip]
     x = torch.linspace(-half, half, math.ceil(2 * half / step) + 1, dtype=torch.float64)
     y = torch.linspace(-height / 2, height / 2, math.ceil(height / step) + 1, dtype=torch.float64)
     latitude = (y / radius)[:, None]

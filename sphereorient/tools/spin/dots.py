@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.errors import PaintError, check_tail, refusal
 from sphereorient.search import GreySearch, GreySearchSettings
-from sphereorient.search.candidates import Candidates
+from sphereorient.search.candidates import Candidates, DiskSearch
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture import map_directions
@@ -85,11 +85,12 @@ class DotTable:
         return replace(self, radius_deg=math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low)))
 
 
-class DotSearch:
+class DotSearch(DiskSearch):
     """Search all of SO(3) for a table of dots: the grey search proposes; missing dots count, other dark hardly."""
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
-        size = settings.size_px
+        super().__init__()
+        self.size_px = size = settings.size_px
         self._search, self._even, self._direction = (
             GreySearch(table.texture(), settings),
             Blur(size, EVEN),
@@ -99,15 +100,6 @@ class DotSearch:
         self._inside, self._normal = view.inside, view.normal_view
         self._weight = view.normal_view[:, 2].square() * rim_share(size)[view.inside]
         self._radius = math.radians(table.radius_deg) * CORE
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._search.size_px
-
-    def likeness(self, disks: Tensor) -> Tensor:
-        """Return the best score of each disk, (F,)."""
-        return self.propose(disks).best_score
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose attitudes; see `GreySearch.propose`.

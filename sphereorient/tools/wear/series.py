@@ -148,14 +148,12 @@ def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
     area = _shares(len(inside))
     direction = map_directions(len(inside))[inside].double()
     x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
-    shares = []
-    for one in wear:
-        seen = float(area[inside & one.known].sum()) >= HALF * float(area[inside].sum())
-        shares.append(float(area[inside & one.worn].sum()) if seen else math.nan)
+    least = HALF * float(area[inside].sum())
+    seen = [float(area[inside & one.known].sum()) >= least for one in wear]
     return WornPlace(
         longitude_deg=math.degrees(math.atan2(y, x)),
         latitude_deg=math.degrees(math.atan2(z, math.hypot(x, y))),
-        share=tuple(shares),
+        share=tuple(float(area[inside & w.worn].sum()) if s else math.nan for w, s in zip(wear, seen, strict=True)),
     )
 
 
@@ -166,12 +164,12 @@ def connected_places(worn: Tensor) -> Tensor:
     pairs = [(node, np.roll(node, -1, axis=1)), (node[:-1], node[1:])]
     pairs += [(node[row], np.full_like(node[row], node[row][mask[row]].min())) for row in (0, -1) if mask[row].any()]
     a, b = (np.concatenate([pair[k].reshape(-1) for pair in pairs]) for k in (0, 1))
-    joined = mask.reshape(-1)[a] & mask.reshape(-1)[b]
+    joined = mask.flat[a] & mask.flat[b]
     graph = coo_matrix((np.ones(int(joined.sum())), (a[joined], b[joined])), shape=(mask.size, mask.size))
     label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
-    number = np.zeros(mask.size, np.int64)
-    number[mask.reshape(-1)] = np.unique(label[mask.reshape(-1)], return_inverse=True)[1] + 1
-    return torch.from_numpy(number.reshape(mask.shape))
+    number = np.zeros(mask.shape, np.int64)
+    number[mask] = np.unique(label.reshape(mask.shape)[mask], return_inverse=True)[1] + 1
+    return torch.from_numpy(number)
 
 
 @in_style
@@ -213,14 +211,12 @@ def _mark(axes: Axes, series: WearSeries, k: int) -> None:
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
-    at = np.arange(1, len(series.wear) + 1)
-    whole = 100 * np.array([one.worn for one in series.growth])
-    axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of the known area", **ALL.drawn)
+    at = np.arange(len(series.wear) + 1)
+    whole = 100 * np.array([0, *(one.worn for one in series.growth)])
+    axes.plot(at, whole, marker=ALL.marker, label="all, of the known area", **ALL.drawn)
     for number, place in enumerate(series.places[:NAMED], start=1):
-        shares = 100 * np.array([0, *place.share])
-        axes.plot(np.append(0, at), shares, marker=".", linewidth=0.9, label=f"place {number}")
-    axes.set(ylabel="worn (% of the ball)", xticks=np.append(0, at), ylim=(0, None))
-    axes.set_ylim(0, max(LEAST_PERCENT, axes.get_ylim()[1]))
-    axes.set_xticklabels(list(names))
+        axes.plot(at, 100 * np.array([0, *place.share]), marker=".", linewidth=0.9, label=f"place {number}")
+    axes.set_xticks(at, list(names))
+    axes.set(ylabel="worn (% of the ball)", ylim=(0, max(LEAST_PERCENT, axes.get_ylim()[1])))
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.legend(loc="upper left")
