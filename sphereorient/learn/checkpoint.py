@@ -118,15 +118,13 @@ def _checked(tree: Any, name: str) -> Checkpoint:
     content = {key: value for key, value in tree.items() if key != "schema"}
     checkpoint = validated(Checkpoint, content | absent, name, CheckpointError)
     state, known = checkpoint.state, Correlator(checkpoint.settings.network).state_dict()
-    if state.keys() != known.keys():
-        different = ", ".join(sorted(short(key) for key in state.keys() ^ known.keys())[:3])
-        _refuse(f"{name}, state", f"{len(known)} tensors of the network", f"others: {different}", DO)
-    for key, expected in known.items():
-        tensor = state[key]
+    if others := sorted(short(key) for key in state.keys() ^ known.keys()):
+        _refuse(f"{name}, state", f"{len(known)} tensors of the network", f"others: {', '.join(others[:3])}", DO)
+    for key, tensor in state.items():
         if tensor.layout != torch.strided or tensor.dtype != torch.float32:
             _refuse(f"{name}, {key}", "a dense tensor of 32 bit floats", f"{tensor.layout}, {tensor.dtype}", DO)
-        if tensor.shape != expected.shape:
-            _refuse(f"{name}, {key}", f"shape {tuple(expected.shape)}", str(tuple(tensor.shape))[:60], DO)
+        if tensor.shape != (shape := known[key].shape):
+            _refuse(f"{name}, {key}", f"shape {tuple(shape)}", str(tuple(tensor.shape))[:60], DO)
         if not bool(tensor.isfinite().all()):
             _refuse(f"{name}, {key}", "finite numbers", "others", "train it anew")
     return checkpoint

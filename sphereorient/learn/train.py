@@ -161,15 +161,14 @@ class CheckpointCallback(Callback):
         """Add a row to the history, and keep the weights if they are the best."""
         module: ProposerModule = pl_module
         assert module.metrics is not None
-        self.rows.append(
-            {
-                "epoch": float(trainer.current_epoch + (not trainer.sanity_checking)),
-                "step": float(trainer.global_step),
-                "learning_rate": 0.0 if trainer.sanity_checking else module.learning_rate(),
-                **module.training_metrics(),
-                **{f"validation_{name}": value for name, value in asdict(module.metrics).items() if name != "pictures"},
-            }
-        )
+        row = {
+            "epoch": float(trainer.current_epoch + (not trainer.sanity_checking)),
+            "step": float(trainer.global_step),
+            "learning_rate": 0.0 if trainer.sanity_checking else module.learning_rate(),
+            **module.training_metrics(),
+        }
+        row |= {f"validation_{name}": value for name, value in asdict(module.metrics).items() if name != "pictures"}
+        self.rows.append(row)
         with put_aside(self.out / "metrics.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, sorted({key for row in self.rows for key in row}))
             writer.writeheader()
@@ -294,9 +293,9 @@ def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, t
     levels = [logger.level for logger in loggers]
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
             for logger in loggers:
                 logger.setLevel(logging.ERROR)
+            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
             trainer = Trainer(
                 accelerator="gpu" if torch.cuda.is_available() else "cpu",
                 devices=1,

@@ -22,6 +22,7 @@ from sphereorient.preflight.mark import Json, Marking, png
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
+Bools = NDArray[np.bool_]
 MOST_SHAPES = 200
 FAR_PX = 1e5
 
@@ -80,12 +81,11 @@ class MaskMarking(Marking):
     def frame(self, name: str, number: int) -> bytes:
         """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
         movie = self._movie(name)
-        if not 0 <= number < len(movie):
+        if number >= len(movie):
             expected = f"0 .. {len(movie) - 1}"
             raise MovieError(refusal(f"frame {number}", expected=expected, got=str(number), do="choose another"))
         with self.lock:
-            picture = movie.sample([number])[0]
-        return png(eight_bits(picture))
+            return png(eight_bits(movie.sample([number])[0]))
 
     def mask(self, name: str) -> bytes:
         """Return what is hidden now as PNG: red, half transparent, where the mask is black."""
@@ -168,9 +168,7 @@ class MaskMarking(Marking):
         return self.movies[name]
 
 
-def drawn_mask(
-    size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: NDArray[np.bool_] | None
-) -> NDArray[np.bool_]:
+def drawn_mask(size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: Bools | None) -> Bools:
     """Return what a mask (H, W) shows after shapes are drawn, see `MaskMarking.save`; ExperimentError for others."""
     if not isinstance(shapes, list | tuple) or len(shapes) > MOST_SHAPES:
         raise _refused("shapes", f"at most {MOST_SHAPES} of them", "another thing")
@@ -191,11 +189,10 @@ def drawn_mask(
     shown = hidden == 0
     if any(shape["kind"] == "show" for shape in shapes):
         shown &= region > 0
-    if old is not None:
-        shown &= old
+    shown = np.asarray(shown if old is None else shown & old)
     if not shown.any():
         raise _refused("mask", "a part of the picture that is shown", "all of it hidden")
-    return np.asarray(shown)
+    return shown
 
 
 def _numbers(values: object, name: str) -> NDArray[np.float64]:
