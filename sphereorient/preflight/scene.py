@@ -153,9 +153,7 @@ def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser
 
 
 def _sizes(
-    found: Sequence[Mapping[str, Poses]],
-    disks: Sequence[Sequence[Sequence[Outline]]],
-    balls: Mapping[str, Initialiser],
+    found: Sequence[Mapping[str, Poses]], disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]
 ) -> Iterator[Finding]:
     """Compare the diameters of balls that several cameras see with the named ones."""
     ratios: dict[str, float] = {}

@@ -162,12 +162,7 @@ def worst_frames(
 
 
 def _tile(
-    canvas: Canvas,
-    page: Page,
-    k: int,
-    why: Sequence[str],
-    pictures: Mapping[str, Grey | None],
-    corner: tuple[int, int],
+    canvas: Canvas, page: Page, k: int, why: Sequence[str], pictures: Mapping[str, Grey | None], corner: tuple[int, int]
 ) -> None:
     left, top = corner
     canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {page.balls[0].track.time[k]:.4f} s", 14)
