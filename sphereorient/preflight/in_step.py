@@ -138,8 +138,7 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
 def shifts_of(scans: Sequence[OffsetScan]) -> dict[str, float]:
     """Return by how many frames each movie is late, NaN: unknown: of two against the first, of more against most."""
     late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
-    known = [value for value in late.values() if not math.isnan(value)]
-    usual = median_low(known) if len(scans) > 1 else 0.0
+    usual = median_low(value for value in late.values() if not math.isnan(value)) if len(scans) > 1 else 0.0
     return {name: value - usual for name, value in late.items()}
 
 

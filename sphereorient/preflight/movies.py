@@ -108,9 +108,9 @@ def background(sample: MovieSample, experiment: Experiment) -> Finding:
     advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
     if experiment.fixed:
         return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
-    centres = [(outline.u_px, outline.v_px, outline.radius_px) for _, outline in sample.balls]
-    shares = [sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in centres) / len(centres) for u, v, _ in centres]
-    share = max(shares, default=0.0)
+    balls = [(outline.u_px, outline.v_px, outline.radius_px) for _, outline in sample.balls]
+    covers = (sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in balls) / len(balls) for u, v, _ in balls)
+    share = max(covers, default=0.0)
     measured = f"learnt from the movie: the ball covers no pixel in more than {100 * share:.0f} % of the frames"
     return judged(title, measured, (share > STAYS, WARNING, advice))
 
@@ -129,9 +129,9 @@ def exposure(sample: MovieSample) -> Finding:
     signal = (white - black) / max(noise, 1e-9)
     saturated, dark = float(np.mean(grey >= full_scale)), float(np.mean(grey == 0))
     measured = (
-        f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball saturated, "
-        f"{100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
+        f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball saturated"
     )
+    measured += f", {100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
     faint = white - black < RANGE * full_scale or signal < SIGNAL
     alike = "light the ball more, or paint it with more contrast: black and white are hardly apart"
     return judged(

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import PaintError
+from sphereorient.experiment import Sphere
 from sphereorient.experiment.recording import Progress, Recording, load_map
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
@@ -53,7 +53,7 @@ def look_at_scene(
     spheres = recording.experiment.spheres
     missing = [one for one in spheres if one.texture_path is None or not one.texture_path.exists()]
     if missing:
-        return (), [_no_map(sphere.name, sphere.texture_path) for sphere in missing]
+        return (), [_no_map(sphere) for sphere in missing]
     loaded = {path: load_map(path) for path in dict.fromkeys(one.texture_path for one in spheres) if path is not None}
     maps = {one.name: loaded[one.texture_path] for one in spheres if one.texture_path is not None}
     job = Job(recording=replace(recording, maps=maps), settings=settings, device=torch.device("cpu"))
@@ -90,10 +90,11 @@ def look_at_scene(
     return seen, [*_counts(disks, balls), *_found(found, balls), *sizes, *contrasts.values(), *one_paint]
 
 
-def _no_map(name: str, path: Path | None) -> Finding:
+def _no_map(ball: Sphere) -> Finding:
+    path = ball.texture_path
     measured = "no texture map is given" if path is None else f"no texture map: {path} is not there"
-    do = f"learn it with `sphereorient map`, or correct spheres.{name}.texture"
-    return judged(f"paint of ball {name}", measured, (True, FAULT, do))
+    do = f"learn it with `sphereorient map`, or correct spheres.{ball.name}.texture"
+    return judged(f"paint of ball {ball.name}", measured, (True, FAULT, do))
 
 
 def _one_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:

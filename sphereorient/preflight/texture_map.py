@@ -75,12 +75,9 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
     share = texel_areas(len(fine)) / (4 * math.pi)
     deviation = ((fine - (fine * share).sum()).square() * share).sum()
     weight = (map_directions(ROWS).reshape(-1, 3) @ direction.T).clamp_min(0) * area.reshape(-1)
-    brightness = (weight @ small.reshape(-1)) / weight.sum(1)
-    return TextureMeasures(
-        contrast=float(deviation.sqrt()),
-        view_brightness=brightness.reshape(ROWS, 2 * ROWS),
-        patch_rad=_patch_rad(fine.float(), float(mean)),
-    )
+    brightness = ((weight @ small.reshape(-1)) / weight.sum(1)).reshape(ROWS, 2 * ROWS)
+    patch_rad = _patch_rad(fine.float(), float(mean))
+    return TextureMeasures(contrast=float(deviation.sqrt()), view_brightness=brightness, patch_rad=patch_rad)
 
 
 def unknown_paint(unseen: Tensor) -> Finding:
@@ -110,10 +107,8 @@ def contrast(measures: TextureMeasures, radius_px: float) -> Finding:
     """Judge contrast, balance and patches of a map, for a ball of this radius in the pictures."""
     patch_deg, patch_px = math.degrees(measures.patch_rad), measures.patch_rad * radius_px
     low, high = float(measures.view_brightness.min()), float(measures.view_brightness.max())
-    measured = (
-        f"views are {100 * low:.0f} to {100 * high:.0f} % bright; patches of about "
-        f"{patch_deg:.0f} degrees, {patch_px:.0f} px; contrast {measures.contrast:.2f}"
-    )
+    measured = f"views are {100 * low:.0f} to {100 * high:.0f} % bright; patches of about {patch_deg:.0f} degrees, "
+    measured += f"{patch_px:.0f} px; contrast {measures.contrast:.2f}"
     lopsided = low < LOPSIDED[0] or high > LOPSIDED[1]
     faint = "paint with more contrast, or check that the map was exported from black to white"
     fine = "paint larger patches, or bring the ball larger into the picture: such detail is blurred away"

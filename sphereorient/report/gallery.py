@@ -154,25 +154,19 @@ def worst_frames(
         canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
         corner = {k: (BETWEEN + i % columns * across, HEAD + i // columns * down) for i, k in enumerate(bad)}
         for done, (k, pictures) in enumerate(pictures_by_row(streams, np.array(sorted(bad), np.int64)), start=1):
-            _tile(canvas, page, k, bad[k], pictures, corner[k])
+            left, top = corner[k]
+            canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {track.time[k]:.4f} s", 14)
+            _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
+            lines = [line for words in bad[k] for line in textwrap.wrap(words, int(width / LETTER_PX))]
+            if len(lines) > LINES:
+                lines = [*lines[: LINES - 1], f"{lines[LINES - 1]} ..."]
+            colour = ink.INK if bad[k][0].startswith("not in doubt") else ink.DOUBT
+            for row, line in enumerate(lines):
+                canvas.text((left, top + TITLE + TILE + 17 + row * LINE), line, 13, colour)
             progress(done, len(bad))
     with put_aside(path) as aside:
         Image.fromarray(canvas.finished()).save(aside)
     return bad
-
-
-def _tile(
-    canvas: Canvas, page: Page, k: int, why: Sequence[str], pictures: Mapping[str, Grey | None], corner: tuple[int, int]
-) -> None:
-    left, top = corner
-    canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {page.balls[0].track.time[k]:.4f} s", 14)
-    _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
-    lines = [line for words in why for line in textwrap.wrap(words, int(_pairs_size(page)[0] / LETTER_PX))]
-    if len(lines) > LINES:
-        lines = [*lines[: LINES - 1], f"{lines[LINES - 1]} ..."]
-    colour = ink.INK if why[0].startswith("not in doubt") else ink.DOUBT
-    for row, line in enumerate(lines):
-        canvas.text((left, top + TITLE + TILE + 17 + row * LINE), line, 13, colour)
 
 
 def _pairs_size(page: Page) -> tuple[int, int]:

@@ -96,15 +96,15 @@ def prepared(
         got, do = "none", "write --cameras cam1, or leave it out"
         raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
     numbers, streams = streams_of(known[0], experiment, names, opened)
-    return Page(numbers=numbers, balls=[_ball(track, experiment, streams) for track in known]), streams
-
-
-def _ball(track: Trajectory, experiment: Experiment, streams: Mapping[str, CameraStream]) -> Ball:
-    sphere = experiment.of(track.sphere)
-    texture = None if sphere.texture_path is None else load_texture(sphere.texture_path)
-    where = path_of(track, sphere.radius_mm)
-    models = {name: Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams}
-    return Ball(track=track, views=[_view(track, models[name], stream) for name, stream in streams.items()])
+    balls = []
+    for track in known:
+        sphere = experiment.of(track.sphere)
+        texture = None if sphere.texture_path is None else load_texture(sphere.texture_path)
+        where = path_of(track, sphere.radius_mm)
+        models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
+        views = [_view(track, *each) for each in zip(models, streams.values(), strict=True)]
+        balls.append(Ball(track=track, views=views))
+    return Page(numbers=numbers, balls=balls), streams
 
 
 def streams_of(

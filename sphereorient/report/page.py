@@ -39,13 +39,15 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
         what = f"Motion of {len(tracks)} spheres"
     elif len(tracks) > 1:
         what += f", {len(tracks)} tracks compared"
+    around = {key: value for key, value in vars(summary.surroundings).items() if value is not None}
+    settings = summary.settings.model_dump() | {"surroundings": around}
     page = {
         "title": f"{what}: {_some(names)}" if names else what,
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "tiles": _tiles(summary, tracks),
         "each": _each(tables["tracks"]) if len(tracks) > 1 else None,
         "grids": [grid for grid in (*_moments(summary), _flow(tables)) if grid["rows"]],
-        "settings": _settings(summary),
+        "settings": str(yaml.safe_dump(settings, sort_keys=False)).rstrip(),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
         "footer": f"sphereorient {versions()['sphereorient']}; {command}",
     }
@@ -179,10 +181,8 @@ def _moments(summary: Summary) -> list[Grid]:
 
 def _cell(of: Interval, most: int) -> Cell:
     value, low, high = float(of.value), float(of.low), float(of.high)
-    if not math.isfinite(value):
-        return "\u2013", ""
-    if not math.isfinite(low + high):
-        return f"{value:.4g}", ""
+    if not math.isfinite(value + low + high):
+        return f"{value:.4g}" if math.isfinite(value) else "\u2013", ""
     digits = min(decimals(high - low), most)
     return f"{value:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}"
 
@@ -192,11 +192,6 @@ def _flow(tables: Mapping[str, Table]) -> Grid:
     cells = [[(row["name"], ""), (row["formula"], ""), (f"{row['value']:.4g}", "")] for row in rows]
     about = "Components' rms, corrected if the errors are known."
     return {"title": "The sphere and its flow", "about": about, "head": ["", "", "value"], "rows": cells}
-
-
-def _settings(summary: Summary) -> str:
-    around = {key: value for key, value in vars(summary.surroundings).items() if value is not None}
-    return str(yaml.safe_dump(summary.settings.model_dump() | {"surroundings": around}, sort_keys=False)).rstrip()
 
 
 def _provenance(name: str, track: Trajectory) -> dict[str, Any]:

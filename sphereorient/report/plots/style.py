@@ -187,10 +187,8 @@ def interval_text(of: Interval, unit: str = "", factor: float = 1.0) -> str:
     """Return a scalar times `factor` with its interval as text: '0.921 ms (0.905 to 0.938)'."""
     value, low, high = (factor * float(x) for x in (of.value, of.low, of.high))
     behind = f" {unit}" if unit else ""
-    if not math.isfinite(value):
-        return "unknown"
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return f"{value:.3g}{behind}"
+    if not math.isfinite(value + low + high):
+        return f"{value:.3g}{behind}" if math.isfinite(value) else "unknown"
     places = decimals(high - low)
     return f"{value:.{places}f}{behind} ({low:.{places}f} to {high:.{places}f})"
 
