@@ -128,10 +128,8 @@ def exposure(sample: MovieSample) -> Finding:
     black, white = np.percentile(grey, [5, 95])
     signal = (white - black) / max(noise, 1e-9)
     saturated, dark = float(np.mean(grey >= full_scale)), float(np.mean(grey == 0))
-    measured = (
-        f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball saturated"
-    )
-    measured += f", {100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
+    measured = f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball "
+    measured += f"saturated, {100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
     faint = white - black < RANGE * full_scale or signal < SIGNAL
     alike = "light the ball more, or paint it with more contrast: black and white are hardly apart"
     return judged(

@@ -62,8 +62,9 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
             ("isotropy", f"shares of the variance, {level}", _each(more.isotropies, _isotropy)),
             ("kernel_widths", f"rms and flatness by kernel width, {level}", _each(more.widths, _width)),
             ("multi_lag", f"rms without noise by many lags, {level}", _each(more.multi_lag, _multi_lag)),
-            ("lift", f"a against omega x v, {level}", _lift(more)),
         ]
+        tabled = {name: of for name, of in vars(more).items() if hasattr(of, "columns")}
+        found += [(name, f"{of.about}, {level}", _rows(**of.columns())) for name, of in tabled.items()]
     tables = [Table(name=name, about=about, rows=list(rows)) for name, about, rows in found]
     return [table for table in tables if table.rows]
 
@@ -244,8 +245,3 @@ def _angles(more: Distributions) -> Iterator[Row]:
         edges = np.rad2deg(of.edges_rad)
         densities = {"pdf_per_rad": of.pdf, "uniform_pdf_per_rad": of.uniform}
         yield from _rows(angle=of.name, from_deg=edges[:-1], to_deg=edges[1:], **densities)
-
-
-def _lift(more: Distributions) -> Iterator[Row]:
-    if more.lift is not None:
-        yield from _rows(component=VECTOR, correlation=more.lift.correlation, coefficient=more.lift.coefficient)
