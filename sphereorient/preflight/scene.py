@@ -85,9 +85,9 @@ def look_at_scene(
     }
     if len(loaded) > 1:
         contrasts = {name: replace(one, title=f"{one.title} {name}") for name, one in contrasts.items()}
-    one_paint = _one_paint({path.name: one.grey for path, one in loaded.items()}, progress)
-    sizes = _sizes(found, disks, balls)
-    return seen, [*_counts(disks, balls), *_found(found, balls), *sizes, *contrasts.values(), *one_paint]
+    one_paint = same_paint({path.name: one.grey for path, one in loaded.items()}, progress)
+    sizes = ball_sizes(found, disks, balls)
+    return seen, [*disk_counts(disks, balls), *found_balls(found, balls), *sizes, *contrasts.values(), *one_paint]
 
 
 def _no_map(ball: Sphere) -> Finding:
@@ -97,7 +97,7 @@ def _no_map(ball: Sphere) -> Finding:
     return judged(f"paint of ball {ball.name}", measured, (True, FAULT, do))
 
 
-def _one_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
+def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
     """Tell maps of two files that show one paint, in any body frames: balls that wear it look alike."""
     pairs = list(combinations(maps, 2))
     for k, (one, other) in enumerate(pairs):
@@ -131,7 +131,7 @@ def _least_px(balls: Mapping[str, Initialiser]) -> float:
     return min(view.diameter_px / 2 for one in balls.values() for view in one.fitter.views)
 
 
-def _counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+def disk_counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
     """Compare the number of disks of each camera with the number of balls."""
     for c, view in enumerate(next(iter(balls.values())).fitter.views):
         counts = [len(one[c]) for one in disks]
@@ -142,7 +142,7 @@ def _counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, In
         yield judged(f"balls {view.name}", measured, *complaints)
 
 
-def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+def found_balls(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
     """Count the frames in which each ball is found by its paint."""
     for name in balls:
         count = sum(len(one[name]) > 0 for one in found)
@@ -153,7 +153,7 @@ def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser
         yield judged(f"ball {name}", measured, *complaints)
 
 
-def _sizes(
+def ball_sizes(
     found: Sequence[Mapping[str, Poses]], disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]
 ) -> Iterator[Finding]:
     """Compare the diameters of balls that several cameras see with the named ones."""

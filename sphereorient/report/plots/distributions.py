@@ -54,11 +54,10 @@ def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS))
         got, do = f"{summary.ensemble.segments}", "pass more tracks, or cut a long one with statistics.max_duration_s"
         raise TrackError(refusal("densities", expected="two segments or more", got=got, do=do))
     figure, panels = look.panel_grid(len(quantities), 2.7, 0.5, shared=True)
-    drawn = [summary.distributions.densities[quantity] for quantity in quantities]
-    for axes, quantity, densities in zip(panels, quantities, drawn, strict=True):
+    drawn = {quantity: summary.distributions.densities[quantity] for quantity in quantities}
+    counted = [density for densities in drawn.values() for density in densities]
+    for axes, (quantity, densities) in zip(panels, drawn.items(), strict=True):
         _densities_panel(axes, quantity, densities)
-    counted = [density for densities in drawn for density in densities]
-    for axes in panels:
         axes.set(xlim=_reach(counted), ylim=(_lowest(counted) / 3, 2.0))
     columns = min(2, len(quantities))
     for axes in panels[-columns:]:
@@ -79,11 +78,10 @@ def _densities_panel(axes: Axes, quantity: str, densities: Sequence[Density]) ->
     for style, density in zip(look.COMPONENTS, densities, strict=True):
         there = density.counts > 0
         look.points(axes, density.centres[there], density.pdf.part(there), style)
-        fit = density.fit
+        fit, a = density.fit, float(density.fit.a.value)
         label = f"{style.name}: a = {look.interval_text(fit.a)}, F = {look.three_digits(float(fit.flatness.value))}"
         x = np.linspace(density.edges[0], density.edges[-1], CURVE_POINTS)
-        known = np.isfinite(fit.a.value)
-        y = stretched_exponential(x, float(fit.a.value)) if known else np.full_like(x, np.nan)
+        y = stretched_exponential(x, a) if np.isfinite(a) else np.full_like(x, np.nan)
         axes.plot(x, y, label=label, **(style.drawn | {"linewidth": 0.9}))
         handles.append(style.handle(label, marker=style.marker, linewidth=0.9))
     _gaussian(axes, densities[0])
@@ -117,8 +115,7 @@ def increments_figure(distributions: Distributions, table: Mapping[str, Moments]
     figure = look.new_figure(look.WIDTH_IN, 4.6)
     left, right = figure.subplots(1, 2)
     _shifted_densities(left, distributions)
-    steps = distributions.increments
-    lag_ms = 1e3 * steps.lag_s
+    steps, lag_ms = distributions.increments, 1e3 * distributions.increments.lag_s
     for i, style in enumerate(FOUR):
         of = steps.flatness.part((slice(None), i))
         look.curve(right, lag_ms, of, style, marker=style.marker, label=style.name)

@@ -62,8 +62,8 @@ def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Fig
     panels[0].set(ylabel="PDF (1/degree)", ylim=(0.0, None))
     bins = look.PLAIN.handle("bins with intervals", marker="o", linestyle="none")
     look.legend_of_figure(figure, [bins, look.SECOND.handle("all attitudes equally likely")], ncols=2)
-    words = "uniformity of the attitudes could not be tested"
-    if np.isfinite((of := uniformity).p_value):
+    words, of = "uniformity of the attitudes could not be tested", uniformity
+    if np.isfinite(of.p_value):
         found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
         words = f"{found}: {look.p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames "
         words += f"in {of.segments:,} segments, worth {of.effective:,.0f} independent attitudes"
@@ -117,11 +117,9 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
     axes.grid(visible=False, axis="x")
     axes.set(xlabel="vector and its frame (–)", ylabel=NOISE_WORDS[error])
     top = max([100 * WARN_SHARE, *(float(np.nan_to_num([s.value, s.high]).max()) for s in shares)])
+    axes.set(yscale="log" if floor else "linear", ylim=(floor, (1.5 if floor else 1.2) * top))
     if floor:
-        axes.set(yscale="log", ylim=(floor, 1.5 * top))
         look.plain_logarithms(axes.yaxis)
-    else:
-        axes.set_ylim(0.0, 1.2 * top)
     look.legend_above(axes, ncols=4, handles=[*bars, limit])
     if not any(np.isfinite(share.value).any() for share in shares):
         look.say_empty(axes, "the errors of this track are unknown")

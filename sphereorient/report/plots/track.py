@@ -147,12 +147,10 @@ def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> TrackPart:
     """Return the whole track, or the `most` consecutive frames of its longest segment that have the most valid ones."""
     rows, words = np.arange(len(track)), ""
     if len(track) > most:
-        inside = np.flatnonzero(track.segment >= 0)
-        if len(inside):
-            labels, counts = np.unique(track.segment[inside], return_counts=True)
-            rows = np.flatnonzero(track.segment == labels[counts.argmax()])
-        which = "the longest segment" if len(rows) <= most else f"the best {most:,} frames of the longest segment"
-        which = which if len(inside) else "none of them in a segment"
+        which = "none of them in a segment"
+        if (frames := np.bincount(track.segment + 1)[1:]).any():
+            rows = np.flatnonzero(track.segment == frames.argmax())
+            which = "the longest segment" if len(rows) <= most else f"the best {most:,} frames of the longest segment"
         if len(rows) > most:
             total = np.concatenate([[0], np.cumsum(track.valid[rows])])
             start = int((total[most:] - total[:-most]).argmax())
@@ -192,8 +190,7 @@ def tait_bryan_deg(R_lab_body: Floats) -> Floats:
 def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
     """Return the sigmas of the angles (N, 3), degrees; NaN near the poles. Source: docs/errata.md E3."""
     theta = np.deg2rad(tait_bryan_deg(R_lab_body))
-    there = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02)
-    out = np.full_like(theta, np.nan)
+    there, out = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02), np.full_like(theta, np.nan)
     inverse = np.linalg.inv(so3.rate_matrix_lab(torch.from_numpy(theta[there])).numpy())
     out[there] = np.rad2deg(_sigma(inverse @ cov_lab_rad2[there] @ inverse.swapaxes(1, 2)))
     return out
@@ -207,9 +204,8 @@ def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDA
     """Draw three components (N, 3) and limit the axis to them: bands are far wider at the ends of segments."""
     for i in range(3):
         _curve(axes, time, values[:, i], sigma[:, i], broken, i)
-    known = values[np.isfinite(values)]
+    known, errors = values[np.isfinite(values)], sigma[np.isfinite(sigma)]
     if len(known):
-        errors = sigma[np.isfinite(sigma)]
         rest = 0.05 * float(np.ptp(known)) + (SIGMAS * float(np.median(errors)) if len(errors) else 0.0)
         rest = rest or 0.05 * abs(float(known[0])) or 1.0
         axes.set_ylim(float(known.min()) - rest, float(known.max()) + rest)
@@ -229,8 +225,6 @@ def _dots(axes: Axes, time: Floats, values: Floats) -> None:
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
-    if not len(known):
-        return
     chosen = known[look.spread(len(known), TRIPODS)]
     start = track.position_smooth[chosen]
     for i, style in enumerate(look.COMPONENTS):
