@@ -85,10 +85,7 @@ def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
     axes.set_xticks(np.arange(len(labels)), labels)
     axes.grid(visible=False, axis="x")
     axes.set(xlabel="vector and its frame, p-value of isotropy (–)", ylabel="share in the variance (%)")
-    if isotropies:
-        axes.set_xlim(-0.5, len(labels) - 0.5)
-    else:
-        look.say_empty(axes)
+    axes.set_xlim(-0.5, len(labels) - 0.5)
     handles = [style.handle(style.name, marker=style.marker, linestyle="none") for style in look.COMPONENTS]
     look.legend_of_figure(figure, [*handles, look.SECOND.handle("isotropic: a third")], ncols=4)
     return figure
@@ -133,8 +130,8 @@ def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
     Source: Voth et al. 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
     shown = [name for name in WIDTHS_OF if name in widths] or list(widths)[:1]
-    figure = look.new_figure(look.WIDTH_IN * max(len(shown), 1) / 2, 6.6)
-    panels = figure.subplots(3, max(len(shown), 1), sharex="col", squeeze=False)
+    figure = look.new_figure(look.WIDTH_IN * len(shown) / 2, 6.6)
+    panels = figure.subplots(3, len(shown), sharex="col", squeeze=False)
     for column, name in zip(panels.T, shown, strict=True):
         _widths_column(column, widths[name])
     figure.align_ylabels()
@@ -175,13 +172,10 @@ def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
     Both axes are logarithmic if even bins would show the smaller distances as one bar; the PDF is per degree.
     Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
     """
-    figure = look.new_figure(look.WIDTH_IN * 0.7, 2.9 * max(len(distances), 1))
-    panels = figure.subplots(max(len(distances), 1), 1, squeeze=False)[:, 0]
-    for axes in panels:
+    figure = look.new_figure(look.WIDTH_IN * 0.7, 2.9 * len(distances))
+    panels = figure.subplots(len(distances), 1, squeeze=False)[:, 0]
+    for axes, distance in zip(panels, distances, strict=True):
         axes.set(xlabel="distance of two cameras' orientations (degrees)", ylabel="PDF (1/degree)")
-    if not distances:
-        look.say_empty(panels[0], "no two cameras to compare")
-    for axes, distance in zip(panels, distances, strict=False):
         _distance_panel(axes, distance)
     return figure
 

@@ -92,8 +92,8 @@ def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.0) -> Figure:
 
 def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
     """Return a figure of `count` panels, at most two in a row, `row_in` inches high, with room for a head."""
-    columns = min(2, max(count, 1))
-    rows = max(-(-count // columns), 1)
+    columns = min(2, count)
+    rows = -(-count // columns)
     figure = new_figure(WIDTH_IN * columns / 2, head_in + row_in * rows)
     panels = np.ravel(figure.subplots(rows, columns, sharex=shared, sharey=shared, squeeze=False))
     for axes in panels[count:]:
