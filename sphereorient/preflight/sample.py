@@ -104,8 +104,8 @@ def sample_movie(
     """
     frame = np.asarray(frames_to_sample(len(stream)), np.int64)
     picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
-    shown = [one for one in picture if one is not None and not uniform(one)]
-    shown = shown or [one for one in picture if one is not None]
+    known = [one for one in picture if one is not None]
+    shown = [one for one in known if not uniform(one)] or known
     if not shown:
         do = "check that it plays; export it again if not"
         raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))

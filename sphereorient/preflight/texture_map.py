@@ -191,15 +191,8 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
         assert outline is not None
         crops.append(crop_disk(picture, outline.u_px, outline.v_px, outline.radius_px, search.size_px))
     disks = torch.from_numpy(np.stack(crops))
-    return TextureMatch(name=sample.name, score=_best(search, disks), mirrored=_best(search, disks.flip(-1)))
-
-
-def _best(search: GreySearch, disks: Tensor) -> Tensor:
-    """Return the best score for each disk (n, S, S), (n,)."""
-    found = search.propose(disks)
-    there, score = found.counts > 0, torch.zeros(len(disks), dtype=torch.float64)
-    score[there] = found.score[found.offset[:-1][there]]
-    return score
+    score, mirrored = (search.propose(each).best_score for each in (disks, disks.flip(-1)))
+    return TextureMatch(name=sample.name, score=score, mirrored=mirrored)
 
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:

@@ -102,7 +102,8 @@ def _write_mat(job: Export) -> None:
     track = job.track
     job.progress(0, len(track))  # SciPy writes in one step
     content = _mat_arrays(track)
-    content["cameras"] = {name: _mat_arrays(camera) for name, camera in table.safe_names(track).items()}
+    seen = table.safe_names(track).items()
+    content["cameras"] = {name: _mat_arrays(camera) | {"reason": table.reasons(camera)} for name, camera in seen}
     about = table.metadata(track)
     content["metadata"] = {
         **{key: about[key] for key in ("experiment", "method", "frame_rate_hz", "settings", "flags")},
@@ -121,8 +122,6 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
         arrays[table.with_unit(dataset.name, dataset.units)] = dataset.values
         if dataset.rotation:
             arrays[dataset.name.replace("orientation", "quat_wxyz", 1)] = quaternions_wxyz(dataset.values)
-    if isinstance(record, CameraTrack):
-        arrays["reason"] = table.reasons(record)
     return arrays
 
 
@@ -131,9 +130,8 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
     Column 5, an error of its own, is the root mean square of the stated errors, rad. NaN where there is no pose.
     """
     R, ms, walk = track.posed, 1e3 * track.time, track.walk()
-    count = np.arange(len(R))
+    count, step_s = np.arange(len(R)), np.diff(track.time, prepend=np.nan)
     begin = np.maximum.accumulate(np.where(walk.start, count, 0))
-    step_s = np.diff(track.time, prepend=np.nan)
     ahead, right = walk.forward_rad_s * step_s, walk.side_rad_s * step_s
     stretch = np.where(np.isfinite(walk.heading_rad), 0.0, np.nan)
     total = np.nancumsum(np.stack([ahead, right], axis=1), axis=0)
@@ -176,10 +174,8 @@ def _write_vtk(job: Export) -> None:
     """Write VTKHDF, a time series for ParaView: the ball's centre, a point in each valid frame, with its vectors.
     Source: the file format of VTK 9.3, transient poly data.
     """
-    track = job.track
-    some = track.valid
-    count = int(some.sum())
-    R, time, position = track.orientation[some], track.time[some], track.position[some]
+    track, some = job.track, job.track.valid
+    count, R = int(some.sum()), track.orientation[some]
     parts = {
         **{f"body_{axis}": R[:, :, k] for k, axis in enumerate("xyz")},
         "quaternion_wxyz": quaternions_wxyz(R),
@@ -192,13 +188,12 @@ def _write_vtk(job: Export) -> None:
     with h5py.File(job.path, "w") as file:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array([2, 0])
-        kind = np.bytes_("PolyData")
-        root.attrs.create("Type", kind, dtype=h5py.string_dtype("ascii", len(kind)))
+        root.attrs.create("Type", np.bytes_("PolyData"), dtype=h5py.string_dtype("ascii", 8))
         root["NumberOfPoints"] = np.ones(count, np.int64)
-        root["Points"] = position
+        root["Points"] = track.position[some]
         steps = root.create_group("Steps")
         steps.attrs["NSteps"] = count
-        steps["Values"] = time
+        steps["Values"] = track.time[some]
         steps["PartOffsets"], steps["NumberOfParts"] = frame, np.ones(count, np.int64)
         steps["PointOffsets"] = frame
         # Each part has one vertex, and nothing else.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera
-from sphereorient.errors import TextureError, refusal
 from sphereorient.movies import Grey
 from sphereorient.pose.lights.disk import DiskLight, light_basis, solved_light
 from sphereorient.preflight.cameras import expected_outline_px
@@ -117,9 +116,7 @@ class Model:
 
     def look(self, k: int, window: CropWindow) -> SeenDisk:
         """Return paint and places in a window of frame k, the mean of finer samples, ports included."""
-        if self.texture is None:
-            do = "draw the track of an experiment with a texture"
-            raise TextureError(refusal("model", expected="a map of the paint", got="none", do=do))
+        assert self.texture is not None  # without a map no light is fitted, and nothing is rendered
         rays = self.camera.rays(torch.from_numpy(window.grid_px(FINE)))
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
         seen = see_sphere(rays, centre, R, self.texture, self.path.radius_mm)
