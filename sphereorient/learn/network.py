@@ -59,9 +59,8 @@ class PictureNetwork(nn.Module):
     def forward(self, disks: Tensor) -> Tensor:
         """Return features (F, C, S/2, S/2) of disks (F, S, S), grey levels of any scale."""
         share = self.share / self.share.sum()
-        mean = (disks * share).sum((1, 2), keepdim=True)
-        deviation = ((disks - mean).square() * share).sum((1, 2), keepdim=True).sqrt().clamp_min(1e-6)
-        even = (disks - mean) / deviation
+        less = disks - (disks * share).sum((1, 2), keepdim=True)
+        even = less / (less.square() * share).sum((1, 2), keepdim=True).sqrt().clamp_min(1e-6)
         about = self.along @ (even * self.share) @ self.along / self.total
         local = (even - about) * (self.share > 0)
         rim = self.radius.expand_as(even)

@@ -36,7 +36,7 @@ LENGTH = ("epochs", "minutes", "patience")  # may change when training is resume
 LAST = "last.ckpt"
 VALIDATION_MAPS = 24
 TRAINING, VALIDATION = 0, 1  # random streams: no picture occurs in both
-VALIDATION_GROUPS, VALIDATION_GROUP = 2, 8  # pictures of a validation batch, which has one map
+VALIDATION_SHAPE = 1, 2, 8  # of a validation batch: maps, groups of each, pictures of a group
 WARM_UP_STEPS = 100  # of the learning rate; at most a tenth of all steps
 RECALL_EVERY = 10  # steps between measurements of the recall on training pictures
 Row = dict[str, float]
@@ -52,9 +52,8 @@ class TrainingData(LightningDataModule):
         self.textures = make_textures(pictures, nodes, count=pictures.textures, first_seed=0)
         unseen = make_textures(pictures, nodes, count=VALIDATION_MAPS, first_seed=VALIDATION_SEED)
         rng = generator_of(settings.training.seed, VALIDATION)
-        shape = 1, VALIDATION_GROUPS, VALIDATION_GROUP
-        count = -(-pictures.validation // math.prod(shape))
-        self.validation = [draw_batch(unseen, pictures, rng, shape) for _ in range(count)]
+        count = -(-pictures.validation // math.prod(VALIDATION_SHAPE))
+        self.validation = [draw_batch(unseen, pictures, rng, VALIDATION_SHAPE) for _ in range(count)]
 
     def training_batch(self, epoch: int, step: int) -> TrainingBatch:
         """Draw the batch of a step."""

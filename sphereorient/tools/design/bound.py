@@ -75,7 +75,6 @@ def cramer_rao_bound(
     Raises:
         ShapeError: orientations that are not 3 x 3, or a map that is not 2:1.
         SettingsError: a diameter, noise or supersampling that is not positive.
-
     Source: docs/errata.md, The bound.
     """
     check_tail("R_view_body", R_view_body, 3, 3)

@@ -87,9 +87,8 @@ def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
     """Draw the strips at true size; not `filled`: only the borders between black and white, to be cut out or traced."""
     (width, height), (equator, meridian) = gores.sheet_mm, gores.size_mm
     figure = Figure(figsize=(width * MM, height * MM))
-    axes = figure.add_axes((0, 0, 1, 1))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2))
     axes.set_axis_off()
-    axes.set(xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2))
     for strip, (outline, middle_rad) in enumerate(zip(gores.outline_mm(), gores.middles_rad(), strict=True)):
         x, y, grey = _gore_texture(gores, texture, strip)
         if filled:
@@ -133,4 +132,4 @@ def instructions(gores: Gores) -> str:
     sizes = {"width": width, "height": height, "sheet_width": sheet[0], "sheet_height": sheet[1]}
     errors = {"stretch": 100 * (math.hypot(1, slope) - 1), "turn": math.degrees(math.atan(slope))}
     text = Path(__file__).with_name("gores.txt").read_text(encoding="utf-8")
-    return text.format(count=gores.count, diameter_mm=gores.diameter_mm, **sizes, **errors)
+    return text.format(**vars(gores), **sizes, **errors)

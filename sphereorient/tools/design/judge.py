@@ -178,11 +178,9 @@ def design_texture(
     judged = []
     for _, kind, size, own_seed in sorted(found)[:FINALISTS]:
         texture = patterns.patterned_texture(kind, size, own_seed)
-        judgement = judge_texture(texture, settings)
-        cost = float(judgement.bound_rad.amax()) / max(judgement.margin, 1e-3)
-        judged.append((cost, texture, judgement, f"{kind} of {size:.1f} degrees, seed {own_seed}"))
-    _, texture, judgement, words = min(judged, key=lambda one: one[0])
-    return texture, judgement, words
+        words = f"{kind} of {size:.1f} degrees, seed {own_seed}"
+        judged.append((texture, judge_texture(texture, settings), words))
+    return min(judged, key=lambda one: float(one[1].bound_rad.amax()) / max(one[1].margin, 1e-3))
 
 
 def _white(texture: Tensor, R_view_body: Tensor) -> Tensor:

@@ -31,12 +31,11 @@ def view_directions(count: int) -> Tensor:
 
 def facing(direction_body: Tensor) -> Tensor:
     """Return R_view_body (..., 3, 3) that turn directions (..., 3) to the camera, north (at a pole: +x) up."""
-    x, y, z = torch.nn.functional.normalize(direction_body, dim=-1).unbind(-1)
-    level = torch.hypot(x, y)
-    polar = level < 1e-9
+    outward = torch.nn.functional.normalize(direction_body, dim=-1)
+    x, y, _ = outward.unbind(-1)
+    polar = torch.hypot(x, y) < 1e-9
     east = torch.stack([torch.where(polar, 0.0, -y), torch.where(polar, 1.0, x), torch.zeros_like(x)], -1)
     east = torch.nn.functional.normalize(east, dim=-1)
-    outward = torch.stack([x, y, z], -1)
     return torch.stack([east, -torch.linalg.cross(outward, east), -outward], dim=-2)
 
 
@@ -99,9 +98,9 @@ def _blobs(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
     phase = 2 * math.pi * torch.rand(WAVES, generator=rng, dtype=torch.float64)
     value = torch.cos(map_directions(height) @ wave.T + phase).sum(-1)
     area = torch.cos((torch.arange(height, dtype=torch.float64) + 0.5) * math.pi / height - math.pi / 2)
-    order = value.flatten().argsort()
+    ranked, order = value.flatten().sort()
     share = area[:, None].expand(-1, 2 * height).flatten()[order].cumsum(0)
-    median = value.flatten()[order][int(torch.searchsorted(share, 0.5 * share[-1]))]
+    median = ranked[int(torch.searchsorted(share, 0.5 * share[-1]))]
     slope = number * math.sqrt(WAVES / 2) / math.sqrt(3)  # rms of the slope along a line, per radian
     return (0.5 + (value - median) / (slope * math.pi / height * 2)).clamp(0, 1).float()
 
@@ -110,9 +109,8 @@ def _patches(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
     """Draw the Voronoi cells of spread points, half of them black and half white, at random."""
     count = max(4, round(4 * math.pi / size_rad**2))
     points = _apart(random_directions(count, rng))
-    white = torch.randperm(count, generator=rng) % 2
-    owner = (map_directions(height).float() @ points.T.float()).argmax(-1)
-    return white[owner].float()
+    white = (torch.randperm(count, generator=rng) % 2).float()
+    return white[(map_directions(height).float() @ points.T.float()).argmax(-1)]
 
 
 def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
@@ -120,8 +118,7 @@ def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
     count = max(4, round(4 * math.pi / (1.9 * size_rad) ** 2))
     points = _apart(random_directions(count, rng))
     radius = 0.5 * size_rad * (2 + 2 * torch.rand(count, generator=rng, dtype=torch.float64)) / 3
-    away = torch.full((height, 2 * height), torch.inf, dtype=torch.float64)
-    directions = map_directions(height)
+    directions, away = map_directions(height), torch.full((height, 2 * height), torch.inf, dtype=torch.float64)
     for point, own in zip(points, radius, strict=True):
         away = torch.minimum(away, torch.acos((directions @ point).clamp(-1, 1)) - own)
     return (0.5 + away * height / math.pi).clamp(0, 1).float()

@@ -107,13 +107,11 @@ def _searched(
     disks: Tensor, time_s: Tensor, texture: Tensor | DotTable, settings: SpinSettings, progress: Progress, stage: str
 ) -> tuple[Candidates, PictureCandidates]:
     """Search each disk alone."""
-    search: Proposer = (
-        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else GreySearch(texture, settings.search)
-    )
-    parts = []
-    for some in torch.split(torch.arange(len(disks)), AT_ONCE):
-        progress(stage, int(some[0]), len(disks))
-        parts.append(search.propose(disks[some]))
+    of, parts = settings.search, []
+    search: Proposer = DotSearch(texture, of) if isinstance(texture, DotTable) else GreySearch(texture, of)
+    for first in range(0, len(disks), AT_ONCE):
+        progress(stage, first, len(disks))
+        parts.append(search.propose(disks[first : first + AT_ONCE]))
     progress(stage, len(disks), len(disks))
     alone = Candidates.joined(parts)
     return alone, fit.picture_candidates(time_s, alone.offset, alone.R_view_body, alone.score.square())
@@ -136,12 +134,10 @@ def _greatest(spins: Spins) -> float:
 
 def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Refine each disk's own orientation (F, 3, 3) float64 from a given one; return also its score (F,)."""
-    each = [
-        refine_rotation(level, level_reference(level, disk), R[None].float(), steps)
-        for disk, R in zip(disks, R_view_body, strict=True)
-    ]
-    R = torch.cat([R for R, _ in each]).double()
-    return so3.nearest_rotation(R), torch.cat([score for _, score in each]).double()
+    pairs = zip(disks, R_view_body, strict=True)
+    each = [refine_rotation(level, level_reference(level, disk), R[None].float(), steps) for disk, R in pairs]
+    R, score = (torch.cat(parts).double() for parts in zip(*each, strict=True))
+    return so3.nearest_rotation(R), score
 
 
 @in_style
@@ -157,11 +153,11 @@ def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequen
         each.set_axis_off()
     inside = torch.isfinite(predicted[0])
     for place, k in enumerate(chosen):
-        row, column = 2 * (place // COLUMNS), place % COLUMNS
+        filmed, drawn = axes[2 * (place // COLUMNS) :, place % COLUMNS][:2]
         disk = torch.where(inside, found.disks[k], torch.nan)
-        axes[row, column].imshow(disk.numpy(), cmap="gray", interpolation="nearest")
-        axes[row + 1, column].imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
+        filmed.imshow(disk.numpy(), cmap="gray", interpolation="nearest")
+        drawn.imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
         off = float(found.residual_rad[k])
         words = f"{math.degrees(off):.1f}° off" if math.isfinite(off) else "no attitude"
-        axes[row, column].set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
+        filmed.set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
     return figure

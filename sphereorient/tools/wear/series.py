@@ -135,8 +135,8 @@ def _figures(now: Wear, before: Wear | None) -> WearFigures:
         total = float(area[whole].sum())
         return float(area[part & whole].sum()) / total if total else math.nan
 
-    worn = share(now.worn, now.known)
-    grown, stays = worn, math.nan
+    worn = grown = share(now.worn, now.known)
+    stays = math.nan
     if before is not None:
         both = now.known & before.known
         grown = share(now.worn, both) - share(before.worn, both)
