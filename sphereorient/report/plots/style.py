@@ -25,8 +25,8 @@ from sphereorient.trajectory.trajectory import COLOURS
 
 Floats = NDArray[np.float64]
 Plan = tuple[str, str, str, Callable[[], Figure]]  # a figure of a report: name, title, caption, function
-Tracks = Mapping[str, Trajectory]  # by file name
-Reported = tuple[Summary, Tracks, Sequence[CameraDistance]]  # what a report is of
+ByFile = Mapping[str, Trajectory]  # tracks by the name of their file
+Reported = tuple[Summary, ByFile, Sequence[CameraDistance]]  # what a report is of
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
@@ -172,7 +172,7 @@ def say_empty(axes: Any, words: str = "nothing measured") -> None:
     write(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
 
 
-def of_tracks(names: Iterable[str], tracks: Tracks) -> str:
+def of_tracks(names: Iterable[str], tracks: ByFile) -> str:
     """Return the label of some of the tracks in a title; empty if there is only one."""
     return "" if len(tracks) == 1 else f" of {', '.join(names)}"
 
