@@ -66,7 +66,8 @@ def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
     for k in [liveliest, *order]:
         begin = min(max(0, starts[k] - STRETCH // 2), max(0, count - STRETCH))
         one = range(begin, min(begin + STRETCH, count))
-        stretches += [] if any({*one} & {*other} for other in stretches) else [one]
+        if not any({*one} & {*other} for other in stretches):
+            stretches.append(one)
     return stretches[:STRETCHES]
 
 

@@ -189,7 +189,8 @@ def _profiles(
     for one, k in zip(share, last, strict=True):
         if 0 < k < len(offset) - 1:
             crossing = offset[k] + FINE * (one[k] - 0.5) / max(one[k] - one[k + 1], 1e-9)
-            shifted += [np.interp(offset + crossing, offset, one)] if abs(crossing) < 2.5 else []
+            if abs(crossing) < 2.5:
+                shifted.append(np.interp(offset + crossing, offset, one))
     return np.asarray(shifted).reshape(-1, len(offset))
 
 

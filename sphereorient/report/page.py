@@ -202,5 +202,6 @@ def _provenance(name: str, track: Trajectory) -> dict[str, Any]:
             text = ", ".join(f"{inner} {entry}" for inner, entry in value.items())
         elif isinstance(value, list | tuple):
             text = "; ".join(map(str, value))
-        entries += [(str(key), text)] if text else []
+        if text:
+            entries.append((str(key), text))
     return {"name": name, "entries": entries, "settings": track.settings.rstrip()}

@@ -34,7 +34,7 @@ COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: in a row, and altogeth
 class SpinSettings(BaseModel, frozen=True, extra="forbid"):
     """How a spin is searched in photographs."""
 
-    omega_max_rad_s: float = Field(2 * math.pi * 300, gt=0, description="fastest spin, rad/s, of those reported")
+    omega_max_rad_s: float = Field(2 * math.pi * 300, gt=0, description="rad/s; all aliases below it are reported")
     search: GreySearchSettings = Field(DOT_SEARCH, description="of attitudes in each photograph alone")
 
 

@@ -149,11 +149,14 @@ def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
     direction = map_directions(len(inside))[inside].double()
     x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
     least = HALF * float(area[inside].sum())
-    seen = [float(area[inside & one.known].sum()) >= least for one in wear]
+    shares = []
+    for one in wear:
+        seen = float(area[inside & one.known].sum()) >= least
+        shares.append(float(area[inside & one.worn].sum()) if seen else math.nan)
     return WornPlace(
         longitude_deg=math.degrees(math.atan2(y, x)),
         latitude_deg=math.degrees(math.atan2(z, math.hypot(x, y))),
-        share=tuple(float(area[inside & w.worn].sum()) if s else math.nan for w, s in zip(wear, seen, strict=True)),
+        share=tuple(shares),
     )
 
 
