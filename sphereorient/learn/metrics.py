@@ -225,10 +225,16 @@ def make_examples(checkpoint: Checkpoint, count: int, shown: int = 4, seed: int 
         logits = network(disk, maps.blurs[k % len(maps.blurs)])
         modes = find_modes(logits, network.grid, shown, checkpoint.temperature)
         proposed = modes.R_view_body[0]
-        views = clean_views(texture, torch.cat([R, proposed]), disk.shape[-1])
-        off_deg = torch.rad2deg(so3.geodesic_distance(proposed.double(), R.double()))
-        paint = {"disk": disk[0], "true_view": views[0], "proposed_view": views[1:]}
-        examples.append(Example(degradations=tuple(values), **paint, probability=modes.probability[0], off_deg=off_deg))
+        examples.append(
+            Example(
+                degradations=tuple(values),
+                disk=disk[0],
+                true_view=clean_views(texture, R, disk.shape[-1])[0],
+                proposed_view=clean_views(texture, proposed, disk.shape[-1]),
+                probability=modes.probability[0],
+                off_deg=torch.rad2deg(so3.geodesic_distance(proposed.double(), R.double())),
+            )
+        )
     return tuple(examples)
 
 
