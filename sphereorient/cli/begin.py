@@ -88,7 +88,7 @@ def mark(
 
 def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: float | None, quiet: bool) -> None:
     from sphereorient.experiment.experiment import MAX_CAMERAS
-    from sphereorient.preflight.draft import camera_keys
+    from sphereorient.preflight.first_look import camera_keys
 
     if len(movies) > MAX_CAMERAS:
         do = "name those of one ball; track others as experiments of their own"
@@ -110,8 +110,8 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
 def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
-    from sphereorient.preflight.draft import camera_keys
     from sphereorient.preflight.fictrac import read_fictrac_config
+    from sphereorient.preflight.first_look import camera_keys
     from sphereorient.preflight.mark_masks import drawn_mask
 
     said = read_fictrac_config(config)
@@ -174,7 +174,7 @@ def _write_experiment(
 ) -> list[DraftKey]:
     """Write experiment.yaml; return the keys that are left to the user."""
     from sphereorient.experiment.experiment import SCHEMA
-    from sphereorient.preflight.draft import experiment_keys
+    from sphereorient.preflight.first_look import experiment_keys
 
     keys = _asked(given(experiment_keys(looks, target.parent, masks), changes))
     write_text(target, draft_yaml(SCHEMA, keys, HEAD))

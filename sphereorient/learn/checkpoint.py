@@ -1,6 +1,7 @@
 """The file of a trained proposer: weights and settings, without code."""
 
 import hashlib
+import io
 import zipfile
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -10,7 +11,7 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictInt
 from torch import Tensor
 
 from sphereorient.errors import CheckpointError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import put_aside, read_whole
 from sphereorient.files.yaml_file import short, validated
 from sphereorient.learn.network import Correlator
 from sphereorient.learn.settings import ProposerSettings
@@ -53,10 +54,11 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint on the CPU without executing code; raise CheckpointError if file or weights are invalid."""
     name = f"checkpoint {path}"
-    _check_archive(path, name)
+    content = read_whole(path, LARGEST_BYTES, "a file of weights", CheckpointError, DO)
+    _check_archive(content, name)
     try:
         # weights_only accepts tensors, numbers, texts and containers; any other name in the pickle is refused.
-        tree = torch.load(path, map_location="cpu", weights_only=True)
+        tree = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # damaged pickles raise nearly anything
         code = "Weights only load failed" in str(error) or "Unsupported" in str(error)
         got = "other objects or code, which were not loaded" if code else "a damaged file"
@@ -90,19 +92,10 @@ def _refuse(name: str, expected: str, got: str, do: str, cause: Exception | None
     raise CheckpointError(refusal(name, expected=expected, got=got, do=do)) from cause
 
 
-def _check_archive(path: Path, name: str) -> None:
+def _check_archive(content: bytes, name: str) -> None:
     """Refuse a file that is not torch's archive, or that expands when it is read."""
     try:
-        size = path.stat().st_size if path.is_file() else -1
-    except OSError as error:
-        _refuse(name, "a readable file", f"'{error.strerror}'", DO, error)
-    if size < 0:
-        _refuse(name, "a file", "a folder" if path.is_dir() else "none", DO)
-    if size > LARGEST_BYTES:
-        _refuse(name, f"at most {LARGEST_BYTES / 1e6:g} MB", f"{size / 1e6:.1f} MB", DO)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
+        entries = zipfile.ZipFile(io.BytesIO(content)).infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         _refuse(name, "a file of weights", "another file, or the beginning of one", DO, error)
     # torch does not compress. Compressed or overlapping entries can expand to any size.
@@ -125,15 +118,13 @@ def _checked(tree: Any, name: str) -> Checkpoint:
     content = {key: value for key, value in tree.items() if key != "schema"}
     checkpoint = validated(Checkpoint, content | absent, name, CheckpointError)
     state, known = checkpoint.state, Correlator(checkpoint.settings.network).state_dict()
-    if state.keys() != known.keys():
-        different = ", ".join(sorted(short(key) for key in state.keys() ^ known.keys())[:3])
-        _refuse(f"{name}, state", f"{len(known)} tensors of the network", f"others: {different}", DO)
-    for key, expected in known.items():
-        tensor = state[key]
+    if others := sorted(short(key) for key in state.keys() ^ known.keys()):
+        _refuse(f"{name}, state", f"{len(known)} tensors of the network", f"others: {', '.join(others[:3])}", DO)
+    for key, tensor in state.items():
         if tensor.layout != torch.strided or tensor.dtype != torch.float32:
             _refuse(f"{name}, {key}", "a dense tensor of 32 bit floats", f"{tensor.layout}, {tensor.dtype}", DO)
-        if tensor.shape != expected.shape:
-            _refuse(f"{name}, {key}", f"shape {tuple(expected.shape)}", str(tuple(tensor.shape))[:60], DO)
+        if tensor.shape != (shape := known[key].shape):
+            _refuse(f"{name}, {key}", f"shape {tuple(shape)}", str(tuple(tensor.shape))[:60], DO)
         if not bool(tensor.isfinite().all()):
             _refuse(f"{name}, {key}", "finite numbers", "others", "train it anew")
     return checkpoint

@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -74,14 +74,11 @@ def cross_entropy(predictions: Predictions, grid: Tensor, spread_rad: float) -> 
 def metrics_of(predictions: Predictions, grid: Tensor, spread_rad: float, temperature: float = 1.0) -> Metrics:
     """Compute the metrics; the temperature changes order and probability of the candidates, not their orientation."""
     rank, probability = _ranked(predictions, grid, temperature)
-    right = rank < 1
     return Metrics(
-        pictures=len(predictions.logits),
+        **_recall(rank),
         nll=float(cross_entropy(predictions, grid, spread_rad).mean()),
-        recall_1=float(right.double().mean()),
-        recall_5=float((rank < 5).double().mean()),
         probability=float(probability.double().mean()),
-        ece=reliability(probability.clamp(0, 1).cpu().numpy(), right.cpu().numpy()).error,
+        ece=reliability(probability.clamp(0, 1).cpu().numpy(), (rank < 1).cpu().numpy()).error,
     )
 
 
@@ -99,15 +96,20 @@ def fitted_temperature(predictions: Predictions, grid: Tensor) -> float:
     return min(costs, key=costs.__getitem__)
 
 
+def _recall(rank: Tensor) -> dict[str, Any]:
+    """Return the recall of pictures (N,) whose right candidate has this rank, as fields of the records."""
+    first, five = (float((rank < among).double().mean()) for among in (1, 5))
+    return {"pictures": len(rank), "recall_1": first, "recall_5": five}
+
+
 def _ranked(predictions: Predictions, grid: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
     """Return the rank of the right candidate and the probability of the first one, (N,) each."""
-    ranks, probabilities = [], []
-    parts = (torch.split(one, 64) for one in predictions)
-    for logits, R in zip(*parts, strict=True):
+    found = []
+    for logits, R in zip(*(torch.split(one, 64) for one in predictions), strict=True):
         modes = find_modes(logits, grid, CANDIDATES, temperature)
-        ranks.append(first_right(modes, R, WITHIN_DEG))
-        probabilities.append(modes.probability[:, 0])
-    return torch.cat(ranks), torch.cat(probabilities)
+        found.append((first_right(modes, R, WITHIN_DEG), modes.probability[:, 0]))
+    rank, probability = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return rank, probability
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +186,10 @@ def benchmark_checkpoint(
     predictions = joined(mixed)
     spread_rad = math.radians(checkpoint.settings.training.spread_deg)
     return ProposerBenchmark(
-        families=tuple(_recall(*key, torch.cat(rank)) for key, rank in ranks.items()),
+        families=tuple(
+            DegradationRecall(family=name, level=level, **_recall(torch.cat(rank)))
+            for (name, level), rank in ranks.items()
+        ),
         mixed=metrics_of(predictions, network.grid, spread_rad, checkpoint.temperature),
         pictures_per_s=len(predictions.logits) / taken_s,
         threads=torch.get_num_threads(),
@@ -201,11 +206,6 @@ def _check(checkpoint: Checkpoint, settings: PictureSettings) -> None:
             expected, do = "the map of its fine-tuning", "name that map as pictures.texture in --config"
             raise CheckpointError(refusal("checkpoint", expected=expected, got="none", do=do))
         check_texture(checkpoint, load_texture(Path(settings.texture)))
-
-
-def _recall(name: str, level: int, rank: Tensor) -> DegradationRecall:
-    first, five = ((rank < among).double().mean().item() for among in (1, 5))
-    return DegradationRecall(family=name, level=level, pictures=len(rank), recall_1=first, recall_5=five)
 
 
 @torch.no_grad()

@@ -1,8 +1,8 @@
 """A network that predicts a density over SO(3), by correlating features of picture and rotated map; its modes."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from sphereorient import so3
 from sphereorient.errors import Reason
 from sphereorient.learn.settings import NetworkSettings
-from sphereorient.search.candidates import Candidates, check_disks, distinct
+from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import rim_share
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -46,14 +46,12 @@ class PictureNetwork(nn.Module):
         self.register_buffer("share", share, persistent=False)
         self.register_buffer("along", along, persistent=False)
         self.register_buffer("total", (along @ share @ along).clamp_min(1e-6), persistent=False)
-        radius = disk_offsets(size).norm(dim=-1).float()
-        self.register_buffer("radius", radius.clamp_max(1.2), persistent=False)
+        self.register_buffer("radius", disk_offsets(size).norm(dim=-1).float().clamp_max(1.2), persistent=False)
         self.first = nn.Sequential(_convolution(4, width // 2), _convolution(width // 2, width, stride=2))
         self.fine = nn.Sequential(Residual(width), Residual(width))
-        self.coarse = nn.Sequential(
-            _convolution(width, 2 * width, stride=2), Residual(2 * width), Residual(2 * width), Residual(2 * width)
-        )
-        self.up = nn.Conv2d(2 * width, width, 1)
+        wide = 2 * width
+        self.coarse = nn.Sequential(_convolution(width, wide, stride=2), *(Residual(wide) for _ in range(3)))
+        self.up = nn.Conv2d(wide, width, 1)
         self.last = nn.Sequential(Residual(width), nn.Conv2d(width, settings.channels, 1))
         for part in (self.first, self.fine, self.coarse, self.up, self.last):
             part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a quarter faster on a CPU
@@ -61,9 +59,8 @@ class PictureNetwork(nn.Module):
     def forward(self, disks: Tensor) -> Tensor:
         """Return features (F, C, S/2, S/2) of disks (F, S, S), grey levels of any scale."""
         share = self.share / self.share.sum()
-        mean = (disks * share).sum((1, 2), keepdim=True)
-        deviation = ((disks - mean).square() * share).sum((1, 2), keepdim=True).sqrt().clamp_min(1e-6)
-        even = (disks - mean) / deviation
+        less = disks - (disks * share).sum((1, 2), keepdim=True)
+        even = less / (less.square() * share).sum((1, 2), keepdim=True).sqrt().clamp_min(1e-6)
         about = self.along @ (even * self.share) @ self.along / self.total
         local = (even - about) * (self.share > 0)
         rim = self.radius.expand_as(even)
@@ -112,16 +109,13 @@ class Correlator(nn.Module):
         self.register_buffer("place", torch.nonzero(white.reshape(-1))[:, 0], persistent=False)
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
         self.register_buffer("grid", grid, persistent=False)
-        body = grid.mT @ normal.T  # (K, 3, P)
-        x, y, z = body.unbind(1)
-        cells = octahedral_cells(x, y, z, settings.nodes).int()
-        self.register_buffer("cells", cells, persistent=False)
+        x, y, z = (grid.mT @ normal.T).unbind(1)  # (K, P) each
+        self.register_buffer("cells", octahedral_cells(x, y, z, settings.nodes).int(), persistent=False)
 
     def bank(self, blurs: Tensor) -> Tensor:
         """Return the map's features in all views of the grid, (K, P C), from blurs (N, B)."""
-        features = self.map(blurs)
-        views: Tensor = features.index_select(0, self.cells.reshape(-1)).reshape(len(self.cells), -1)
-        return views
+        features: Tensor = self.map(blurs)
+        return features.index_select(0, self.cells.reshape(-1)).reshape(len(self.cells), -1)
 
     def seen(self, disks: Tensor) -> Tensor:
         """Return the features of disks (F, S, S) at the P compared points, (F, P C)."""
@@ -170,8 +164,7 @@ def map_blurs(textures: Tensor, side: int) -> Tensor:
     return torch.stack(blurs, -1).transpose(0, 1).contiguous()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Modes:
+class Modes(NamedTuple):
     """K candidates for each of F disks, likeliest first; made by `find_modes`."""
 
     R_view_body: Tensor  # (F, K, 3, 3) float32
@@ -179,9 +172,8 @@ class Modes:
 
 
 def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) -> Modes:
-    """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3).
-    The temperature divides the logits for probabilities and order only; orientations are means of the density as
-    learnt.
+    """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3). The
+    temperature divides the logits for probabilities and order only; orientations are means of the density as learnt.
     """
     flat = grid.flatten(1)
     probability = logits.softmax(-1)
@@ -214,8 +206,7 @@ def first_right(modes: Modes, R: Tensor, within_deg: float) -> Tensor:
     trace = (modes.R_view_body * R[:, None]).sum((-2, -1))
     right = (trace > 1 + 2 * math.cos(math.radians(within_deg))) & (modes.probability > 0)
     count = right.shape[1]
-    rank: Tensor = torch.where(right, torch.arange(count, device=R.device), count).amin(1)
-    return rank
+    return torch.where(right, torch.arange(count, device=R.device), count).amin(1)
 
 
 def score_of(probability: Tensor) -> Tensor:
@@ -228,25 +219,17 @@ def probability_of(score: Tensor) -> Tensor:
     return 2.0 * score - 1.0
 
 
-class LearnedProposer:
+class LearnedProposer(DiskSearch):
     """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
     At most `CANDIDATES` for each disk; `temperature` divides the logits, for calibrated probabilities.
     """
 
     def __init__(self, correlator: Correlator, texture: Tensor, *, temperature: float = 1.0) -> None:
+        super().__init__()
         self._network, self._temperature = correlator.eval(), temperature
+        self.size_px = correlator.settings.size_px
         with torch.inference_mode():
-            blurs = map_blurs(texture.float()[None], correlator.settings.nodes)[0]
-            self._bank = correlator.bank(blurs)
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._network.settings.size_px
-
-    def likeness(self, disks: Tensor) -> Tensor:
-        """Return the best score of each disk, (F,)."""
-        return self.propose(disks).best_score
+            self._bank = correlator.bank(map_blurs(texture.float()[None], correlator.settings.nodes)[0])
 
     @torch.inference_mode()
     def propose(self, disks: Tensor) -> Candidates:
@@ -255,13 +238,11 @@ class LearnedProposer:
         """
         check_disks(disks, self.size_px, self.size_px)
         filled = F.pad(disks.float(), (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        R, score = [torch.zeros(0, CANDIDATES, 3, 3)], [torch.zeros(0, CANDIDATES)]
+        found = [Modes(torch.zeros(0, CANDIDATES, 3, 3), torch.zeros(0, CANDIDATES))]
         for batch in torch.split(filled, BATCH) if len(disks) else ():
             logits = self._network.logits(self._network.seen(batch), self._bank)
-            modes = find_modes(logits, self._network.grid, CANDIDATES, self._temperature)
-            R.append(modes.R_view_body)
-            score.append(modes.probability)
-        R_view_body, probability = torch.cat(R)[: len(disks)], torch.cat(score)[: len(disks)]
+            found.append(find_modes(logits, self._network.grid, CANDIDATES, self._temperature))
+        R_view_body, probability = (torch.cat(parts)[: len(disks)] for parts in zip(*found, strict=True))
         shown = (disks != disks[:, :1, :1]).flatten(1).any(1)  # not uniform
         there = (probability >= PROBABILITY_MIN) & shown[:, None]
         counts = there.sum(1)

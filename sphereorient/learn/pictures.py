@@ -51,8 +51,7 @@ def make_textures(settings: PictureSettings, nodes: int, *, count: int, first_se
         textures = torch.nn.functional.interpolate(own[None, None], (rows, 2 * rows), mode="area")[0]
     else:
         textures = torch.stack([_random_map(settings, first_seed + k, k) for k in range(count)])
-    blurs = [map_blurs(some, nodes) for some in torch.split(textures, BLUR_BATCH)]
-    return RandomTextures(textures, torch.cat(blurs))
+    return RandomTextures(textures, torch.cat([map_blurs(some, nodes) for some in torch.split(textures, BLUR_BATCH)]))
 
 
 def _random_map(settings: PictureSettings, seed: int, number: int) -> Tensor:
@@ -74,12 +73,12 @@ def draw_batch(
     count, groups, group = shape
     rows = []
     for k in torch.randint(len(maps.textures), (count,), generator=rng).tolist():
-        negative = bool(torch.rand((), generator=rng) < 0.5) and settings.texture is None
-        texture = 1 - maps.textures[k] if negative else maps.textures[k]
+        texture, blurs = maps.textures[k], maps.blurs[k]
+        if bool(torch.rand((), generator=rng) < 0.5) and settings.texture is None:  # the negative
+            texture, blurs = 1 - texture, -blurs
         R = so3.random_rotations(groups * group, generator=rng).float()
-        each = torch.split(R, group)
-        filmed = [film(texture, some, draw_values(settings, rng), rng, settings) for some in each]
-        rows.append((texture, -maps.blurs[k] if negative else maps.blurs[k], torch.cat(filmed), R))
+        filmed = [film(texture, some, draw_values(settings, rng), rng, settings) for some in torch.split(R, group)]
+        rows.append((texture, blurs, torch.cat(filmed), R))
     return TrainingBatch(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
@@ -99,8 +98,7 @@ def draw_values(settings: PictureSettings, rng: torch.Generator) -> dict[str, fl
     most = min(settings.at_once, len(names))
     count = int(torch.randint(most + 1, (), generator=rng))
     chosen = torch.randperm(len(names), generator=rng)[:count].tolist()
-    span = settings.hardest - LEVELS[0]
-    levels = (LEVELS[0] + span * torch.rand(count, generator=rng)).tolist()
+    levels = (LEVELS[0] + (settings.hardest - LEVELS[0]) * torch.rand(count, generator=rng)).tolist()
     return {names[k]: value_at(names[k], level) for k, level in zip(chosen, levels, strict=True)}
 
 

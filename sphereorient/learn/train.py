@@ -36,7 +36,7 @@ LENGTH = ("epochs", "minutes", "patience")  # may change when training is resume
 LAST = "last.ckpt"
 VALIDATION_MAPS = 24
 TRAINING, VALIDATION = 0, 1  # random streams: no picture occurs in both
-VALIDATION_GROUPS, VALIDATION_GROUP = 2, 8  # pictures of a validation batch, which has one map
+VALIDATION_SHAPE = 1, 2, 8  # of a validation batch: maps, groups of each, pictures of a group
 WARM_UP_STEPS = 100  # of the learning rate; at most a tenth of all steps
 RECALL_EVERY = 10  # steps between measurements of the recall on training pictures
 Row = dict[str, float]
@@ -52,15 +52,14 @@ class TrainingData(LightningDataModule):
         self.textures = make_textures(pictures, nodes, count=pictures.textures, first_seed=0)
         unseen = make_textures(pictures, nodes, count=VALIDATION_MAPS, first_seed=VALIDATION_SEED)
         rng = generator_of(settings.training.seed, VALIDATION)
-        shape = 1, VALIDATION_GROUPS, VALIDATION_GROUP
-        count = -(-pictures.validation // math.prod(shape))
-        self.validation = [draw_batch(unseen, pictures, rng, shape) for _ in range(count)]
+        count = -(-pictures.validation // math.prod(VALIDATION_SHAPE))
+        self.validation = [draw_batch(unseen, pictures, rng, VALIDATION_SHAPE) for _ in range(count)]
 
     def training_batch(self, epoch: int, step: int) -> TrainingBatch:
         """Draw the batch of a step."""
-        training = self._settings.training
-        rng = generator_of(training.seed, TRAINING, epoch, step)
-        return draw_batch(self.textures, self._settings.pictures, rng, (training.maps, training.groups, training.group))
+        of = self._settings.training
+        rng = generator_of(of.seed, TRAINING, epoch, step)
+        return draw_batch(self.textures, self._settings.pictures, rng, (of.maps, of.groups, of.group))
 
     def train_dataloader(self) -> DataLoader[int]:
         """Return the batches of the coming epoch; Lightning calls this in every epoch."""
@@ -89,10 +88,8 @@ class ProposerModule(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return the optimiser; `on_train_batch_start` sets its learning rate."""
-        training = self.settings.training
-        return torch.optim.AdamW(
-            self.network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
-        )
+        of = self.settings.training
+        return torch.optim.AdamW(self.network.parameters(), lr=of.learning_rate, weight_decay=of.weight_decay)
 
     def learning_rate(self) -> float:
         """Return the rate of the next step: a linear rise, then a cosine of the share of steps or time that is done."""
@@ -130,11 +127,10 @@ class ProposerModule(LightningModule):
 
     def training_metrics(self) -> Row:
         """Return loss and recall on training pictures since the last call."""
-        row: Row = {}
-        if self._losses:
-            row["train_nll"] = float(torch.stack(self._losses).mean())
-        if self._right:
-            row["train_recall_1"] = float(torch.cat(self._right).double().mean())
+        if not self._losses:
+            return {}
+        recall = torch.cat(self._right).double().mean()
+        row = {"train_nll": float(torch.stack(self._losses).mean()), "train_recall_1": float(recall)}
         self._losses, self._right = [], []
         return row
 
@@ -164,15 +160,14 @@ class CheckpointCallback(Callback):
         """Add a row to the history, and keep the weights if they are the best."""
         module: ProposerModule = pl_module
         assert module.metrics is not None
-        self.rows.append(
-            {
-                "epoch": float(trainer.current_epoch + (not trainer.sanity_checking)),
-                "step": float(trainer.global_step),
-                "learning_rate": 0.0 if trainer.sanity_checking else module.learning_rate(),
-                **module.training_metrics(),
-                **{f"validation_{name}": value for name, value in asdict(module.metrics).items() if name != "pictures"},
-            }
-        )
+        row = {
+            "epoch": float(trainer.current_epoch + (not trainer.sanity_checking)),
+            "step": float(trainer.global_step),
+            "learning_rate": 0.0 if trainer.sanity_checking else module.learning_rate(),
+            **module.training_metrics(),
+        }
+        row |= {f"validation_{name}": value for name, value in asdict(module.metrics).items() if name != "pictures"}
+        self.rows.append(row)
         with put_aside(self.out / "metrics.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, sorted({key for row in self.rows for key in row}))
             writer.writeheader()
@@ -192,8 +187,7 @@ class CheckpointCallback(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state."""
-        for key, value in state_dict.items():
-            setattr(self, key, value)
+        vars(self).update(state_dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -233,7 +227,7 @@ def train_proposer(
     own = settings.pictures.texture
     checkpoint = Checkpoint(
         settings=settings,
-        state={name: tensor.detach().clone() for name, tensor in network.state_dict().items()},
+        state=kept.best,
         temperature=temperature,
         texture_sha256=None if own is None else texture_sha256(load_texture(Path(own))),
         about={
@@ -294,13 +288,13 @@ def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, t
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
     training = module.settings.training
-    loggers = {name: logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")}
-    levels = {name: logger.level for name, logger in loggers.items()}
+    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric")]
+    levels = [logger.level for logger in loggers]
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
-            for logger in loggers.values():
+            for logger in loggers:
                 logger.setLevel(logging.ERROR)
+            warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|lightning)\b.*")
             trainer = Trainer(
                 accelerator="gpu" if torch.cuda.is_available() else "cpu",
                 devices=1,
@@ -323,5 +317,5 @@ def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, t
     finally:
         if main:
             signal.signal(signal.SIGINT, before)
-        for name, logger in loggers.items():
-            logger.setLevel(levels[name])
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

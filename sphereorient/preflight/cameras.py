@@ -121,15 +121,6 @@ def camera_findings(
     yield from tracked.findings
 
 
-def outlines_of(samples: Sequence[MovieSample]) -> Seen:
-    """Return what the outlines of the sampled frames say."""
-    return Seen.of_outlines(
-        {one.name: one.camera for one in samples},
-        torch.stack([one.sightings.centre_px for one in samples], 1),
-        torch.stack([one.sightings.radius_px for one in samples], 1),
-    )
-
-
 def sample_positions(samples: Sequence[MovieSample]) -> Tensor:
     """Return the positions (n, 3), lab, mm, of the ball in the frames sampled by two cameras or more."""
     return nearest_point([one.camera.rays(one.sightings.centre_px) for one in samples])[0]
@@ -137,7 +128,10 @@ def sample_positions(samples: Sequence[MovieSample]) -> Tensor:
 
 def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> Finding:
     """Judge the distance between the lines of sight; `in_step_px`: the gap after synchronising the movies."""
-    title, seen, names = "lines of sight", outlines_of(samples), [one.name for one in samples]
+    title, names = "lines of sight", [one.name for one in samples]
+    centre_px = torch.stack([one.sightings.centre_px for one in samples], 1)
+    radius_px = torch.stack([one.sightings.radius_px for one in samples], 1)
+    seen = Seen.of_outlines({one.name: one.camera for one in samples}, centre_px, radius_px)
     pairs = {pair: seen.gaps(pair) for pair in seen.pairs}
     counts = {pair: int(torch.isfinite(gaps.signed_mm).sum()) for pair, gaps in pairs.items()}
     k, m = min(counts, key=lambda pair: counts[pair])
@@ -146,7 +140,7 @@ def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> 
         measured = f"{who} the ball in {count} of {len(samples[0].frame)} frames sampled"
         return warning(title, measured, f"{SEE_BALL}, and check start: the movies must show the same time")
     by_pair = {pair: gaps.typical_px for pair, gaps in pairs.items()}
-    k, m = max(by_pair, key=lambda pair: by_pair[pair])
+    k, m = max(by_pair, key=by_pair.__getitem__)
     gap_px, gap_mm = by_pair[k, m], float(pairs[k, m].signed_mm.abs().nanmedian())
     who = "they miss" if len(samples) == 2 else f"those of {names[k]} and {names[m]} miss"
     measured = f"{who} each other by {gap_mm:.3f} mm, {gap_px:.2f} px (median of {counts[k, m]} frames)"
@@ -223,8 +217,8 @@ def ball_size_px(sample: MovieSample) -> Finding:
     seen = 2 * radius[torch.isfinite(radius)]
     if not len(seen):
         return warning(title, "unknown: no ball was found", SEE_BALL)
-    least, usual, most = (float(size) for size in (seen.min(), seen.median(), seen.max()))
-    measured = f"{usual:.1f} px across ({least:.1f} .. {most:.1f})"
+    usual = float(seen.median())
+    measured = f"{usual:.1f} px across ({float(seen.min()):.1f} .. {float(seen.max()):.1f})"
     if sample.expected_px is None:
         advice = f"set locate.diameter_px to {usual:.0f} (--set, or in the settings file)"
         return warning(title, measured + "; none expected", advice)

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
+from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.stream import given_scene
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.proposers import as_near
@@ -63,7 +64,9 @@ def preflight(
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
         if len(experiment.spheres) > 1:
-            return _of_scene(recording, settings, progress)
+            scene, found = look_at_scene(recording, settings, progress)
+            checked = Preflight(experiment=experiment, timeline=recording.timeline, scene=scene)
+            return replace(checked, findings=tuple(_findings(checked, found)))
         image, unseen = None, None
         if experiment.texture_path is not None and experiment.texture_path.exists():
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
@@ -73,10 +76,11 @@ def preflight(
         planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
         both = image is not None and len(recording.streams) > 1
         learning = pool.submit(cameras.study, experiment, planned) if both else None
-        sampling = [
-            pool.submit(sample_movie, stream, experiment, sizes[stream.name], settings.locate)
-            for stream in recording.streams
-        ]
+        sampling = []
+        for stream in recording.streams:
+            empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
+            size_px = sizes[stream.name]
+            sampling.append(pool.submit(sample_movie, stream, size_px, settings.locate, empty, experiment.fixed))
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
         samples = tuple(one.result() for one in sampling)
@@ -106,13 +110,6 @@ def preflight(
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
 
 
-def _of_scene(recording: Recording, settings: Settings, progress: Progress) -> Preflight:
-    """Check an experiment of several balls."""
-    scene, found = look_at_scene(recording, settings, progress)
-    checked = Preflight(experiment=recording.experiment, timeline=recording.timeline, scene=scene)
-    return replace(checked, findings=tuple(_findings(checked, found)))
-
-
 def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:
     """Yield all findings; those that are told `first` are known."""
     yield movies.frames(seen.experiment, seen.timeline)
@@ -140,8 +137,8 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         yield warning("paint", measured, do if path else f"{do}; then write it under sphere: as texture:")
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
-    default = seen.samples[0].diameter_px / 2
-    yield (paint := texture_map.contrast(seen.measures, min((r for r in radii if not math.isnan(r)), default=default)))
+    least_px = min((r for r in radii if not math.isnan(r)), default=seen.samples[0].diameter_px / 2)
+    yield (paint := texture_map.contrast(seen.measures, least_px))
     if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
     yield texture_map.look_alikes(seen.similar)
@@ -154,8 +151,8 @@ def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[st
     """Return the expected diameter in each camera, px, None if unknown, and findings for impossible ones."""
     sizes: dict[str, float | None] = dict.fromkeys(experiment.cameras, settings.locate.diameter_px)
     findings = []
-    for name in experiment.cameras:
-        if sizes[name] is None and experiment.diameter_mm is not None:
+    if settings.locate.diameter_px is None and experiment.diameter_mm is not None:
+        for name in experiment.cameras:
             try:
                 sizes[name] = expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
             except SettingsError as error:

@@ -1,6 +1,6 @@
-"""A first look at movies of which nothing is known: how large the ball is, and whether it stays in its place."""
+"""A first look at movies of which nothing is known, and their experiment.yaml, which asks for what was not measured."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from sphereorient.cameras import PinholeCamera
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
-from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.experiment.stream import CameraStream
+from sphereorient.files.draft import DraftKey
 from sphereorient.files.threads import side_by_side
+from sphereorient.files.whole_file import relative_path
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
@@ -25,6 +26,8 @@ from sphereorient.preflight.sample import sample_movie
 STAYS = 0.15  # of the radius: a ball whose outlines scatter by less stays in its place
 SEEN = 0.4  # share of the frames in which a ball that moves is found at least
 PICTURES = 40  # all over the movie, for a ball that stays
+EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
+FLOW = {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,14 +64,13 @@ def look_at(
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
     """Look at the movie of a camera; `shown` (H, W) is False where something hides the ball."""
     settings, stream = LocateSettings(), _stream(name, movie, shown)
-    sample = sample_movie(stream, _unknown(movie), None, settings)
+    sample = sample_movie(stream, None, settings)
     outlines = [outline for _, outline in sample.balls]
     with_ball = [k for k, (outline, _) in enumerate(sample.found) if outline is not None]
     readable = [k for k, picture in enumerate(sample.picture) if picture is not None]
-    k = with_ball[len(with_ball) // 2] if with_ball else readable[0]
+    k, looked = with_ball[len(with_ball) // 2] if with_ball else readable[0], len(readable)
     picture, outline = sample.picture[k], sample.found[k][0]
     assert picture is not None
-    looked = sum(one is not None for one in sample.picture)
     seen, stays = len(outlines) >= SEEN * looked, None
     if seen:
         places = np.array([(one.u_px, one.v_px) for one in outlines])
@@ -105,13 +107,69 @@ def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraS
     return CameraStream(name=name, camera=camera, movie=movie, rows=np.arange(len(movie)), shown=shown)
 
 
-def _unknown(movie: Movie) -> Experiment:
-    path = Path(movie.path)
-    return Experiment(
-        name=path.stem,
-        path=path.parent / "experiment.yaml",
-        frame_rate_hz=float("nan"),
-        cameras_path=path.parent / "cameras.yaml",
-        cameras={},
-        movie_paths={},
-    )
+def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str, str] | None = None) -> list[DraftKey]:
+    """Return the keys of an experiment.yaml in a folder, in their order; `masks`: files by camera."""
+    cameras, one_camera = [one.name for one in looks], len(looks) == 1
+    counts = ", ".join(f"{one.name} {len(one.movie)}" for one in looks)
+    movies = {one.name: relative_path(one.movie.path, folder) for one in looks}
+    made = "written beside this file" if one_camera else "`sphereorient calibrate` writes it"
+
+    def each(value: Any) -> dict[str, Any]:
+        return {name: value.format(name) if isinstance(value, str) else value for name in cameras}
+
+    def key(name: str, comment: str, value: Any = ..., example: Any = None) -> DraftKey:
+        return DraftKey(name=name, value=value, comment=comment, example=example)
+
+    empty = "the scene without the ball, of the movie's size: better for short movies"
+    hidden = "black where something that does not move hides the ball: `sphereorient mark` draws them"
+    return [
+        key("name", "free", folder.resolve().name),
+        _rate_key(looks),
+        key("exposure", EXPOSURE, example=0.0004),
+        *_sphere_keys(looks),
+        key("cameras", made, "cameras.yaml"),
+        key("movies", f"frames: {counts}", movies),
+        key("backgrounds", empty, example=each("empty_{}.png")),
+        key("masks", hidden, masks or ..., each("mask_{}.png")),
+        key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
+        key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
+        key("flip", "mirrored movies: vertical, horizontal, both", example=each("vertical")),
+        key("flow", "SI, for reports", example=FLOW),
+    ]
+
+
+def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
+    rate = looks[0].rate_hz
+    if rate is not None and all(one.rate_hz for one in looks):
+        return DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
+    played = next((f"; players show it at {one.movie.played_hz:g}" for one in looks if one.movie.played_hz), "")
+    return DraftKey(name="frame_rate", comment=f"Hz, of the recording{played}", example=600.0, asked=True)
+
+
+def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
+    stays = all(one.stays for one in looks)
+    sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
+    unknown = "; null where it is not known: lengths are then in radii" if len(looks) == 1 and stays else ""
+    size = f"mm{unknown} ({sizes or 'no ball was found'})"
+    fixed = f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies"
+    return [
+        DraftKey(name="sphere.diameter", comment=size, example=18.0, asked=True),
+        DraftKey(name="sphere.texture", value="texture.png", comment="`sphereorient map` learns it from the movies"),
+        DraftKey(name="sphere.fixed", value=stays, comment=fixed),
+    ]
+
+
+def camera_keys(
+    look: FirstLook, vfov_deg: float, R: Sequence[Sequence[float]] | None = None, *, known: bool
+) -> list[DraftKey]:
+    """Return the keys of cameras.yaml for one camera of which at most the field of view is known.
+    R: R_cam_lab, where the lab is not the camera's own frame.
+    """
+    height, width = look.movie.frame_shape
+    entry: dict[str, Any] = {"model": "pinhole", "image_size": [width, height], "vfov_deg": vfov_deg}
+    if R is not None:
+        entry |= {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
+    told = "known" if known else "assumed: it hardly matters for a ball in its place"
+    where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
+    comment = f"field of view {told}; {where}"
+    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=comment)]

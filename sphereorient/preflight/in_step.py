@@ -66,7 +66,7 @@ def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
     for k in [liveliest, *order]:
         begin = min(max(0, starts[k] - STRETCH // 2), max(0, count - STRETCH))
         one = range(begin, min(begin + STRETCH, count))
-        if all(one.start >= other.stop or one.stop <= other.start for other in stretches):
+        if not any({*one} & {*other} for other in stretches):
             stretches.append(one)
     return stretches[:STRETCHES]
 
@@ -87,8 +87,8 @@ def scan_offsets(
     if not least_px <= meet_px:
         # Moved cameras leave a constant gap at any offset: use the varying part, if the motion varies.
         best, least_px = _least(varying)
-        varies_px = float(motion.std()) if len(motion) > 1 else 0.0
-        best = best if varies_px > MOVES_PX and least_px <= meet_px else math.nan
+        varies = len(motion) > 1 and float(motion.std()) > MOVES_PX
+        best = best if varies and least_px <= meet_px else math.nan
     return OffsetScan(
         gap_px=gap,
         varying_px=varying,
@@ -139,8 +139,7 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
 def shifts_of(scans: Sequence[OffsetScan]) -> dict[str, float]:
     """Return by how many frames each movie is late, NaN: unknown: of two against the first, of more against most."""
     late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
-    known = [value for value in late.values() if not math.isnan(value)]
-    usual = median_low(known) if len(scans) > 1 else 0.0
+    usual = median_low(value for value in late.values() if not math.isnan(value)) if len(scans) > 1 else 0.0
     return {name: value - usual for name, value in late.items()}
 
 
@@ -157,14 +156,13 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
         measured = f"unknown: within {REACH} frames no shift makes the lines of sight meet"
         return warning(title, measured, "correct the findings on ball and lines of sight first, then check again")
     name = max(list(late)[1:] if len(scans) == 1 else late, key=lambda one: abs(late[one]))
-    measured = (
-        f"{name} shows the same instant {abs(late[name]):.2f} frames {'later' if late[name] > 0 else 'earlier'} "
-        f"(the ball moves {moved_px:.1f} px a frame across the lines of sight)"
-    )
+    measured = f"{name} shows the same instant {abs(late[name]):.2f} frames "
+    measured += "later" if late[name] > 0 else "earlier"
+    measured += f" (the ball moves {moved_px:.1f} px a frame across the lines of sight)"
     shifted = [scan for scan in scans if scan.shift]
     if not shifted:
-        advice = "trigger both cameras by one signal: start: cannot correct a part of a frame"
-        advice = advice if len(scans) == 1 else advice.replace("both", "all")
+        which = "both" if len(scans) == 1 else "all"
+        advice = f"trigger {which} cameras by one signal: start: cannot correct a part of a frame"
         return judged(title, measured, (abs(late[name]) > IN_STEP, WARNING, advice))
     now = max(float(scan.gap_px[REACH]) for scan in shifted)
     best = max(float(scan.gap_px.min()) for scan in shifted)

@@ -1,5 +1,4 @@
 """The server of the pages on which people mark what pictures show: masks, or fiducials of a plate.
-
 It answers this machine alone, to who knows the random token of its address.
 """
 
@@ -81,27 +80,21 @@ def serve(marking: Marking, port: int = 0) -> PageServer:
 
         def do_GET(self) -> None:
             match self._steps():
-                case None:
-                    self.send_error(HTTPStatus.NOT_FOUND)
                 case [""]:
                     self._file(marking.page, "text/html; charset=utf-8")
                 case [name] if name in SHARED:
                     self._file(name, SHARED[name])
                 case steps:
-                    self._answer(lambda: marking.shown(steps))
+                    self._answer(lambda: None if steps is None else marking.shown(steps))
 
         def do_POST(self) -> None:
-            length = self.headers.get("Content-Length", "")
+            length, steps = self.headers.get("Content-Length", ""), self._steps()
             if not length.isdigit() or int(length) > MOST_BYTES:
                 self.close_connection = True
                 self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
                 return
-            content = self.rfile.read(int(length))
-            match self._steps():
-                case None:
-                    self.send_error(HTTPStatus.NOT_FOUND)
-                case steps:
-                    self._answer(lambda: marking.done(steps, self._asked(content)))
+            asked = self._asked(self.rfile.read(int(length)))
+            self._answer(lambda: None if steps is None else marking.done(steps, asked))
 
         def _asked(self, content: bytes) -> Mapping[str, Any]:
             try:

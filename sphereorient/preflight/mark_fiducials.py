@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.calibration import DotPlate, PlateView, load_calibration
+from sphereorient.calibration import DotPlate, load_calibration
 from sphereorient.calibration.document import Picture, checked_clicks
 from sphereorient.calibration.dots import Dots, find_dots
 from sphereorient.calibration.lattice import index_dots
@@ -40,20 +40,20 @@ class FiducialMarking(Marking):
             case ["state"]:
                 return self.state()
             case ["picture", number] if number.isdigit():
-                return png(eight_bits(self._grey(self._picture(int(number[:9])))))
+                return png(eight_bits(self._grey(self._picture(number))))
             case ["view", number] if number.isdigit():
-                k = int(number[:9])
-                return self.view(k, self.clicked.get(self._picture(k)))
+                picture = self._picture(number)
+                return self.view(picture, self.clicked.get(picture))
         return None
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Try or save the clicked `points` of a picture."""
         match steps:
-            case ["try", number] if number.isdigit():
-                k = int(number[:9])
-                return self.view(k, self._checked(self._picture(k), asked.get("points")))
-            case ["save", number] if number.isdigit():
-                return self.save(int(number[:9]), asked.get("points"))
+            case ["try" | "save" as what, number] if number.isdigit():
+                picture, points = self._picture(number), asked.get("points")
+                return (
+                    self.save(picture, points) if what == "save" else self.view(picture, self._checked(picture, points))
+                )
         return None
 
     def state(self) -> Json:
@@ -70,33 +70,32 @@ class FiducialMarking(Marking):
             ],
         }
 
-    def view(self, number: int, clicked: NDArray[np.float64] | None) -> Json:
+    def view(self, picture: Picture, clicked: NDArray[np.float64] | None) -> Json:
         """Return what a picture shows with these clicked places, None or (2 or 3, 2) px: all dots with their radii,
         those that are identified, the fiducials among them, and why it is not tied.
         """
-        picture = self._picture(number)
         with self.lock:
             if picture not in self.dots:
                 self.dots[picture] = find_dots(self._grey(picture), dark=self.plate.dark)
             dots = self.dots[picture]
         view = index_dots(dots, self.plate, picture.path.name, clicked)
+        tied = view.state == "tied"
+        at = [view.uv_px[tied & (view.index == mark).all(axis=1)] for mark in self.plate.fiducials]
         return {
-            "tied": view.state == "tied",
+            "tied": tied,
             "reason": view.reason,
             "dots": np.column_stack([dots.uv_px, np.sqrt(dots.area_px / np.pi)]).round(2).tolist(),
-            "points": view.uv_px.round(2).tolist() if view.state == "tied" else [],
-            "fiducials": self._fiducials(view),
+            "points": view.uv_px.round(2).tolist() if tied else [],
+            "fiducials": [uv_px[0].round(2).tolist() if len(uv_px) else None for uv_px in at],
             "clicked": None if clicked is None else clicked.tolist(),
         }
 
-    def save(self, number: int, points: Any) -> Json:
-        """Write clicked places into the file; return the view with them.
-        Raises CameraError (impossible places, places that do not tie the picture, or a file that cannot be changed
-        safely), OutputError (the file cannot be written).
+    def save(self, picture: Picture, points: Any) -> Json:
+        """Write clicked places into the file; return the view with them. Raises CameraError (impossible places, places
+        that do not tie the picture, or a file that cannot be changed safely), OutputError (the file cannot be written).
         """
-        picture = self._picture(number)
         clicked = self._checked(picture, points).round(1)
-        view = self.view(number, clicked)
+        view = self.view(picture, clicked)
         if not view["tied"]:
             raise CameraError(view["reason"])
         pose, camera = self.document.poses[picture.row], picture.camera
@@ -117,19 +116,13 @@ class FiducialMarking(Marking):
         entries = content.get("pictures") if isinstance(content, dict) else None
         return [entry if isinstance(entry, dict) else {} for entry in entries] if isinstance(entries, list) else []
 
-    def _fiducials(self, view: PlateView) -> list[list[float] | None]:
-        if view.state != "tied":
-            return [None] * len(FIDUCIALS)
-        at = [np.flatnonzero((view.index == mark).all(axis=1)) for mark in self.plate.fiducials]
-        return [view.uv_px[k[0]].round(2).tolist() if len(k) else None for k in at]
-
     def _grey(self, picture: Picture) -> NDArray[Any]:
         return read_plate_picture(picture.path, self.document.keys.image_size)
 
     def _checked(self, picture: Picture, points: Any) -> NDArray[np.float64]:
         return checked_clicks(points, self.document.keys.image_size, f"{picture.path.name}, clicked")
 
-    def _picture(self, number: int) -> Picture:
-        if number >= (count := len(self.document.pictures)):
-            raise self.refused(f"picture {number}", f"0 .. {count - 1}", str(number), "choose another")
-        return self.document.pictures[number]
+    def _picture(self, number: str) -> Picture:
+        if (k := int(number[:9])) >= (count := len(self.document.pictures)):
+            raise self.refused(f"picture {k}", f"0 .. {count - 1}", str(k), "choose another")
+        return self.document.pictures[k]

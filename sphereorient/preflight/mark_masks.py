@@ -22,6 +22,7 @@ from sphereorient.preflight.mark import Json, Marking, png
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
+Bools = NDArray[np.bool_]
 MOST_SHAPES = 200
 FAR_PX = 1e5
 
@@ -60,12 +61,11 @@ class MaskMarking(Marking):
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Save the mask of a camera, of `shapes` and `keep`."""
-        match steps:
-            case ["save", name]:
-                if not {"shapes", "keep"} <= set(asked):
-                    raise _refused("request", "shapes and keep, as JSON", "another thing")
-                return self.save(name, asked["shapes"], keep=bool(asked["keep"]))
-        return None
+        if len(steps) != 2 or steps[0] != "save":
+            return None
+        if not {"shapes", "keep"} <= set(asked):
+            raise _refused("request", "shapes and keep, as JSON", "another thing")
+        return self.save(steps[1], asked["shapes"], keep=bool(asked["keep"]))
 
     def state(self) -> Json:
         """Return what the page begins with."""
@@ -81,19 +81,16 @@ class MaskMarking(Marking):
     def frame(self, name: str, number: int) -> bytes:
         """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
         movie = self._movie(name)
-        if not 0 <= number < len(movie):
+        if number >= len(movie):
             expected = f"0 .. {len(movie) - 1}"
             raise MovieError(refusal(f"frame {number}", expected=expected, got=str(number), do="choose another"))
         with self.lock:
-            picture = movie.sample([number])[0]
-        return png(eight_bits(picture))
+            return png(eight_bits(movie.sample([number])[0]))
 
     def mask(self, name: str) -> bytes:
         """Return what is hidden now as PNG: red, half transparent, where the mask is black."""
-        height, width = self._movie(name).frame_shape
-        shown = self.masks[name]
-        picture = np.zeros((height, width, 4), np.uint8)
-        if shown is not None:
+        picture = np.zeros((*self._movie(name).frame_shape, 4), np.uint8)
+        if (shown := self.masks[name]) is not None:
             picture[~shown] = (0, 0, 255, 110)
         return png(picture)
 
@@ -153,22 +150,17 @@ class MaskMarking(Marking):
         `keep`: what the old mask hides stays hidden. Raises ExperimentError (impossible shapes, or nothing would be
         shown), OutputError (a file cannot be written).
         """
-        height, width = self._movie(name).frame_shape
-        old = self.masks[name] if keep else None
-        shown = drawn_mask((height, width), shapes, old)
+        shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
         flip = self.experiment.flip.get(name, "none")
         file = self.path.parent / f"{name}_mask.png"
         with self.lock:
             write_picture(file, flipped_picture(np.where(shown, 255, 0).astype(np.uint8), flip))
-            self._name_mask(name, file.name)
+            masks = dict((self.read() or {}).get("masks") or {})
+            if masks.get(name) != file.name:
+                self.write(["masks"], masks | {name: file.name}, f"write masks: {{{name}: {file.name}}} there")
             self.masks[name] = shown
             vars(self).pop("looks", None)
         return {"file": str(file), "hidden": 100 * float(np.mean(~shown))}
-
-    def _name_mask(self, name: str, file: str) -> None:
-        masks = dict((self.read() or {}).get("masks") or {})
-        if masks.get(name) != file:
-            self.write(["masks"], masks | {name: file}, f"write masks: {{{name}: {file}}} there")
 
     def _movie(self, name: str) -> Movie:
         if name not in self.movies:
@@ -176,9 +168,7 @@ class MaskMarking(Marking):
         return self.movies[name]
 
 
-def drawn_mask(
-    size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: NDArray[np.bool_] | None
-) -> NDArray[np.bool_]:
+def drawn_mask(size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: Bools | None) -> Bools:
     """Return what a mask (H, W) shows after shapes are drawn, see `MaskMarking.save`; ExperimentError for others."""
     if not isinstance(shapes, list | tuple) or len(shapes) > MOST_SHAPES:
         raise _refused("shapes", f"at most {MOST_SHAPES} of them", "another thing")
@@ -199,11 +189,10 @@ def drawn_mask(
     shown = hidden == 0
     if any(shape["kind"] == "show" for shape in shapes):
         shown &= region > 0
-    if old is not None:
-        shown &= old
+    shown = np.asarray(shown if old is None else shown & old)
     if not shown.any():
         raise _refused("mask", "a part of the picture that is shown", "all of it hidden")
-    return np.asarray(shown)
+    return shown
 
 
 def _numbers(values: object, name: str) -> NDArray[np.float64]:

@@ -53,10 +53,9 @@ def frames(experiment: Experiment, timeline: Timeline) -> Finding:
 def outside(experiment: Experiment) -> list[Finding]:
     """Report files outside the folder of the experiment."""
     paths = [os.path.relpath(path, experiment.folder) for path in outside_paths(experiment)]
-    if not paths:
-        return []
     measured = f"not in the folder of {experiment.path.name}: {', '.join(paths)}"
-    return [warning("files elsewhere", measured, "check these paths if somebody else made the experiment")]
+    found = warning("files elsewhere", measured, "check these paths if somebody else made the experiment")
+    return [found] if paths else []
 
 
 def movie_file(sample: MovieSample) -> Finding:
@@ -92,13 +91,13 @@ def ball(sample: MovieSample) -> Finding:
     """Count the frames with a ball, and the reasons for those without."""
     usable = [k for k, reason in enumerate(sample.screen) if reason in (Reason.OK, Reason.REPEATED)]
     reasons = Counter(sample.found[k][1] for k in usable)
-    title, seen = f"ball {sample.name}", reasons.pop(Reason.OK, 0)
+    seen = reasons.pop(Reason.OK, 0)
     measured = f"found in {seen} of {len(usable)} frames"
     if reasons:
-        measured += " (" + ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) + ")"
+        measured += f" ({', '.join(f'{count} {reason}' for reason, count in reasons.most_common())})"
     remedy = REMEDY[reasons.most_common(1)[0][0] if reasons else Reason.NOT_FOUND]
     few = seen < BALL_SEEN * len(usable)
-    return judged(title, measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
+    return judged(f"ball {sample.name}", measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
 
 
 def background(sample: MovieSample, experiment: Experiment) -> Finding:
@@ -109,9 +108,9 @@ def background(sample: MovieSample, experiment: Experiment) -> Finding:
     advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
     if experiment.fixed:
         return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
-    centres = [(outline.u_px, outline.v_px, outline.radius_px) for _, outline in sample.balls]
-    shares = [sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in centres) / len(centres) for u, v, _ in centres]
-    share = max(shares, default=0.0)
+    balls = [(outline.u_px, outline.v_px, outline.radius_px) for _, outline in sample.balls]
+    covers = (sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in balls) / len(balls) for u, v, _ in balls)
+    share = max(covers, default=0.0)
     measured = f"learnt from the movie: the ball covers no pixel in more than {100 * share:.0f} % of the frames"
     return judged(title, measured, (share > STAYS, WARNING, advice))
 
@@ -129,10 +128,8 @@ def exposure(sample: MovieSample) -> Finding:
     black, white = np.percentile(grey, [5, 95])
     signal = (white - black) / max(noise, 1e-9)
     saturated, dark = float(np.mean(grey >= full_scale)), float(np.mean(grey == 0))
-    measured = (
-        f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball saturated, "
-        f"{100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
-    )
+    measured = f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball "
+    measured += f"saturated, {100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
     faint = white - black < RANGE * full_scale or signal < SIGNAL
     alike = "light the ball more, or paint it with more contrast: black and white are hardly apart"
     return judged(
@@ -190,11 +187,10 @@ def _profiles(
     last = share.shape[1] - 1 - (share[:, ::-1] > 0.5).argmax(1)
     shifted = []
     for one, k in zip(share, last, strict=True):
-        if not 0 < k < len(offset) - 1:
-            continue
-        crossing = offset[k] + FINE * (one[k] - 0.5) / max(one[k] - one[k + 1], 1e-9)
-        if abs(crossing) < 2.5:
-            shifted.append(np.interp(offset + crossing, offset, one))
+        if 0 < k < len(offset) - 1:
+            crossing = offset[k] + FINE * (one[k] - 0.5) / max(one[k] - one[k + 1], 1e-9)
+            if abs(crossing) < 2.5:
+                shifted.append(np.interp(offset + crossing, offset, one))
     return np.asarray(shifted).reshape(-1, len(offset))
 
 

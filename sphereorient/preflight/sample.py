@@ -11,8 +11,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
 from sphereorient.errors import MovieError, Reason, refusal
-from sphereorient.experiment import Experiment
-from sphereorient.experiment.stream import CameraStream, given_scene, pictures_of, spread_frames, uniform
+from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,
@@ -93,23 +92,26 @@ def frames_to_sample(count: int) -> list[int]:
 
 
 def sample_movie(
-    stream: CameraStream, experiment: Experiment, diameter_px: float | None, settings: LocateSettings
+    stream: CameraStream,
+    diameter_px: float | None,
+    settings: LocateSettings,
+    empty: Grey | None = None,
+    fixed: bool = False,
 ) -> MovieSample:
-    """Sample one camera's frames, background and ball; measure its diameter if None.
-    Raises MovieError (no sampled frame can be decoded), ExperimentError (a background picture cannot be used).
+    """Sample one camera's frames, background and ball; measure its diameter if None; `empty`: a picture without it.
+    Raises MovieError: no sampled frame can be decoded.
     """
     frame = np.asarray(frames_to_sample(len(stream)), np.int64)
     picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
-    shown = [one for one in picture if one is not None and not uniform(one)]
-    shown = shown or [one for one in picture if one is not None]
+    known = [one for one in picture if one is not None]
+    shown = [one for one in known if not uniform(one)] or known
     if not shown:
         do = "check that it plays; export it again if not"
         raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
-    empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
 
     def at_size(size_px: float) -> MovieSample:
-        if empty is None and experiment.fixed:
+        if empty is None and fixed:
             background = replace(_surroundings(some), shown=stream.shown)
         else:
             background = learn_background(some, size_px, settings, empty, stream.shown)
@@ -137,16 +139,15 @@ def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
     found: list[Found] = []
     rows = sample.row
     for k, (row, picture) in enumerate(zip(rows, sample.picture, strict=True)):
-        if picture is None:
-            reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
-        else:  # a repeated picture is known only if its neighbour was read
+        reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
+        ball: Found | None = None
+        if picture is not None:  # a repeated picture is known only if its neighbour was read
             neighbour = sample.picture[k - 1] if k > 0 and row == rows[k - 1] + 1 else None
             reason = screened(picture, neighbour, sample.background).reason
+            if reason in (Reason.OK, Reason.REPEATED):
+                ball = find_ball(picture, sample.background, sample.diameter_px, settings)
         screen.append(reason)
-        if picture is None or reason not in (Reason.OK, Reason.REPEATED):
-            found.append((None, reason))
-        else:
-            found.append(find_ball(picture, sample.background, sample.diameter_px, settings))
+        found.append(ball or (None, reason))
     return replace(sample, screen=tuple(screen), found=tuple(found))
 
 

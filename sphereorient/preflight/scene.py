@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import PaintError
+from sphereorient.experiment import Sphere
 from sphereorient.experiment.recording import Progress, Recording, load_map
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
@@ -52,13 +53,14 @@ def look_at_scene(
     spheres = recording.experiment.spheres
     missing = [one for one in spheres if one.texture_path is None or not one.texture_path.exists()]
     if missing:
-        return (), [_no_map(sphere.name, None if (p := sphere.texture_path) is None else str(p)) for sphere in missing]
+        return (), [_no_map(sphere) for sphere in missing]
     loaded = {path: load_map(path) for path in dict.fromkeys(one.texture_path for one in spheres) if path is not None}
     maps = {one.name: loaded[one.texture_path] for one in spheres if one.texture_path is not None}
     job = Job(recording=replace(recording, maps=maps), settings=settings, device=torch.device("cpu"))
     first = {name: paint.first for paint in open_paints(job, progress) for name in paint.names}
     balls = {name: first[name] for name in recording.experiment.names}
-    frames, places = sample_frames(job.recording, next(iter(balls.values())).fitter.views, FRAMES)
+    cameras = next(iter(balls.values())).fitter.views
+    frames, places = sample_frames(job.recording, cameras, FRAMES)
     start, found, disks = SceneStart(balls), [], []
     for k, shots in enumerate(frames):
         progress("balls", k, len(frames))
@@ -66,7 +68,6 @@ def look_at_scene(
         found.append(start(shots, list(balls), {}))
     progress("balls", len(frames), len(frames))
     best = max(range(len(frames)), key=lambda k: sum(len(one) > 0 for one in found[k].values()))
-    cameras = next(iter(balls.values())).fitter.views
     seen = tuple(
         SceneView(
             name=view.name,
@@ -84,18 +85,19 @@ def look_at_scene(
     }
     if len(loaded) > 1:
         contrasts = {name: replace(one, title=f"{one.title} {name}") for name, one in contrasts.items()}
-    one_paint = _one_paint({path.name: one.grey for path, one in loaded.items()}, progress)
-    sizes = _sizes(found, disks, balls)
-    return seen, [*_counts(disks, balls), *_found(found, balls), *sizes, *contrasts.values(), *one_paint]
+    one_paint = same_paint({path.name: one.grey for path, one in loaded.items()}, progress)
+    sizes = ball_sizes(found, disks, balls)
+    return seen, [*disk_counts(disks, balls), *found_balls(found, balls), *sizes, *contrasts.values(), *one_paint]
 
 
-def _no_map(name: str, path: str | None) -> Finding:
+def _no_map(ball: Sphere) -> Finding:
+    path = ball.texture_path
     measured = "no texture map is given" if path is None else f"no texture map: {path} is not there"
-    do = f"learn it with `sphereorient map`, or correct spheres.{name}.texture"
-    return judged(f"paint of ball {name}", measured, (True, FAULT, do))
+    do = f"learn it with `sphereorient map`, or correct spheres.{ball.name}.texture"
+    return judged(f"paint of ball {ball.name}", measured, (True, FAULT, do))
 
 
-def _one_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
+def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
     """Tell maps of two files that show one paint, in any body frames: balls that wear it look alike."""
     pairs = list(combinations(maps, 2))
     for k, (one, other) in enumerate(pairs):
@@ -114,9 +116,9 @@ def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[lis
     """Return the disks in the pictures of one instant."""
     each, found = list(balls.values()), []
     for c, shot in enumerate(shots):
-        views = [one.fitter.views[c] for one in each]
-        sizes = [view.diameter_px for view in views]
-        found.append(find_disks(shot.picture, views[0].background, sizes, each[0].locating) if shot.usable else [])
+        sizes = [one.fitter.views[c].diameter_px for one in each]
+        background = each[0].fitter.views[c].background
+        found.append(find_disks(shot.picture, background, sizes, each[0].locating) if shot.usable else [])
     return found
 
 
@@ -129,22 +131,18 @@ def _least_px(balls: Mapping[str, Initialiser]) -> float:
     return min(view.diameter_px / 2 for one in balls.values() for view in one.fitter.views)
 
 
-def _counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+def disk_counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
     """Compare the number of disks of each camera with the number of balls."""
     for c, view in enumerate(next(iter(balls.values())).fitter.views):
         counts = [len(one[c]) for one in disks]
         measured = f"{median(counts):g} disks in the usual frame ({min(counts)} to {max(counts)}), {len(balls)} named"
         more = "name the other balls under `spheres`; mask what is round and no ball (`sphereorient mark`)"
         fewer = "leave out of `spheres` what is not there; give backgrounds: where the balls hardly move"
-        yield judged(
-            f"balls {view.name}",
-            measured,
-            (median(counts) > len(balls), WARNING, more),
-            (max(counts) < len(balls), WARNING, fewer),
-        )
+        complaints = (median(counts) > len(balls), WARNING, more), (max(counts) < len(balls), WARNING, fewer)
+        yield judged(f"balls {view.name}", measured, *complaints)
 
 
-def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+def found_balls(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
     """Count the frames in which each ball is found by its paint."""
     for name in balls:
         count = sum(len(one[name]) > 0 for one in found)
@@ -155,10 +153,8 @@ def _found(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser
         yield judged(f"ball {name}", measured, *complaints)
 
 
-def _sizes(
-    found: Sequence[Mapping[str, Poses]],
-    disks: Sequence[Sequence[Sequence[Outline]]],
-    balls: Mapping[str, Initialiser],
+def ball_sizes(
+    found: Sequence[Mapping[str, Poses]], disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]
 ) -> Iterator[Finding]:
     """Compare the diameters of balls that several cameras see with the named ones."""
     ratios: dict[str, float] = {}
@@ -189,5 +185,5 @@ def _sizes(
 
 def _exchanged(one: str, other: str, measured: Mapping[str, float], named: Mapping[str, float]) -> bool:
     """Return whether two balls of unlike diameters each have about that of the other."""
-    apart = abs(named[one] / named[other] - 1) > BAD
-    return apart and all(abs(measured[a] / named[b] - 1) < BAD for a, b in ((one, other), (other, one)))
+    swapped = all(abs(measured[a] / named[b] - 1) < BAD for a, b in ((one, other), (other, one)))
+    return swapped and abs(named[one] / named[other] - 1) > BAD

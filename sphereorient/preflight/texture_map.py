@@ -75,12 +75,9 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
     share = texel_areas(len(fine)) / (4 * math.pi)
     deviation = ((fine - (fine * share).sum()).square() * share).sum()
     weight = (map_directions(ROWS).reshape(-1, 3) @ direction.T).clamp_min(0) * area.reshape(-1)
-    brightness = (weight @ small.reshape(-1)) / weight.sum(1)
-    return TextureMeasures(
-        contrast=float(deviation.sqrt()),
-        view_brightness=brightness.reshape(ROWS, 2 * ROWS),
-        patch_rad=_patch_rad(fine.float(), float(mean)),
-    )
+    brightness = ((weight @ small.reshape(-1)) / weight.sum(1)).reshape(ROWS, 2 * ROWS)
+    patch_rad = _patch_rad(fine.float(), float(mean))
+    return TextureMeasures(contrast=float(deviation.sqrt()), view_brightness=brightness, patch_rad=patch_rad)
 
 
 def unknown_paint(unseen: Tensor) -> Finding:
@@ -98,11 +95,9 @@ def _patch_rad(texture: Tensor, mean: float) -> float:
     there = sample_texture(texture, at * angle.cos()[:, None, None] + side * angle.sin()[:, None, None]) - mean
     correlation = (here * there).mean(1) / here.square().mean().clamp_min(1e-12)
     below = torch.nonzero(correlation < 0.5)
-    if not len(below):
-        return math.pi
-    k = int(below[0, 0])
+    k = int(below[0, 0]) if len(below) else 0
     if k == 0:
-        return 0.0
+        return 0.0 if len(below) else math.pi
     share = float((correlation[k - 1] - 0.5) / (correlation[k - 1] - correlation[k]).clamp_min(1e-9))
     # The correlation of stripes falls to a half at a quarter of their width.
     return 4 * float(angle[k - 1] + share * (angle[k] - angle[k - 1]))
@@ -112,10 +107,8 @@ def contrast(measures: TextureMeasures, radius_px: float) -> Finding:
     """Judge contrast, balance and patches of a map, for a ball of this radius in the pictures."""
     patch_deg, patch_px = math.degrees(measures.patch_rad), measures.patch_rad * radius_px
     low, high = float(measures.view_brightness.min()), float(measures.view_brightness.max())
-    measured = (
-        f"views are {100 * low:.0f} to {100 * high:.0f} % bright; patches of about "
-        f"{patch_deg:.0f} degrees, {patch_px:.0f} px; contrast {measures.contrast:.2f}"
-    )
+    measured = f"views are {100 * low:.0f} to {100 * high:.0f} % bright; patches of about {patch_deg:.0f} degrees, "
+    measured += f"{patch_px:.0f} px; contrast {measures.contrast:.2f}"
     lopsided = low < LOPSIDED[0] or high > LOPSIDED[1]
     faint = "paint with more contrast, or check that the map was exported from black to white"
     fine = "paint larger patches, or bring the ball larger into the picture: such detail is blurred away"
@@ -136,14 +129,13 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
     view = orthographic_view(size)
     normal = view.normal_view.T.contiguous()
     table = texture_table(texture, min(2.0 / size, settings.detail), 192)
+    normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
 
-    def pictures(R: Tensor) -> Tensor:
-        return view.picture(table.sample(R.mT @ normal)[0])
-
-    normalisation = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
+    def pictures(R: Tensor, beyond: float = 0.0) -> Tensor:
+        return view.picture(table.sample(R.mT @ normal)[0], beyond)
 
     def normalised(R: Tensor) -> Tensor:
-        return torch.cat([normalisation(pictures(some)) for some in torch.split(R, BATCH)])
+        return torch.cat([normalise(pictures(some)) for some in torch.split(R, BATCH)])
 
     seen = views_towards(fibonacci_directions(VIEWS)).float()
     grid = so3.lattman_grid(math.radians(STEP_DEG)).float()
@@ -159,8 +151,7 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
         angle = float(so3.geodesic_distance(seen[k].double(), R[0].double()))
         if float(score) > found.score and angle > math.radians(APART_DEG):
             pair = torch.stack([seen[k], R[0]])
-            shown = view.picture(table.sample(pair.mT @ normal)[0], math.nan)
-            found = ViewPair(score=float(score), angle_rad=angle, pictures=shown, R_view_body=pair)
+            found = ViewPair(score=float(score), angle_rad=angle, pictures=pictures(pair, math.nan), R_view_body=pair)
     return found
 
 
@@ -174,8 +165,8 @@ def views_towards(direction_body: Tensor) -> Tensor:
 
 def look_alikes(pair: ViewPair) -> Finding:
     """Judge the two most similar views."""
-    apart, explained = f"{math.degrees(pair.angle_rad):.0f} degrees apart", f"{100 * pair.score:.0f} % of the other"
-    measured = f"the worst pair, {apart}: one explains {explained}"
+    measured = f"the worst pair, {math.degrees(pair.angle_rad):.0f} degrees apart: one explains "
+    measured += f"{100 * pair.score:.0f} % of the other"
     measured += ": single frames are unambiguous" if pair.score < ALIKE else ""
     same = "break the paint's symmetry: add a patch that exists only once; these two views cannot be told apart"
     alike = "add a patch where the two views are alike: there a single frame is ambiguous without its history"
@@ -193,27 +184,20 @@ def match_texture(search: GreySearch, samples: Sequence[MovieSample]) -> list[Te
 
 
 def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> TextureMatch:
-    centre, radius = sample.sightings.centre_px[chosen], sample.sightings.radius_px[chosen]
     crops = []
-    for k, (u, v), r in zip(chosen, centre.tolist(), radius.tolist(), strict=True):
-        picture = sample.picture[k]
-        assert picture is not None  # there is an outline
-        crops.append(torch.from_numpy(crop_disk(picture, u, v, r, search.size_px)))
-    disks = torch.stack(crops)
-    return TextureMatch(name=sample.name, score=_best(search, disks), mirrored=_best(search, disks.flip(-1)))
-
-
-def _best(search: GreySearch, disks: Tensor) -> Tensor:
-    """Return the best score for each disk (n, S, S), (n,)."""
-    found = search.propose(disks)
-    there, score = found.counts > 0, torch.zeros(len(disks), dtype=torch.float64)
-    score[there] = found.score[found.offset[:-1][there]]
-    return score
+    for k in chosen:
+        picture, outline = sample.picture[k], sample.found[k][0]
+        assert picture is not None
+        assert outline is not None
+        crops.append(crop_disk(picture, outline.u_px, outline.v_px, outline.radius_px, search.size_px))
+    disks = torch.from_numpy(np.stack(crops))
+    score, mirrored = (search.propose(each).best_score for each in (disks, disks.flip(-1)))
+    return TextureMatch(name=sample.name, score=score, mirrored=mirrored)
 
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
     """Judge the match of the map with one camera's pictures."""
-    score, mirrored = float(np.median(match.score)), float(np.median(match.mirrored))
+    score, mirrored = np.median(match.score), np.median(match.mirrored)
     measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
     flip = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
     if len(matches) > 1 and all(np.median(one.mirrored - one.score) > CLEARLY for one in matches):

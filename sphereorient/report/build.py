@@ -2,41 +2,33 @@
 
 import base64
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
+from sphereorient.experiment.recording import Progress, silent
 from sphereorient.files.whole_file import ROOM, has_mark, unfinished
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text
-from sphereorient.report import plots
 from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
 from sphereorient.report.page import page_html, strip_html
+from sphereorient.report.plots import report_figures
+from sphereorient.report.plots.style import Plan, of_tracks, write_figure
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.report.texture_map import worn_figure
 from sphereorient.report.verdicts import Verdict, verdicts
 from sphereorient.sphere import load_texture
-from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, summarise
-from sphereorient.statistics.cameras import CameraDistance, camera_distances, without_perspective
+from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
+from sphereorient.statistics.cameras import camera_distances, without_perspective
 from sphereorient.trajectory import Trajectory
 
 KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, and what is in them
 MOST_STRIPS = 8  # tracks shown frame by frame
 PICTURES = 120  # frames of a report with pictures
-PAPER = {  # numbers of the paper's figures
-    "track": "Figure 7",
-    "camera_distance": "Figure 8",
-    "durations": "Figure 9",
-    "angles": "Figure 10",
-    "densities": "Figures 11 and 12",
-    "increments": "Figure 11",
-}
 PX_PER_INCH = 120  # on the page, the same for all figures: so is their text
 FLOW_KEYS = {
     "viscosity": "viscosity_m2_s",
@@ -45,7 +37,6 @@ FLOW_KEYS = {
     "integral_length": "integral_length_m",
     "integral_time": "integral_time_s",
 }
-Progress = Callable[[str, int, int], None]
 
 
 def write_report(
@@ -54,30 +45,25 @@ def write_report(
     *,
     experiments: Sequence[Experiment] = (),
     settings: StatisticsSettings | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: Progress = silent,
     command: str = "",
 ) -> list[Verdict]:
     """Write the report of tracks, by file name, whole or not at all, and return its findings.
-
     `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
-
-    Raises:
-        TrackError: no valid frame, or tracks of kernels and of smoothers together.
-        ExperimentError: an experiment without a track, or experiments that contradict each other.
-        OutputError: `out` cannot be written, or contains something else.
+    Raises TrackError (no valid frame, or tracks of kernels and of smoothers together), ExperimentError (one without a
+    track, or two that contradict each other), OutputError (`out` cannot be written, or contains something else).
     """
     known = match_experiments(tracks, experiments)
     around = surroundings_of([experiment for experiment in known.values() if experiment is not None])
     names = list(tracks)
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
-    summary = summarise(
-        list(tracks.values()), settings, around, lambda done, total: progress("numbers", done, total), name
-    )
+    summary = summarise(list(tracks.values()), settings, around, partial(progress, "numbers"), name)
     rough = [None if (e := known[key]) is None else without_perspective(tracks[key], e.cameras) for key in tracks]
     distances = camera_distances(list(tracks.values()), rough)
-    words = verdicts(summary, tracks, distances)
+    of = summary, tracks, distances
+    words = verdicts(*of)
     with _folder(out) as aside:
-        tables = tables_of(summary, tracks, distances)
+        tables = tables_of(*of)
         page = page_html(
             summary,
             tracks,
@@ -85,9 +71,7 @@ def write_report(
             verdicts=words,
             tables=tables,
             suffixes=write_tables(tables, aside / "tables"),
-            figures=_draw_all(
-                [*_figures(summary, tracks, distances), *_worn(tracks, known)], aside / "figures", progress
-            ),
+            figures=_draw_all([*report_figures(of), *_worn(tracks, known)], aside / "figures", progress),
             strips=list(_strips(tracks, known, progress)),
         )
         (aside / "index.html").write_text(page, "utf-8")
@@ -97,11 +81,8 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track by its name, or None, of its sphere alone; a single one belongs to a single
-    track.
-
-    Raises:
-        ExperimentError: an experiment without a track or without its sphere, or two of one name.
+    """Return the experiment of each track, of its sphere alone, or None; a single one belongs to a single track.
+    Raises ExperimentError: an experiment without a track or without its sphere, or two of one name.
     """
     if len(tracks) == 1 and len(experiments) == 1:
         return {name: experiments[0].of(track.sphere) for name, track in tracks.items()}
@@ -113,12 +94,11 @@ def match_experiments(
             do = "give them different names (key `name`), or report them one by one"
             got = f"{known[name].path} and {experiment.path}"
             raise ExperimentError(refusal(f"--experiment '{name}'", expected="one of a name", got=got, do=do))
-        known[name] = experiment
-    for name, experiment in known.items():
         if name not in wanted:
             do = "pass the experiment.yaml that the track was measured from"
             expected = f"the name of one of {', '.join(sorted(wanted)[:5])}"
             raise ExperimentError(refusal(str(experiment.path), expected=expected, got=name, do=do))
+        known[name] = experiment
     return {
         name: known[track.experiment].of(track.sphere) if track.experiment in known else None
         for name, track in tracks.items()
@@ -130,12 +110,10 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
     one recording that differ in size, no diameter is known.
     """
     known: dict[str, float] = {}
-    sizes: dict[Path, set[float | None]] = {}
-    for experiment in experiments:
-        sizes.setdefault(experiment.path, set()).add(experiment.diameter_mm)
+    sizes = {(one.path, one.diameter_mm) for one in experiments}
     for experiment in experiments:
         found = {FLOW_KEYS[key]: value for key, value in experiment.flow.items() if key in FLOW_KEYS}
-        if experiment.diameter_mm is not None and len(sizes[experiment.path]) == 1:
+        if experiment.diameter_mm is not None and sum(path == experiment.path for path, _ in sizes) == 1:
             found["diameter_mm"] = experiment.diameter_mm
         for key, value in found.items():
             if known.setdefault(key, value) != value:
@@ -143,49 +121,6 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
                 label, got = f"{experiment.path}, {key}", f"{value:g}"
                 raise ExperimentError(refusal(label, expected=f"{known[key]:g} as before", got=got, do=do))
     return Surroundings(**known)
-
-
-Plan = tuple[str, str, str, Callable[[], Figure]]  # name, title, caption, function
-
-
-def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
-    name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
-    caption = "As measured (dots) and smooth, with bands of two standard errors."
-    recording = name.removesuffix(track.sphere)
-    together = {key: one for key, one in tracks.items() if key.removesuffix(one.sphere) == recording}
-    for number, (key, one) in enumerate(together.items(), start=1):
-        label = "track" if number == 1 else f"track_{number}"
-        yield label, f"Track{_of([key], tracks)}", caption, partial(plots.track_figure, one)
-    if not track.held:
-        draw = partial(plots.path_figure, *together.values())
-        yield "path", f"Path{_of(together, tracks)}", "With the sphere's axes.", draw
-    if any(len(one.distance_rad) for one in distances):
-        caption = "PDF of the angle between two cameras' own orientations."
-        yield "camera_distance", "Distance of the cameras", caption, lambda: plots.camera_distance_figure(distances)
-    caption = "Share of each variance that is noise, or was smoothed away."
-    if summary.ensemble.segments:
-        yield "noise", "Noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error)
-    if (more := summary.distributions) is None:
-        return
-    caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
-    yield "densities", "PDFs", caption, lambda: plots.densities_figure(summary, list(more.densities))
-    caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
-    yield "increments", "Increments", caption, lambda: plots.increments_figure(more, summary.table)
-    caption = "Autocorrelations and integral times."
-    yield "correlations", "Correlations", caption, lambda: plots.correlations_figure(more.correlations)
-    caption = "Euler angles against the law of uniform attitudes."
-    yield "angles", "Angles", caption, lambda: plots.angles_figure(more.angles, more.uniformity)
-    caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
-    yield "kernel_widths", "Kernel widths", caption, lambda: plots.widths_figure(more.widths)
-    caption = "Shares of the components in the variance, in the lab and in the body."
-    yield "isotropy", "Isotropy", caption, lambda: plots.isotropy_figure(more.isotropies)
-    if (found := more.durations) is not None:
-        yield "durations", "Durations", "Of the segments.", lambda: plots.durations_figure(found)
-
-
-def _of(names: Iterable[str], tracks: Mapping[str, Trajectory]) -> str:
-    """Return the label of some of the tracks in a title; empty if there is only one."""
-    return "" if len(tracks) == 1 else f" of {', '.join(names)}"
 
 
 def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> Iterator[Plan]:
@@ -198,7 +133,7 @@ def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment
         drawn.add(text)
         path = None if experiment is None else experiment.texture_path
         draw = partial(worn_figure, worn_of_text(text), None if path is None else load_texture(path))
-        title = f"Paint{_of([name], tracks)} that was not used"
+        title = f"Paint{of_tracks([name], tracks)} that was not used"
         yield f"unused_paint_{len(drawn)}", title, "It differs from the map.", draw
 
 
@@ -207,9 +142,8 @@ def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[d
     for k, (name, title, caption, draw) in enumerate(plans):
         progress("figures", k, len(plans))
         figure = draw()
-        plots.write_figure(figure, folder / name)
+        write_figure(figure, folder / name)
         png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
-        title += f" ({PAPER[name]} of the paper)" if name in PAPER else ""
         width = round(PX_PER_INCH * figure.get_figwidth())
         drawn.append({"name": name, "title": title, "caption": caption, "png": png, "width": width})
     progress("figures", len(plans), len(plans))
@@ -228,7 +162,7 @@ def _strips(
         seen = None
         if (experiment := experiments[name]) is not None:
             count = max(PICTURES // pictured, 12)
-            seen = gallery(tracks[name], experiment, count, lambda done, total: progress("pictures", done, total))
+            seen = gallery(tracks[name], experiment, count, partial(progress, "pictures"))
         yield strip_html(name, tracks[name], seen)
         progress("strips", k + 1, len(chosen))
 

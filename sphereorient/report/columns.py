@@ -27,7 +27,6 @@ FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadshe
 
 def to_arrow(track: Trajectory) -> "pa.Table":
     """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
-
     Raise OutputError if pyarrow is not installed.
     """
     arrow = package("pyarrow", "table")
@@ -43,10 +42,9 @@ def to_arrow(track: Trajectory) -> "pa.Table":
 
 def to_xarray(track: Trajectory) -> "xr.Dataset":
     """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
-
     Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
-    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN.
-    Raise OutputError if xarray is not installed.
+    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN. Raise
+    OutputError if xarray is not installed.
     """
     xarray = package("xarray", "table")
     own = {dataset.name: dataset for dataset in frame_wise(track)}
@@ -73,7 +71,7 @@ def to_xarray(track: Trajectory) -> "xr.Dataset":
 def _dims(dataset: "Dataset") -> tuple[str, ...]:
     second = "body_axis" if dataset.rotation else "axis_2"
     named = {(): (), (2,): ("image_axis",), (3,): ("axis",), (3, 3): ("axis", second)}
-    return ("time", *named[dataset.tail])
+    return ("time", *named[dataset.values.shape[1:]])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,14 +84,9 @@ class Dataset:
     values: NDArray[Any]  # (N, ...); of a column (N,)
 
     @property
-    def tail(self) -> tuple[int, ...]:
-        """Axes after the frames."""
-        return self.values.shape[1:]
-
-    @property
     def rotation(self) -> bool:
         """Whether the values are rotations, which tables hold as quaternions."""
-        return self.tail == (3, 3) and self.units == "1"
+        return self.values.shape[1:] == (3, 3) and self.units == "1"
 
     @property
     def about(self) -> dict[str, str]:
@@ -111,7 +104,6 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
 
 def columns(track: Trajectory) -> Iterator[Dataset]:
     """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
-
     Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
     """
     for dataset in frame_wise(track):
@@ -124,14 +116,14 @@ def columns(track: Trajectory) -> Iterator[Dataset]:
 
 def _split(dataset: Dataset, prefix: str) -> Iterator[Dataset]:
     name, values = f"{prefix}{dataset.name}", dataset.values
-    parts = {name: values}
+    parts, tail = {name: values}, values.shape[1:]
     if dataset.rotation:
         stem = prefix + dataset.name.replace("orientation", "quat", 1)
         parts = {f"{stem}_{axis}": column for axis, column in zip("wxyz", quaternions_wxyz(values).T, strict=True)}
-    elif dataset.tail == (3, 3):
+    elif tail == (3, 3):
         parts = {f"{name}_{'xyz'[i]}{'xyz'[j]}": values[:, i, j] for i, j in PAIRS}
-    elif dataset.tail in AXES:
-        parts = {f"{name.removesuffix('_px')}_{axis}": values[:, k] for k, axis in enumerate(AXES[dataset.tail])}
+    elif tail in AXES:
+        parts = {f"{name.removesuffix('_px')}_{axis}": values[:, k] for k, axis in enumerate(AXES[tail])}
     for stem, column in parts.items():
         yield replace(dataset, name=with_unit(stem, dataset.units), values=column)
 

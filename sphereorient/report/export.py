@@ -16,17 +16,6 @@ from sphereorient.report import columns as table
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.walk import fictrac_rows
 
-SUFFIXES = {
-    ".csv": "csv",
-    ".parquet": "parquet",
-    ".pq": "parquet",
-    ".mat": "mat",
-    ".dat": "fictrac",
-    ".tum": "tum",
-    ".vtkhdf": "vtk",
-    ".nwb": "nwb",
-    ".nc": "netcdf",
-}
 ROWS = 50_000  # written at once
 TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
 Floats = NDArray[np.float64]
@@ -41,25 +30,25 @@ def export_track(
     camera: Camera | None = None,
 ) -> None:
     """Write a track for other programs, whole or not at all; NaN stays NaN.
-
-    `to` is a key of `WRITERS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
+    `to` is a key of `FORMATS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
     for an unknown format, a package that is not installed, or a file that cannot be written.
     """
-    write = WRITERS[format_of(path, to)]
+    write, *_ = FORMATS[format_of(path, to)]
     with put_aside(path) as aside:
         write(Export(track=track, path=aside, progress=progress, camera=camera))
 
 
 def format_of(path: Path, to: str | None) -> str:
     """Return the format, from `to`, or from the suffix if None; OutputError if unknown or contradictory."""
-    by_name, known = SUFFIXES.get(path.suffix.lower()), ", ".join(WRITERS)
-    if to is not None and to not in WRITERS:
+    suffixes = {suffix: name for name, (_, *own) in FORMATS.items() for suffix in own}
+    by_name, known = suffixes.get(path.suffix.lower()), ", ".join(FORMATS)
+    if to is not None and to not in FORMATS:
         do = "write --to with one of these"
         raise OutputError(refusal("--to", expected=f"one of {known}", got=repr(to)[:60], do=do))
     if to is None and by_name is None:
         do = f"add --to with one of {known}, or end the name in one of these"
         got = f"'{path.suffix}'"
-        raise OutputError(refusal(f"--out {path}", expected=" ".join(SUFFIXES), got=got, do=do))
+        raise OutputError(refusal(f"--out {path}", expected=" ".join(suffixes), got=got, do=do))
     if to is not None and by_name not in (None, to):
         do = "let --to and the name agree"
         raise OutputError(refusal(f"--out {path}", expected=f"a name for {to}", got=f"'{path.suffix}'", do=do))
@@ -113,7 +102,8 @@ def _write_mat(job: Export) -> None:
     track = job.track
     job.progress(0, len(track))  # SciPy writes in one step
     content = _mat_arrays(track)
-    content["cameras"] = {name: _mat_arrays(camera) for name, camera in table.safe_names(track).items()}
+    seen = table.safe_names(track).items()
+    content["cameras"] = {name: _mat_arrays(camera) | {"reason": table.reasons(camera)} for name, camera in seen}
     about = table.metadata(track)
     content["metadata"] = {
         **{key: about[key] for key in ("experiment", "method", "frame_rate_hz", "settings", "flags")},
@@ -132,8 +122,6 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
         arrays[table.with_unit(dataset.name, dataset.units)] = dataset.values
         if dataset.rotation:
             arrays[dataset.name.replace("orientation", "quat_wxyz", 1)] = quaternions_wxyz(dataset.values)
-    if isinstance(record, CameraTrack):
-        arrays["reason"] = table.reasons(record)
     return arrays
 
 
@@ -142,9 +130,8 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
     Column 5, an error of its own, is the root mean square of the stated errors, rad. NaN where there is no pose.
     """
     R, ms, walk = track.posed, 1e3 * track.time, track.walk()
-    count = np.arange(len(R))
+    count, step_s = np.arange(len(R)), np.diff(track.time, prepend=np.nan)
     begin = np.maximum.accumulate(np.where(walk.start, count, 0))
-    step_s = np.diff(track.time, prepend=np.nan)
     ahead, right = walk.forward_rad_s * step_s, walk.side_rad_s * step_s
     stretch = np.where(np.isfinite(walk.heading_rad), 0.0, np.nan)
     total = np.nancumsum(np.stack([ahead, right], axis=1), axis=0)
@@ -187,10 +174,8 @@ def _write_vtk(job: Export) -> None:
     """Write VTKHDF, a time series for ParaView: the ball's centre, a point in each valid frame, with its vectors.
     Source: the file format of VTK 9.3, transient poly data.
     """
-    track = job.track
-    some = track.valid
-    count = int(some.sum())
-    R, time, position = track.orientation[some], track.time[some], track.position[some]
+    track, some = job.track, job.track.valid
+    count, R = int(some.sum()), track.orientation[some]
     parts = {
         **{f"body_{axis}": R[:, :, k] for k, axis in enumerate("xyz")},
         "quaternion_wxyz": quaternions_wxyz(R),
@@ -203,13 +188,12 @@ def _write_vtk(job: Export) -> None:
     with h5py.File(job.path, "w") as file:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array([2, 0])
-        kind = np.bytes_("PolyData")
-        root.attrs.create("Type", kind, dtype=h5py.string_dtype("ascii", len(kind)))
+        root.attrs.create("Type", np.bytes_("PolyData"), dtype=h5py.string_dtype("ascii", 8))
         root["NumberOfPoints"] = np.ones(count, np.int64)
-        root["Points"] = position
+        root["Points"] = track.position[some]
         steps = root.create_group("Steps")
         steps.attrs["NSteps"] = count
-        steps["Values"] = time
+        steps["Values"] = track.time[some]
         steps["PartOffsets"], steps["NumberOfParts"] = frame, np.ones(count, np.int64)
         steps["PointOffsets"] = frame
         # Each part has one vertex, and nothing else.
@@ -261,13 +245,13 @@ def _write_netcdf(job: Export) -> None:
     data.to_netcdf(job.path, engine="scipy")
 
 
-WRITERS: dict[str, Callable[[Export], None]] = {
-    "csv": _write_csv,
-    "parquet": _write_parquet,
-    "mat": _write_mat,
-    "fictrac": _write_fictrac,
-    "tum": _write_tum,
-    "vtk": _write_vtk,
-    "nwb": _write_nwb,
-    "netcdf": _write_netcdf,
+FORMATS: dict[str, tuple[Any, ...]] = {  # what writes it (of an `Export`), and the suffixes of its files
+    "csv": (_write_csv, ".csv"),
+    "parquet": (_write_parquet, ".parquet", ".pq"),
+    "mat": (_write_mat, ".mat"),
+    "fictrac": (_write_fictrac, ".dat"),
+    "tum": (_write_tum, ".tum"),
+    "vtk": (_write_vtk, ".vtkhdf"),
+    "nwb": (_write_nwb, ".nwb"),
+    "netcdf": (_write_netcdf, ".nc"),
 }

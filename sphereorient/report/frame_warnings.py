@@ -94,7 +94,6 @@ def stated_error(cov: Floats) -> Floats:
 
 def choose_worst(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     """Choose at most `count` of the worst frames; return the reasons by row, worst first, the kinds of problem in turn.
-
     Of frames less than three apart one is taken. If fewer frames are bad, those with the lowest scores follow.
     """
     kinds = [list(ranked) for ranked in _kinds(track)]
@@ -176,9 +175,8 @@ def _outliers(values: Floats, words: str, sign: int = 1) -> Ranked:
 
 def _score(track: Trajectory) -> Floats:
     """Return the lowest score of the cameras, (N,); NaN without scores."""
-    scores = np.stack([np.full(len(track), np.inf), *(camera.score for camera in track.cameras.values())])
-    lowest = np.fmin.reduce(scores)
-    return np.asarray(np.where(np.isfinite(lowest), lowest, np.nan), np.float64)
+    scores = [np.full(len(track), np.nan), *(camera.score for camera in track.cameras.values())]
+    return np.asarray(np.fmin.reduce(scores), np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,10 +185,6 @@ class BadStretch:
 
     first: int  # row of the track
     last: int  # row, included
-    first_number: int  # the experiment's
-    last_number: int
-    start_s: float
-    end_s: float  # of the last frame
     doubtful: int  # frames
     not_valid: int  # frames
     reasons: tuple[tuple[str, int], ...]  # warning, and its number of frames; the most frequent first
@@ -203,7 +197,6 @@ class BadStretch:
 
 def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
     """Return the quality of n bins of frames, each represented by its worst one, for JSON; None where unknown.
-
     `numbers` (N,) are the experiment's; None: by the times. A bin is one frame, or more of a long track.
     """
     size = max(1, -(-len(track) // MOST_BINS))
@@ -260,9 +253,8 @@ def _cameras_apart_deg(track: Trajectory) -> Floats | None:
     return np.asarray(np.fmax.reduce(pairs), np.float64) if pairs else None
 
 
-def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:
-    """Find runs of bad frames, joined over fewer than ten good ones, longest first; `numbers` as for `strip_of`."""
-    numbers = frame_numbers(track) if numbers is None else numbers
+def bad_stretches(track: Trajectory) -> list[BadStretch]:
+    """Find runs of bad frames, joined over fewer than ten good ones, longest first."""
     doubts, status = _doubts(track), status_of(track)
     bad, found = np.flatnonzero(status), []
     parts = np.split(bad, np.flatnonzero(np.diff(bad) > STRETCH_FRAMES) + 1) if len(bad) else []
@@ -270,18 +262,8 @@ def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStr
         inside = slice(first, last + 1)
         _, doubtful, not_valid = np.bincount(status[inside], minlength=3).tolist()
         counted = Counter({words: int(there[inside].sum()) for words, there in doubts.items() if there[inside].any()})
-        stretch = BadStretch(
-            first=first,
-            last=last,
-            first_number=int(numbers[first]),
-            last_number=int(numbers[last]),
-            start_s=float(track.time[first]),
-            end_s=float(track.time[last]),
-            doubtful=doubtful,
-            not_valid=not_valid,
-            reasons=tuple(counted.most_common()),
-        )
-        found.append(stretch)
+        reasons = tuple(counted.most_common())
+        found.append(BadStretch(first=first, last=last, doubtful=doubtful, not_valid=not_valid, reasons=reasons))
     return sorted(found, key=lambda stretch: (-stretch.frames, -stretch.not_valid, stretch.first))
 
 

@@ -22,7 +22,6 @@ from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes, draw_outline, draw_pictures
 from sphereorient.trajectory import Trajectory
 
-COUNT = 120
 BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
 QUALITY = 85  # of the JPEG
 TO_COMPARE = "good; to compare with"
@@ -40,10 +39,6 @@ class GalleryFrame:
     """The picture of one frame; a part of `Gallery`."""
 
     k: int  # row of the track
-    number: int  # the experiment's
-    time_s: float
-    status: int  # index in frame_warnings.STATUS_WORDS
-    rank: int  # 0: chosen first, the worst
     words: tuple[str, ...]  # why it was chosen
     jpeg: bytes
 
@@ -62,25 +57,21 @@ class GalleryFrame:
 class Gallery:
     """Pictures of some frames; made by `gallery`, read by the page."""
 
-    frames: tuple[GalleryFrame, ...]  # k increasing
+    frames: tuple[GalleryFrame, ...]  # in the order of the choice, the worst first
     numbers: Rows  # (N,), the experiment's numbers of all frames of the track
     cameras: tuple[str, ...]  # from left to right
     size: tuple[int, int]  # width and height of every picture, px
 
 
 def gallery(
-    track: Trajectory, experiment: Experiment, count: int = COUNT, progress: Progress = lambda done, total: None
+    track: Trajectory, experiment: Experiment, count: int, progress: Progress = lambda done, total: None
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
-
     Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another
     experiment, MovieError for a movie that cannot be opened.
     """
     why = chosen_frames(track, count)
-    rows = np.array(sorted(why), dtype=np.int64)
-    rank = {k: place for place, k in enumerate(why)}
-    status = quality.status_of(track)
-    frames = []
+    rows, frames = np.array(sorted(why), dtype=np.int64), {}
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, None, opened)
         for done, (k, pictures) in enumerate(pictures_by_row(streams, rows), start=1):
@@ -88,28 +79,19 @@ def gallery(
             _draw_pairs(canvas, page, k, pictures, (0, 0))
             # No subsampling: it blurs thin coloured lines.
             Image.fromarray(canvas.finished()).save(jpeg, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
-            frame = GalleryFrame(
-                k=k,
-                number=int(page.numbers[k]),
-                time_s=float(track.time[k]),
-                status=int(status[k]),
-                rank=rank[k],
-                words=why[k],
-                jpeg=jpeg.getvalue(),
-            )
-            frames.append(frame)
+            frames[k] = GalleryFrame(k=k, words=why[k], jpeg=jpeg.getvalue())
             progress(done, len(rows))
-    return Gallery(frames=tuple(frames), numbers=page.numbers, cameras=page.cameras, size=_pairs_size(page))
+    chosen = tuple(frames[k] for k in why)
+    return Gallery(frames=chosen, numbers=page.numbers, cameras=page.cameras, size=_pairs_size(page))
 
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
-
     The worst frame is first, then the middles of the longest stretches. Two thirds are bad frames; good ones, spread
     evenly, serve to compare.
     """
     status = quality.status_of(track)
-    good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status != quality.GOOD)
+    good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status)
     room = min(count, len(track))
     bad_room = room - min(len(good), room - round(BAD_SHARE * room))
     worst = quality.choose_worst(track, max(bad_room, min(room, 1)))
@@ -121,7 +103,7 @@ def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
                 why[k] = words
 
     # At most half are middles, so that frames of `choose_worst` are shown too.
-    fill(dict(_middles(track, bad, quality.bad_stretches(track))), -(-bad_room // 2))
+    fill(dict(_middles(track, bad)), -(-bad_room // 2))
     fill({k: words for k, words in worst.items() if not words[0].startswith("not in doubt")}, bad_room)
     left = np.setdiff1d(bad, list(why))
     fill({k: tuple(quality.frame_warnings(track, k)) for k in _spread(left, bad_room - len(why))}, bad_room)
@@ -130,9 +112,9 @@ def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     return why
 
 
-def _middles(track: Trajectory, bad: Rows, found: list[quality.BadStretch]) -> Iterator[tuple[int, tuple[str, ...]]]:
+def _middles(track: Trajectory, bad: Rows) -> Iterator[tuple[int, tuple[str, ...]]]:
     """Yield the bad frame nearest to the middle of each stretch."""
-    for stretch in found:
+    for stretch in quality.bad_stretches(track):
         inside = bad[np.searchsorted(bad, stretch.first) : np.searchsorted(bad, stretch.last, "right")]
         k = int(inside[np.abs(inside - (stretch.first + stretch.last) / 2).argmin()])
         place = "alone among good ones" if stretch.frames == 1 else f"in a stretch of {stretch.frames} frames"
@@ -140,9 +122,8 @@ def _middles(track: Trajectory, bad: Rows, found: list[quality.BadStretch]) -> I
 
 
 def _spread(rows: Rows, count: int) -> list[int]:
-    if count <= 0 or not len(rows):
-        return []
-    at = (np.arange(min(count, len(rows))) + 0.5) * len(rows) / min(count, len(rows))
+    count = max(0, min(count, len(rows)))
+    at = (np.arange(count) + 0.5) * len(rows) / max(count, 1)
     return [int(k) for k in rows[at.astype(np.int64)]]
 
 
@@ -156,7 +137,6 @@ def worst_frames(
     progress: Progress = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
     """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
-
     Raise the errors of `gallery`, and OutputError for another suffix or a file that cannot be written.
     """
     check_ending(path, "--worst", SUFFIXES)
@@ -174,30 +154,19 @@ def worst_frames(
         canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
         corner = {k: (BETWEEN + i % columns * across, HEAD + i // columns * down) for i, k in enumerate(bad)}
         for done, (k, pictures) in enumerate(pictures_by_row(streams, np.array(sorted(bad), np.int64)), start=1):
-            _tile(canvas, page, k, bad[k], pictures, corner[k])
+            left, top = corner[k]
+            canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {track.time[k]:.4f} s", 14)
+            _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
+            lines = [line for words in bad[k] for line in textwrap.wrap(words, int(width / LETTER_PX))]
+            if len(lines) > LINES:
+                lines = [*lines[: LINES - 1], f"{lines[LINES - 1]} ..."]
+            colour = ink.INK if bad[k][0].startswith("not in doubt") else ink.DOUBT
+            for row, line in enumerate(lines):
+                canvas.text((left, top + TITLE + TILE + 17 + row * LINE), line, 13, colour)
             progress(done, len(bad))
     with put_aside(path) as aside:
         Image.fromarray(canvas.finished()).save(aside)
     return bad
-
-
-def _tile(
-    canvas: Canvas,
-    page: Page,
-    k: int,
-    why: Sequence[str],
-    pictures: Mapping[str, Grey | None],
-    corner: tuple[int, int],
-) -> None:
-    left, top = corner
-    canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {page.balls[0].track.time[k]:.4f} s", 14)
-    _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
-    lines = [line for words in why for line in textwrap.wrap(words, int(_pairs_size(page)[0] / LETTER_PX))]
-    if len(lines) > LINES:
-        lines = [*lines[: LINES - 1], f"{lines[LINES - 1]} ..."]
-    colour = ink.INK if why[0].startswith("not in doubt") else ink.DOUBT
-    for row, line in enumerate(lines):
-        canvas.text((left, top + TITLE + TILE + 17 + row * LINE), line, 13, colour)
 
 
 def _pairs_size(page: Page) -> tuple[int, int]:

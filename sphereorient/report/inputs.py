@@ -24,6 +24,7 @@ from sphereorient.preflight.sample import MovieSample
 from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, say_empty, spread, write_figure
 from sphereorient.report.texture_map import draw_map
 
+Floats = NDArray[np.float64]
 EXPECTED, FOUND, USED = AXIS_COLOURS
 OUTLIER = "#CC79A7"
 # Shape and colour both: readable without colours, and by colour-blind readers.
@@ -44,15 +45,12 @@ def contact_sheet(movie: Movie, seen: Survey, path: Path) -> None:
     height, width = movie.frame_shape
     figure = new_figure(WIDTH, HEAD + rows * ((WIDTH / COLUMNS) * height / width + TITLE))
     known = [(frame.small, frame.fault) for frame in seen.frames if frame.small is not None]
-    pictures = [small for small, fault in known if not fault] or [small for small, _ in known]
-    values = np.concatenate([picture.ravel() for picture in pictures]) if pictures else np.array([0.0])
+    good = [grey for grey, fault in known if not fault] or [grey for grey, _ in known]
+    values = np.concatenate([part.ravel() for part in good]) if good else np.zeros(1)
     black = float(values.min())
     white = max(float(np.quantile(values, BRIGHT_QUANTILE)), black + 1)
-    figure.suptitle(
-        f"{movie.path.name}: {len(movie)} frames of {width} x {height} px, {8 * movie.dtype.itemsize} bit\n"
-        f"grey levels {black:.0f} (black) to {white:.0f} (white)",
-        fontsize=11,
-    )
+    title = f"{movie.path.name}: {len(movie)} frames of {width} x {height} px, {8 * movie.dtype.itemsize} bit\n"
+    figure.suptitle(f"{title}grey levels {black:.0f} (black) to {white:.0f} (white)", fontsize=11)
     axes = np.ravel(figure.subplots(rows, COLUMNS, squeeze=False))
     for ax, frame in zip(axes, seen.frames, strict=False):
         _draw_frame(ax, frame, movie, black, white)
@@ -121,9 +119,7 @@ def _draw_picture(ax: Any, one: PictureReport) -> None:
     ax.legend(loc="lower right", frameon=True, framealpha=0.8)
 
 
-def _draw_residuals(
-    ax: Any, place: NDArray[np.float64], missed: NDArray[np.float64], image_size: tuple[int, int]
-) -> None:
+def _draw_residuals(ax: Any, place: Floats, missed: Floats, image_size: tuple[int, int]) -> None:
     usual = float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else 1.0
     # The arrow of the usual length is a fortieth of the picture long.
     times = image_size[0] / 40 / max(usual, 1e-9)
@@ -133,7 +129,7 @@ def _draw_residuals(
     ax.set_title(f"found less expected, {times:.0f} times", fontsize=9)
 
 
-def _draw_histogram(ax: Any, missed: NDArray[np.float64], rms_px: float) -> None:
+def _draw_histogram(ax: Any, missed: Floats, rms_px: float) -> None:
     reach = 4 * max(rms_px, 1e-6) / np.sqrt(2)
     for part, colour, label in zip(missed.T, (FOUND, EXPECTED), ("u", "v"), strict=True):
         ax.hist(part, np.linspace(-reach, reach, 41), histtype="step", lw=1.5, color=colour, label=label)
@@ -185,10 +181,7 @@ def preflight_figure(result: Preflight, path: Path) -> None:
     heights = [PICTURE, PICTURE if agreement else 0.01, LINE * (len(lines) + 2)]
     figure = new_figure(WIDTH, sum(heights))
     top, middle, bottom = np.ravel(figure.subfigures(3, 1, height_ratios=heights, squeeze=False))
-    if result.samples:
-        _cameras_part(top, result)
-    else:
-        _scene_part(top, result)
+    (_cameras_part if result.samples else _scene_part)(top, result)
     if agreement:
         gap, balance, pair = middle.subplots(1, 3, width_ratios=[1.1, 1.5, 1.4])
         _draw_gap(gap, result)
@@ -206,9 +199,8 @@ def _cameras_part(part: Any, result: Preflight) -> None:
     axes = part.subplots(1, 2 * several)
     for ax in axes[2 * len(result.samples) :]:
         ax.set_axis_off()
-    diameter_mm, position = result.experiment.diameter_mm, torch.full((3,), torch.nan)
-    if result.scans:
-        position = sample_positions(result.samples)[k]
+    diameter_mm = result.experiment.diameter_mm
+    position = sample_positions(result.samples)[k] if result.scans else torch.full((3,), torch.nan)
     for sample, pair in zip(result.samples, axes.reshape(several, 2), strict=False):
         expected = None  # by all cameras and the diameter, (n, 2) px
         if diameter_mm is not None and bool(torch.isfinite(position).all()):
@@ -230,7 +222,7 @@ def _scene_part(part: Any, result: Preflight) -> None:
         ax.set_title(f"{view.name}, frame {view.frame}: disks, and the balls found by their paint", fontsize=9)
 
 
-def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float64] | None, near: bool) -> None:
+def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: Floats | None, near: bool) -> None:
     picture, (outline, reason) = sample.picture[k], sample.found[k]
     _show(ax, np.zeros(sample.stream.movie.frame_shape) if picture is None else picture)
     if outline is not None:

@@ -18,7 +18,6 @@ from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
-from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
 from sphereorient.report.plots.style import spread
@@ -29,7 +28,6 @@ SAMPLE = 16  # frames from which light and brightness are taken
 NEAR_FRAMES = 0.5  # frames: largest distance in time of a picture from the track's frame
 DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures that are shown black and white
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
-H264 = {"crf": "19", "preset": "veryfast"}
 Rows = NDArray[np.int64]
 Progress = Callable[[int, int], None]
 
@@ -45,12 +43,9 @@ class FrameSelection:
 
     def rows(self, numbers: Rows) -> Rows:
         """Return the rows to show, from the experiment's numbers of all frames (N,); TrackError if there are none."""
-        wanted = np.ones(len(numbers), bool)
-        if self.first is not None:
-            wanted &= numbers >= self.first
-        if self.last is not None:
-            wanted &= numbers < self.last
-        chosen = np.flatnonzero(wanted)[:: self.every]
+        first = -np.inf if self.first is None else self.first
+        last = np.inf if self.last is None else self.last
+        chosen = np.flatnonzero((numbers >= first) & (numbers < last))[:: self.every]
         if not len(chosen):
             expected, do = f"frames within {numbers[0]}:{numbers[-1] + 1}", "correct --frames"
             got = f"{'' if self.first is None else self.first}:{'' if self.last is None else self.last}"
@@ -67,10 +62,9 @@ def overlay_movie(
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
-    All spheres, by name, are drawn into the same frames.
-
-    Raise ExperimentError for a camera that track or experiment do not have, TrackError if no frame of the track is in
-    the range, OutputError for a suffix that is not a movie's, or a file that cannot be written.
+    All spheres, by name, are drawn into the same frames. Raise ExperimentError for a camera that track or experiment do
+    not have, TrackError if no frame of the track is in the range, OutputError for a suffix that is not a movie's, or a
+    file that cannot be written.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
@@ -102,31 +96,28 @@ def prepared(
         got, do = "none", "write --cameras cam1, or leave it out"
         raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
     numbers, streams = streams_of(known[0], experiment, names, opened)
-    return Page(numbers=numbers, balls=[_ball(track, experiment, streams) for track in known]), streams
-
-
-def _ball(track: Trajectory, experiment: Experiment, streams: Mapping[str, CameraStream]) -> Ball:
-    sphere = experiment.of(track.sphere)
-    texture = None if sphere.texture_path is None else load_texture(sphere.texture_path)
-    where = path_of(track, sphere.radius_mm)
-    models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
-    views = [_view(track, model, stream) for model, stream in zip(models, streams.values(), strict=True)]
-    return Ball(track=track, views=views)
+    balls = []
+    for track in known:
+        sphere = experiment.of(track.sphere)
+        texture = None if sphere.texture_path is None else load_texture(sphere.texture_path)
+        where = path_of(track, sphere.radius_mm)
+        models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
+        views = [_view(track, *each) for each in zip(models, streams.values(), strict=True)]
+        balls.append(Ball(track=track, views=views))
+    return Page(numbers=numbers, balls=balls), streams
 
 
 def streams_of(
     track: Trajectory, experiment: Experiment, names: Sequence[str], opened: ExitStack
 ) -> tuple[Rows, dict[str, CameraStream]]:
     """Find a track's frames by time: their numbers (N,), and the streams by camera; `opened` closes them.
-
     Raise TrackError if no frame is found.
     """
     movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
     known = timeline(experiment, movies)
     after = np.searchsorted(known.time_s, track.time).clip(1, max(len(known) - 1, 1))
     low, high = after - 1, np.minimum(after, len(known) - 1)
-    nearer = np.abs(known.time_s[high] - track.time) < np.abs(known.time_s[low] - track.time)
-    at = np.where(nearer, high, low)
+    at = np.where(np.abs(known.time_s[high] - track.time) < np.abs(known.time_s[low] - track.time), high, low)
     step = known.frame_s if len(known) > 1 else np.inf
     near = np.abs(known.time_s[at] - track.time) <= NEAR_FRAMES * step
     if not near.any():
@@ -167,7 +158,7 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
     known = [(k, picture) for k, picture in pictures if picture is not None]
     greys = np.concatenate([np.zeros(0), *(picture[::3, ::3].ravel() for _, picture in known)])
     black, white = np.percentile(greys, (DARK, BRIGHT)) if len(greys) else (0.0, 1.0)
-    light: DiskLight | None = None
+    light = None
     if len(good) and np.isfinite(half_px) and model.texture is not None:
         side = crop_side(half_px)
         model = replace(model, texture=reduced_texture(model.texture, side / MARGIN))
@@ -186,7 +177,6 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
-
     Raise OutputError for a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
     check_ending(path, "--out", FORMATS)
@@ -195,7 +185,7 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -
     with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format=kind) as container:
         for picture in pictures:
             if not count:
-                stream = container.add_stream("libx264", rate=rate, options=dict(H264))
+                stream = container.add_stream("libx264", rate=rate, options={"crf": "19", "preset": "veryfast"})
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")

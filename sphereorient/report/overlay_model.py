@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera
-from sphereorient.errors import TextureError, refusal
 from sphereorient.movies import Grey
 from sphereorient.pose.lights.disk import DiskLight, light_basis, solved_light
 from sphereorient.preflight.cameras import expected_outline_px
@@ -89,10 +88,9 @@ class CropWindow:
 
 def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
     """Return a picture within a window, (side, side) grey levels; NaN outside the picture."""
-    at = window.grid_px().astype(np.float32)
-    u, v, nan = at[..., 0], at[..., 1], float("nan")
+    u, v = window.grid_px().astype(np.float32).transpose(2, 0, 1)
     grey = picture.astype(np.float32)
-    found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
+    found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
     return np.asarray(found, np.float32)
 
 
@@ -118,9 +116,7 @@ class Model:
 
     def look(self, k: int, window: CropWindow) -> SeenDisk:
         """Return paint and places in a window of frame k, the mean of finer samples, ports included."""
-        if self.texture is None:
-            do = "draw the track of an experiment with a texture"
-            raise TextureError(refusal("model", expected="a map of the paint", got="none", do=do))
+        assert self.texture is not None  # without a map no light is fitted, and nothing is rendered
         rays = self.camera.rays(torch.from_numpy(window.grid_px(FINE)))
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
         seen = see_sphere(rays, centre, R, self.texture, self.path.radius_mm)
@@ -158,7 +154,6 @@ def lit_picture(light: DiskLight, seen: SeenDisk, filmed: NDArray[np.float32] | 
 
 def fit_light(pairs: Iterable[tuple[SeenDisk, NDArray[np.float32]]]) -> DiskLight | None:
     """Fit one light to all given frames of one camera (model, crop in grey levels); None if too few pixels are known.
-
     It has no noise, glints or stray light, which a crop is not compared with.
     """
     # One light for all frames: a fit of each frame would hide a part of a wrong orientation.

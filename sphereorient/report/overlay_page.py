@@ -195,7 +195,6 @@ class Ball:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Page:
     """Draws frames of the tracks of a recording, all in one layout; made by `overlay.prepared`.
-
     Beside the frame of each camera, every sphere has a row of panels: crop, re-rendered, residual.
     """
 
@@ -261,10 +260,8 @@ class Page:
             frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], TRAIL, 1)
         canvas.text((corner[0] + 8, corner[1] + 20), views[0].name, 16)
         frame.say("no picture" if picture is None else "", 16)
-        for colour in (LOST, DOUBT):
-            if colour in states:
-                frame.border(colour, 3)
-                break
+        if worst := [colour for colour in (LOST, DOUBT) if colour in states]:
+            frame.border(worst[0], 3)
 
     def _foot(self, canvas: Canvas, k: int, top: int) -> None:
         width, frames = canvas.pixels.shape[1], sum(len(ball.track) for ball in self.balls)
@@ -300,9 +297,9 @@ class Panels:
         seen = self.ball.track.cameras[view.name]
         window, panels = view.window(seen, k), []
         for column, title in enumerate((f"{self.ball.name} crop".strip(), "re-rendered", "residual")):
-            at = (corner[0] + column * (side + GAP), corner[1] + TITLE)
-            canvas.text((at[0], at[1] - 7), title, 14, FAINT)
-            panels.append(crop_panel(canvas, at, side, window))
+            left, top = corner[0] + column * (side + GAP), corner[1] + TITLE
+            canvas.text((left, top - 7), title, 14, FAINT)
+            panels.append(crop_panel(canvas, (left, top), side, window))
         blank = "no position"
         if window.known:
             drawn = draw_pictures(panels, view, k, picture, window, self.others)
@@ -347,7 +344,7 @@ class Panels:
 def state_strip(canvas: Canvas, track: Trajectory, k: int, corner: tuple[int, int], size: tuple[int, int]) -> None:
     """Draw the states of all frames side by side, and a mark at frame k; a pixel shows the worst of its frames."""
     (left, top), (width, height) = corner, size
-    state = np.where(track.valid, np.where(shown_flags(track) != 0, 1, 0), 2)
+    state = np.where(track.valid, shown_flags(track) != 0, 2)
     edges = np.linspace(0, len(state), width + 1)
     first = edges[:-1].astype(int)
     last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
@@ -396,20 +393,19 @@ def rendered(
 ) -> NDArray[np.float32]:
     """Return the spheres of one camera as they are seen, nearer before farther, (side, side); NaN beside them."""
     whole = np.full((window.side, window.side), np.nan, np.float32)
-    known = [view for view in views if view.model.path.whole[k] and view.light is not None]
-    for view in sorted(known, key=lambda view: view.depth_mm(k)):
+    known = [(view, view.light) for view in views if view.model.path.whole[k] and view.light is not None]
+    for view, light in sorted(known, key=lambda one: one[0].depth_mm(k)):
         there = np.isnan(whole)
         shown = None if filmed is None else np.where(there, filmed, np.float32(np.nan))
-        if view.light is not None:
-            whole = np.where(there, lit_picture(view.light, view.model.look(k, window), shown), whole)
+        whole = np.where(there, lit_picture(light, view.model.look(k, window), shown), whole)
     return whole
 
 
 def residual_colours(residual: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a residual relative to the contrast as colours: blue too dark, black equal, orange too bright."""
     share = np.clip(np.nan_to_num(residual) / RESIDUAL_REACH, -1, 1)[..., None]
-    ends = np.where(share < 0, np.array(AXES[2], np.float32), np.array(AXES[0], np.float32))
-    colours: NDArray[np.uint8] = np.asarray(np.abs(share) * ends, np.uint8)
+    ends = np.where(share < 0, *np.array([AXES[2], AXES[0]], np.float32))
+    colours = np.asarray(np.abs(share) * ends, np.uint8)
     colours[np.isnan(residual)] = BLANK
     return colours
 

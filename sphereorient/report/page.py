@@ -10,25 +10,16 @@ from typing import Any
 import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined, Template
-from numpy.typing import NDArray
 
 from sphereorient.files.provenance import versions
 from sphereorient.report import frame_warnings as quality
-from sphereorient.report.gallery import Gallery, GalleryFrame
+from sphereorient.report.gallery import Gallery
 from sphereorient.report.plots.style import SYMBOLS, decimals, superscript
 from sphereorient.report.tables import Table
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
 from sphereorient.trajectory import Trajectory
 
-CONTENTS = (
-    ("summary", "Summary"),
-    ("numbers", "Numbers"),
-    ("figures", "Figures"),
-    ("frames", "Frame by frame"),
-    ("tables", "Tables"),
-    ("settings", "Settings and provenance"),
-)
 MOST_STRETCHES = 200  # rows of the table
 UNFOLDED = 12  # pictures that are visible without JavaScript
 Cell = tuple[str, str]  # a number or words, and the interval
@@ -37,7 +28,6 @@ Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells;
 
 def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, **parts: Any) -> str:
     """Return the page of a report, from statistics, tracks by the name of their file, and the command that made it.
-
     `parts`: verdicts; figures (name, title, caption, png in base64, width in px); tables that were written, and the
     suffixes of their files; strips, HTML of `strip_html`.
     """
@@ -49,14 +39,15 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
         what = f"Motion of {len(tracks)} spheres"
     elif len(tracks) > 1:
         what += f", {len(tracks)} tracks compared"
+    around = {key: value for key, value in vars(summary.surroundings).items() if value is not None}
+    settings = summary.settings.model_dump() | {"surroundings": around}
     page = {
         "title": f"{what}: {_some(names)}" if names else what,
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
-        "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
         "each": _each(tables["tracks"]) if len(tracks) > 1 else None,
         "grids": [grid for grid in (*_moments(summary), _flow(tables)) if grid["rows"]],
-        "settings": _settings(summary),
+        "settings": str(yaml.safe_dump(settings, sort_keys=False)).rstrip(),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
         "footer": f"sphereorient {versions()['sphereorient']}; {command}",
     }
@@ -84,45 +75,36 @@ def strip_assets() -> tuple[str, str]:
 
 def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     """Return the HTML section (text escaped) with the quality of every frame of a track; needs `strip_assets`.
-
     Without JavaScript it shows a table of the bad stretches and the pictures; with it, interactive strips.
     """
     numbers = quality.frame_numbers(track) if gallery is None else gallery.numbers
-    strip, found = quality.strip_of(track, numbers), quality.bad_stretches(track, numbers)
-    ranked = [] if gallery is None else sorted(gallery.frames, key=lambda frame: frame.rank)
+    found = quality.bad_stretches(track)
+    shown = () if gallery is None else gallery.frames
     return _template("strip.html.j2").render(
         name=name,
-        strip=strip,
-        worst=_worst(track, numbers),
+        numbers=numbers,
+        time_s=track.time,
+        status=quality.status_of(track),
+        strip=quality.strip_of(track, numbers),
+        worst=quality.choose_worst(track, 1),
         stretches=found[:MOST_STRETCHES],
         more=found[MOST_STRETCHES:],
-        reasons=_reasons,
         gallery=gallery,
-        unfolded=ranked[:UNFOLDED],
-        folded=sorted(ranked[UNFOLDED:], key=lambda frame: frame.k),
+        unfolded=shown[:UNFOLDED],
+        folded=sorted(shown[UNFOLDED:], key=lambda frame: frame.k),
         caption=_caption,
     )
 
 
-def _worst(track: Trajectory, numbers: NDArray[np.int64]) -> dict[str, Any] | None:
-    found = quality.choose_worst(track, 1).items()
-    shown = [{"k": k, "number": int(numbers[k]), "time_s": float(track.time[k]), "words": why} for k, why in found]
-    return shown[0] if shown else None
+def _caption(status: int, why: Sequence[str]) -> str:
+    good = quality.STATUS_WORDS[status]
+    words = [words for words in why if words != good]
+    return "; ".join(words if words and words[0].startswith(good) else [good, *words])
 
 
-def _reasons(stretch: quality.BadStretch) -> str:
-    return "; ".join(f"{words} ({count})" for words, count in stretch.reasons) or "no reason given"
-
-
-def _caption(frame: GalleryFrame) -> str:
-    status = quality.STATUS_WORDS[frame.status]
-    words = [words for words in frame.words if words != status]
-    return "; ".join(words if words and words[0].startswith(status) else [status, *words])
-
-
-def _some(names: Sequence[str], most: int = 4) -> str:
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return ", ".join(names[:4]) + more
 
 
 def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str, str]]:
@@ -199,10 +181,8 @@ def _moments(summary: Summary) -> list[Grid]:
 
 def _cell(of: Interval, most: int) -> Cell:
     value, low, high = float(of.value), float(of.low), float(of.high)
-    if not math.isfinite(value):
-        return "\u2013", ""
-    if not math.isfinite(low + high):
-        return f"{value:.4g}", ""
+    if not math.isfinite(value + low + high):
+        return f"{value:.4g}" if math.isfinite(value) else "\u2013", ""
     digits = min(decimals(high - low), most)
     return f"{value:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}"
 
@@ -214,20 +194,14 @@ def _flow(tables: Mapping[str, Table]) -> Grid:
     return {"title": "The sphere and its flow", "about": about, "head": ["", "", "value"], "rows": cells}
 
 
-def _settings(summary: Summary) -> str:
-    around = {key: value for key, value in vars(summary.surroundings).items() if value is not None}
-    return str(yaml.safe_dump(summary.settings.model_dump() | {"surroundings": around}, sort_keys=False)).rstrip()
-
-
 def _provenance(name: str, track: Trajectory) -> dict[str, Any]:
     entries = [("experiment", track.experiment), ("method", track.method), ("frame rate, Hz", f"{track.frame_rate:g}")]
     for key, value in track.provenance.items():
+        text = str(value)
         if isinstance(value, Mapping):
             text = ", ".join(f"{inner} {entry}" for inner, entry in value.items())
         elif isinstance(value, list | tuple):
             text = "; ".join(map(str, value))
-        else:
-            text = str(value)
         if text:
             entries.append((str(key), text))
     return {"name": name, "entries": entries, "settings": track.settings.rstrip()}

@@ -26,7 +26,7 @@ from sphereorient.trajectory import Flag, Reason, Trajectory
 POOLED = ("x", "y", "z", "all")
 VECTOR = ("x", "y", "z", "vector")
 LIKELIHOODS = ("log_likelihood", "log_likelihood_gaussian", "better_than_gaussian")
-WIDTH_COLUMNS = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
+WIDTHS = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 Row = dict[str, Any]
 Floats = NDArray[np.float64]
 
@@ -37,12 +37,7 @@ class Table:
 
     name: str  # of the file, without suffix
     about: str  # its content, one line
-    rows: Sequence[Row]
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of the columns, with their units at the end."""
-        return list(self.rows[0]) if self.rows else []
+    rows: Sequence[Row]  # names of columns have their units at the end
 
 
 def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> list[Table]:
@@ -67,8 +62,9 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
             ("isotropy", f"shares of the variance, {level}", _each(more.isotropies, _isotropy)),
             ("kernel_widths", f"rms and flatness by kernel width, {level}", _each(more.widths, _width)),
             ("multi_lag", f"rms without noise by many lags, {level}", _each(more.multi_lag, _multi_lag)),
-            ("lift", f"a against omega x v, {level}", _lift(more)),
         ]
+        tabled = {name: of for name, of in vars(more).items() if hasattr(of, "columns")}
+        found += [(name, f"{of.about}, {level}", _rows(**of.columns())) for name, of in tabled.items()]
     tables = [Table(name=name, about=about, rows=list(rows)) for name, about, rows in found]
     return [table for table in tables if table.rows]
 
@@ -84,8 +80,8 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
     import pyarrow.parquet as arrow_parquet
 
     for table in tables:
-        columns = {name: [row[name] for row in table.rows] for name in table.columns}
-        arrow_parquet.write_table(arrow.table(columns), folder / f"{table.name}.parquet", compression="zstd")
+        content = arrow.Table.from_pylist(table.rows)
+        arrow_parquet.write_table(content, folder / f"{table.name}.parquet", compression="zstd")
     return ["csv", "parquet"]
 
 
@@ -232,13 +228,11 @@ def _isotropy(of: Isotropy) -> Row:
 
 
 def _width(of: WidthCurve) -> Row:
-    found = {name: getattr(of, name) for name in WIDTH_COLUMNS}
-    return {"width_s": of.width_s[:, None], "component": list("xyz"), **found}
+    return {"width_s": of.width_s[:, None], "component": list("xyz"), **{name: getattr(of, name) for name in WIDTHS}}
 
 
 def _multi_lag(of: MultiLag) -> Row:
-    found = {name: getattr(of, name) for name in ("rms", "variance", "noise_variance")}
-    return {"component": list("xyz"), **found}
+    return {"component": list("xyz"), "rms": of.rms, "variance": of.variance, "noise_variance": of.noise_variance}
 
 
 def _durations(more: Distributions) -> Iterator[Row]:
@@ -251,8 +245,3 @@ def _angles(more: Distributions) -> Iterator[Row]:
         edges = np.rad2deg(of.edges_rad)
         densities = {"pdf_per_rad": of.pdf, "uniform_pdf_per_rad": of.uniform}
         yield from _rows(angle=of.name, from_deg=edges[:-1], to_deg=edges[1:], **densities)
-
-
-def _lift(more: Distributions) -> Iterator[Row]:
-    if more.lift is not None:
-        yield from _rows(component=VECTOR, correlation=more.lift.correlation, coefficient=more.lift.coefficient)

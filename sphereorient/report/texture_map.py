@@ -65,19 +65,15 @@ def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
     with put_aside(path, also=(RuntimeError,)) as aside:
         track.save(aside)
         with h5py.File(aside, "a") as file:
-            _write_map(learnt, file.create_group("map"))
-
-
-def _write_map(learnt: LearntMap, group: h5py.Group) -> None:
-    for name, description in LEARNT.items():
-        _put(group, name, getattr(learnt, name).numpy(), "1", description)
-    if learnt.rounds:
-        names = [field.name for field in fields(learnt.rounds[0])]
-        table = np.array([[getattr(one, name) for name in names] for one in learnt.rounds], np.float64)
-        _put(group, "rounds", table, "as named", f"one row a round: {', '.join(names)}")
-    for field in fields(learnt.closure):
-        group.attrs[field.name] = getattr(learnt.closure, field.name)
-    group.attrs["blur_px"], group.attrs["arrived"] = learnt.blur_px, learnt.arrived
+            group = file.create_group("map")
+            for name, description in LEARNT.items():
+                _put(group, name, getattr(learnt, name).numpy(), "1", description)
+            if learnt.rounds:
+                names = [field.name for field in fields(learnt.rounds[0])]
+                table = np.array([[getattr(one, name) for name in names] for one in learnt.rounds], np.float64)
+                _put(group, "rounds", table, "as named", f"one row a round: {', '.join(names)}")
+            for name, value in (vars(learnt.closure) | {"blur_px": learnt.blur_px, "arrived": learnt.arrived}).items():
+                group.attrs[name] = value
 
 
 def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, description: str) -> None:
@@ -138,9 +134,8 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
     axes = figure.add_subplot(top[0, 1])
     most = max(int(learnt.seen.max()), 2)
     counts = torch.where(learnt.seen < 1, torch.nan, learnt.seen.double())
-    bar = figure.colorbar(
-        draw_map(axes, counts, "pictures that show it", cmap="viridis", norm=LogNorm(1, most)), ax=axes, shrink=0.8
-    )
+    shown = draw_map(axes, counts, "pictures that show it", cmap="viridis", norm=LogNorm(1, most))
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8)
     ticks = [tick for tick in (1, 3, 10, 30, 100, 300, 1000, 3000) if tick <= most]
     bar.set_ticks(ticks, labels=[str(tick) for tick in ticks])
     bar.minorticks_off()
@@ -197,10 +192,8 @@ def worn_figure(worn: Tensor, texture: Tensor | None) -> Figure:
     whole = torch.full((360, 720), 0.6) if texture is None else texture
     unused = worn_texels(worn, len(whole))
     figure = new_figure(WIDTH_IN, 4.0)
-    axes = figure.subplots()
-    draw_map(
-        axes, whole.masked_fill(unused, torch.nan), f"{100 * worn_share(worn):.0f} % of the paint differs from the map"
-    )
+    axes, title = figure.subplots(), f"{100 * worn_share(worn):.0f} % of the paint differs from the map"
+    draw_map(axes, whole.masked_fill(unused, torch.nan), title)
     axes.set_ylabel("latitude (degrees)")
     map_words = "" if texture is not None else " The map itself is not drawn: the report was made without --experiment."
     note(figure, f"Sand: the paint that the pictures show is not that of the map, and was not used.{map_words}")
@@ -220,9 +213,8 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
         shown = draw_map(panels[1], change, "change of the paint itself", **style)
         figure.colorbar(shown, ax=panels[1], shrink=0.8, extend="both")
         words = " Below: brighter (red) or darker (blue) than everything within 1° in the old map; 1 is white."
-    count = len(comparison.length_rad)
     sizes = "no patch could be located"
-    if count:
+    if count := len(comparison.length_rad):
         rms, most = np.rad2deg([comparison.rms_rad, comparison.max_rad])
         sizes = f"{count} patches located: {rms:.2f}° rms, {most:.2f}° at most; arrows {times:g} times as long"
     note(figure, f"{sizes}, from a patch's place in the old map to its place now. Sand: unknown.{words}")
@@ -242,11 +234,7 @@ def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
     # The map stretches longitudes away from the equator.
     along = moved[:, 0] / latitude.cos().clamp_min(0.1)
     style: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "color": ARROW, "width": 0.0022}
-    axes.quiver(
-        *(torch.rad2deg(part).numpy() for part in (longitude, latitude)),
-        *(times * part.numpy() for part in (along, moved[:, 1])),
-        **style,
-        headwidth=4,
-        headlength=4.5,
-    )
+    place = (torch.rad2deg(part).numpy() for part in (longitude, latitude))
+    arrows = (times * part.numpy() for part in (along, moved[:, 1]))
+    axes.quiver(*place, *arrows, **style, headwidth=4, headlength=4.5)
     return float(times)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from typing import Literal
 
 import numpy as np
 
@@ -21,20 +21,12 @@ GAUSSIAN = 3.0  # flatness
 CLEAR, WEAK = 0.001, 0.05  # p-values below which a finding is clear, or worth a word: a report makes a dozen tests
 
 
-class Grade(StrEnum):
-    """The mark of a verdict."""
-
-    GOOD = "good"
-    NEUTRAL = "neutral"
-    DOUBT = "doubt"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """One sentence on the tracks, a doubt with what to do at its end; made by `verdicts`, printed on the page."""
 
     title: str
-    grade: Grade
+    grade: Literal["good", "neutral", "doubt"]
     words: str
 
 
@@ -49,8 +41,8 @@ def verdicts(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
 def _say(title: str, words: str, do: str = "", *, good: bool = False) -> Verdict:
     """Return a verdict; with something to do it is a doubt."""
     if do:
-        return Verdict(title=title, grade=Grade.DOUBT, words=f"{words}; {do}")
-    return Verdict(title=title, grade=Grade.GOOD if good else Grade.NEUTRAL, words=words)
+        return Verdict(title=title, grade="doubt", words=f"{words}; {do}")
+    return Verdict(title=title, grade="good" if good else "neutral", words=words)
 
 
 def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
@@ -113,9 +105,8 @@ def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:
         if not len(one.distance_rad):
             continue
         median, far = np.rad2deg(np.quantile(one.distance_rad, (0.5, 0.95)))
-        words = (
-            f"{' and '.join(one.cameras)} by themselves differ by {median:.2g}\u00b0 (median), {far:.2g}\u00b0 (95 %)"
-        )
+        names = " and ".join(one.cameras)
+        words = f"{names} by themselves differ by {median:.2g}\u00b0 (median), {far:.2g}\u00b0 (95 %)"
         if one.uncorrected_rad is not None and len(one.uncorrected_rad):
             words += f"; without correction of perspective by {np.rad2deg(np.median(one.uncorrected_rad)):.2g}\u00b0"
         do = "run `sphereorient check`: swapped cameras, movies out of step and a poor calibration look like this"
@@ -154,12 +145,10 @@ def _frames(more: Distributions) -> Iterator[Verdict]:
     for name, row in more.rows.items():
         own = name.removeprefix("omega_")
         sizes = f"off the rotations by {100 * row.lab_residual:.3g} % in lab, {100 * row.body_residual:.3g} % in body"
-        if row.frame in (own, "both"):
-            yield _say(f"Frame of {name}", f"written in {own} components ({sizes})", good=True)
-        else:
-            found = "not in lab or body components" if row.frame == "none" else f"written in {row.frame} components"
-            do = "compute it again from the orientations, see docs/errata.md E6"
-            yield _say(f"Frame of {name}", f"{found} ({sizes})", do)
+        found, right = own if row.frame == "both" else row.frame, row.frame in (own, "both")
+        words = "not in lab or body components" if found == "none" else f"written in {found} components"
+        do = "" if right else "compute it again from the orientations, see docs/errata.md E6"
+        yield _say(f"Frame of {name}", f"{words} ({sizes})", do, good=True)
 
 
 def _isotropy(more: Distributions) -> Iterator[Verdict]:
@@ -183,9 +172,8 @@ def _isotropy(more: Distributions) -> Iterator[Verdict]:
 
 
 def _lift(more: Distributions) -> Iterator[Verdict]:
-    if more.lift is None:
-        return
-    found = more.lift.correlation
-    clear = bool(found.low[3] > 0 or found.high[3] < 0)
-    seen = "the acceleration follows omega x v" if clear else "no correlation of the acceleration with omega x v"
-    yield _say("Lift", f"{seen}: cosine {interval_text(found.part(3))}")
+    if more.lift is not None:
+        found = more.lift.correlation
+        clear = found.low[3] > 0 or found.high[3] < 0
+        seen = "the acceleration follows omega x v" if clear else "no correlation of the acceleration with omega x v"
+        yield _say("Lift", f"{seen}: cosine {interval_text(found.part(3))}")

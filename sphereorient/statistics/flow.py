@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -101,8 +102,13 @@ def _component_rms(moments: Moments) -> float:
 class Lift:
     """Correlation of omega x v with a, lab; made by `lift`. Columns: x, y, z, and the whole vectors (their sum)."""
 
+    about: ClassVar[str] = "a against omega x v"
     correlation: Interval  # (4,), cosine: <a . l> / sqrt(<a^2> <l^2>) with l = omega x v
     coefficient: Interval  # (4,), least squares of a = C omega x v
+
+    def columns(self) -> dict[str, Any]:
+        """Return the columns of its table in a report."""
+        return {"component": ("x", "y", "z", "vector"), **vars(self)}
 
 
 def lift(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Lift:

@@ -1,4 +1,6 @@
-"""All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
+"""All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`.
+A record with `about` and `columns` has a table of the field's name in a report.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress

@@ -153,7 +153,7 @@ def large(path: Path) -> None:
 
 
 FILES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "nothing": (lambda path: None, "expected a file, got none"),
+    "nothing": (lambda path: None, "got no such file"),
     "folder": (Path.mkdir, "got a folder"),
     "empty": (lambda path: path.write_bytes(b""), "another file"),
     "random bytes": (lambda path: path.write_bytes(np.random.default_rng(0).bytes(5000)), "another file"),

@@ -30,9 +30,8 @@ from sphereorient.experiment.experiment import ExperimentKeys
 from sphereorient.files.draft import DraftKey, draft_yaml, given
 from sphereorient.files.whole_file import has_mark
 from sphereorient.movies import open_movie
-from sphereorient.preflight.draft import experiment_keys
 from sphereorient.preflight.fictrac import read_fictrac_config
-from sphereorient.preflight.first_look import FirstLook, look_at
+from sphereorient.preflight.first_look import FirstLook, experiment_keys, look_at
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 ROUND = ["--set", "frame_rate=600", "--set", "sphere.diameter=18"]

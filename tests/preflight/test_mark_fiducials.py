@@ -92,13 +92,14 @@ def test_clicked_fiducials_are_tried_then_saved_and_the_rest_of_the_file_stays(m
     view = next(view for picture, view in views.items() if picture.row == 1)
     assert view.state == "tied"
     assert np.abs(view.uv_px - SCENES[1].centres_px(view.index)).max() < 0.5
-    assert FiducialMarking(marking.path).view(1, None)["tied"] is False  # only by the points of the file
+    again = FiducialMarking(marking.path)
+    assert again.view(again.document.pictures[1], None)["tied"] is False  # only by the points of the file
     assert json.loads(ask(f"{address}/view/1")[1])["clicked"] == points
 
 
 def test_a_saved_picture_can_be_clicked_again(marking):
-    marking.save(1, clicks(*PLATE.fiducials))
-    marking.save(1, clicks((0, 0), (3, 0)))
+    marking.save(marking.document.pictures[1], clicks(*PLATE.fiducials))
+    marking.save(marking.document.pictures[1], clicks((0, 0), (3, 0)))
     entry = yaml.safe_load(marking.path.read_text())["pictures"][1]
     assert entry["clicked"] == {"cam1": clicks((0, 0), (3, 0))}
 
@@ -129,10 +130,10 @@ def test_a_file_that_cannot_be_changed_safely_stays_and_what_to_write_is_told(ma
     marking.path.write_text(changed)
     points = clicks(*PLATE.fiducials)
     with pytest.raises(CameraError, match=r"write clicked: \{cam1: \[\[.*\]\]\} into the entry of pose 1"):
-        marking.save(1, points)
+        marking.save(marking.document.pictures[1], points)
     marking.path.write_text(FILE.replace("pose: 1", "pose: 2"))  # since the page was opened
     with pytest.raises(CameraError, match="expected one entry with pose 1 and cam1, got 0"):
-        marking.save(1, points)
+        marking.save(marking.document.pictures[1], points)
 
 
 def test_another_kind_of_plate_needs_no_clicks(marking):

@@ -146,11 +146,13 @@ def test_the_blur_of_the_limb_is_that_of_the_lens(blur_px):
 def sample_of(*u_px: float, v_px: float = 150.0, radius_px: float = 30.0) -> SimpleNamespace:
     """Sample of consecutive frames with outlines in these columns; picture k is of grey k throughout."""
     outlines = [Outline(u_px=u, v_px=v_px, radius_px=radius_px, rms_px=0.1, coverage=1.0) for u in u_px]
-    seen = sightings_of((one, Reason.OK) for one in outlines)
+    found = [(one, Reason.OK) for one in outlines]
+    seen = sightings_of(found)
     return SimpleNamespace(
         name="cam1",
         frame=np.arange(len(u_px)),
         picture=[np.full((300, 300), k, np.uint8) for k in range(len(u_px))],
+        found=found,
         sightings=seen,
         whole=holds_disk(ALONG_Y, seen.centre_px, seen.radius_px),
     )
@@ -176,9 +178,7 @@ class Greys:
     size_px = 8
 
     def propose(self, disks: torch.Tensor) -> SimpleNamespace:
-        count = len(disks)
-        score = disks.mean((1, 2)).double()
-        return SimpleNamespace(counts=torch.ones(count).long(), offset=torch.arange(count + 1), score=score)
+        return SimpleNamespace(best_score=disks.mean((1, 2)).double())
 
 
 def test_the_map_is_compared_with_whole_disks_where_there_are_any():

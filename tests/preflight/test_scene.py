@@ -13,7 +13,7 @@ from sphereorient.experiment.recording import silent
 from sphereorient.locate.outline import Outline
 from sphereorient.mapping.compare import turned_map
 from sphereorient.preflight.finding import FAULT, OK, WARNING
-from sphereorient.preflight.scene import _counts, _found, _one_paint, _sizes, look_at_scene
+from sphereorient.preflight.scene import ball_sizes, disk_counts, found_balls, look_at_scene, same_paint
 from sphereorient.synth.textures import random_texture
 
 PX_PER_MM = 4.0
@@ -57,23 +57,23 @@ def told(x_mm: dict[str, float | None], true_mm: dict[float, float], **named: fl
     """The findings on sizes where balls are found at x, and disks of true diameters are there."""
     seen = [disk(x, mm) for x, mm in true_mm.items()]
     found = {name: poses(x) for name, x in x_mm.items()}
-    return {one.title.removeprefix("size of ball "): one for one in _sizes([found], [[seen, seen]], balls(**named))}
+    return {one.title.removeprefix("size of ball "): one for one in ball_sizes([found], [[seen, seen]], balls(**named))}
 
 
 def test_more_and_fewer_disks_than_named_balls_are_told():
     seen = [[[disk(0, 14), disk(30, 14)], [disk(0, 14)]]] * 3
-    first, second = _counts(seen, balls(a=14.0))
+    first, second = disk_counts(seen, balls(a=14.0))
     assert (first.severity, second.severity) == (WARNING, OK)
     assert "2 disks in the usual frame (2 to 2), 1 named" in first.measured
     assert "name the other balls" in first.advice
-    first, second = _counts(seen, balls(a=14.0, b=14.0))
+    first, second = disk_counts(seen, balls(a=14.0, b=14.0))
     assert (first.severity, second.severity) == (OK, WARNING)
     assert "leave out of `spheres` what is not there" in second.advice
 
 
 def test_a_ball_that_is_never_found_is_a_fault_and_one_found_now_and_then_a_warning():
     found = [{"a": poses(0.0), "b": poses(None), "c": poses(0.0 if k < 2 else None)} for k in range(4)]
-    a, b, c = _found(found, balls(a=14.0, b=14.0, c=14.0))
+    a, b, c = found_balls(found, balls(a=14.0, b=14.0, c=14.0))
     assert [a.severity, b.severity, c.severity] == [OK, FAULT, WARNING]
     assert b.measured == "found by its paint in 0 of 4 frames"
     assert "spheres.b" in b.advice
@@ -112,5 +112,5 @@ def test_missing_maps_are_told_ball_by_ball(tmp_path):
 def test_two_maps_of_one_paint_are_told():
     a, b = (torch.nn.functional.avg_pool2d(random_texture("patches", seed)[None], 8)[0] for seed in (3, 4))
     turned = turned_map(a, so3.exp(torch.tensor([[0.4, -1.1, 0.7]], dtype=torch.float64))[0])
-    (finding,) = _one_paint({"a.png": a, "b.png": b, "c.png": turned}, silent)
+    (finding,) = same_paint({"a.png": a, "b.png": b, "c.png": turned}, silent)
     assert (finding.title, finding.severity) == ("paint of a.png and c.png", WARNING)

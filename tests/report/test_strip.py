@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import SphereOrientError
-from sphereorient.report.frame_warnings import bad_stretches, frame_numbers, strip_of
+from sphereorient.report.frame_warnings import bad_stretches, frame_numbers, status_of, strip_of
 from sphereorient.report.gallery import GAP, TILE, chosen_frames, gallery
 from sphereorient.report.page import strip_assets, strip_html
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -61,8 +61,6 @@ def test_stretches_are_the_planted_ones_longest_first_with_their_reasons_counted
     assert found[0].reasons == (("cam1: too dark", 20), ("cam2: no clear outline", 10), ("the orientation jumps", 1))
     assert found[1].reasons == (("cam2: no orientation explains the picture", 3),)
     assert dict(found[2].reasons) == {"found again after a loss": 1, "the orientation jumps": 1}
-    assert found[0].start_s == pytest.approx(0.1)
-    assert found[0].end_s == pytest.approx(85 / 600)
 
 
 @pytest.mark.parametrize(("second", "count"), [(19, 1), (20, 1), (21, 2)])
@@ -144,8 +142,6 @@ def test_numbers_are_the_experiments():
     assert strip_of(good_track(30, first=100))["number"][:2] == [100, 101]
     uneven = replace(good_track(4), time=np.array([0.0, 0.0013, 0.0022, 0.0051]))
     assert frame_numbers(uneven).tolist() == [0, 1, 2, 3]
-    given = bad_stretches(changed(good_track(30), 3, valid=False), np.arange(1000, 1030))
-    assert (given[0].first, given[0].first_number) == (3, 1003)
 
 
 def test_one_camera_only_is_no_doubt_where_there_is_no_other():
@@ -245,6 +241,7 @@ def test_the_page_begins_with_the_worst_frame_and_its_reason():
     page = strip_html("planted", troubled(), None)
     first = re.search(r'data-first="(\d+)".*?</p>', page, re.DOTALL)
     assert first[1] == "60"
+    assert "0.1000&thinsp;–&thinsp;0.1417" in page  # s, of the first stretch
     assert "gap of 20 frames begins: cam1: too dark, cam2: no clear outline" in first[0]
     assert first.start() < page.index("strip__main") < page.index("strip__stretches") < page.index("strip__overview")
 
@@ -254,15 +251,14 @@ def test_the_pictures_show_the_ball_within_its_outline():
     track, told = lost_excerpt(), []
     shown = gallery(track, excerpt(), count=6, progress=lambda done, total: told.append((done, total)))
     rows = [frame.k for frame in shown.frames]
-    assert rows == sorted(rows)
     assert 5 in rows
     assert any(20 <= k < 28 for k in rows)
     assert sum(track.valid[k] and k != 5 for k in rows) >= 2
     assert told == [(done, 6) for done in range(1, 7)]
-    assert {frame.status for frame in shown.frames} == {0, 1, 2}
-    assert sorted(frame.rank for frame in shown.frames) == list(range(6))
+    assert set(status_of(track)[rows]) == {0, 1, 2}
+    assert shown.numbers.tolist() == list(range(len(track)))
+    assert rows == list(chosen_frames(track, 6))
     for frame in shown.frames:
-        assert frame.number == frame.k
         picture = np.asarray(Image.open(io.BytesIO(frame.jpeg)).convert("L"), np.float64)
         assert picture.shape == (TILE, 4 * (TILE + GAP) - GAP) == shown.size[::-1]
         v, u = np.mgrid[:TILE, :TILE]

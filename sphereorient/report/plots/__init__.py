@@ -1,5 +1,8 @@
-"""The figures of the paper's section IV: each function returns a figure, `write_figure` writes it."""
+"""The figures of the paper's section IV; a file's `figures` are those on the page of a report."""
 
+from collections.abc import Iterator
+
+from sphereorient.report.plots import distributions, quality, track
 from sphereorient.report.plots.distributions import (
     correlations_figure,
     densities_figure,
@@ -13,5 +16,11 @@ from sphereorient.report.plots.quality import (
     noise_figure,
     widths_figure,
 )
-from sphereorient.report.plots.style import write_figure
+from sphereorient.report.plots.style import Plan, Reported, write_figure
 from sphereorient.report.plots.track import path_figure, track_figure
+
+
+def report_figures(of: Reported) -> Iterator[Plan]:
+    """Yield the figures of a report in its order."""
+    for file in (track, quality, distributions):
+        yield from file.figures(of)

@@ -1,7 +1,8 @@
 """Figures of distributions and correlations: PDFs, increments, autocorrelations, durations of the segments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -26,10 +27,26 @@ SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or l
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
 
 
+def figures(of: look.Reported) -> Iterator[look.Plan]:
+    """Yield the figures of this file in a report."""
+    summary, _, _ = of
+    if (more := summary.distributions) is None:
+        return
+    caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
+    draw = partial(densities_figure, summary, list(more.densities))
+    yield "densities", "PDFs (Figures 11 and 12 of the paper)", caption, draw
+    caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
+    yield "increments", "Increments (Figure 11 of the paper)", caption, partial(increments_figure, more, summary.table)
+    caption = "Autocorrelations and integral times."
+    yield "correlations", "Correlations", caption, partial(correlations_figure, more.correlations)
+    if more.durations is not None:
+        draw = partial(durations_figure, more.durations)
+        yield "durations", "Durations (Figure 9 of the paper)", "Of the segments.", draw
+
+
 @look.in_style
 def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS)) -> Figure:
     """Draw the PDFs of the components of some quantities, in standard deviations, with the fit and the Gaussian.
-
     Raise TrackError if there is a single segment, which has no densities.
     Source: the paper, section IV; Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245.
     """
@@ -37,11 +54,10 @@ def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS))
         got, do = f"{summary.ensemble.segments}", "pass more tracks, or cut a long one with statistics.max_duration_s"
         raise TrackError(refusal("densities", expected="two segments or more", got=got, do=do))
     figure, panels = look.panel_grid(len(quantities), 2.7, 0.5, shared=True)
-    drawn = [summary.distributions.densities[quantity] for quantity in quantities]
-    for axes, quantity, densities in zip(panels, quantities, drawn, strict=True):
+    drawn = {quantity: summary.distributions.densities[quantity] for quantity in quantities}
+    counted = [density for densities in drawn.values() for density in densities]
+    for axes, (quantity, densities) in zip(panels, drawn.items(), strict=True):
         _densities_panel(axes, quantity, densities)
-    counted = [density for densities in drawn for density in densities]
-    for axes in panels:
         axes.set(xlim=_reach(counted), ylim=(_lowest(counted) / 3, 2.0))
     columns = min(2, len(quantities))
     for axes in panels[-columns:]:
@@ -62,11 +78,10 @@ def _densities_panel(axes: Axes, quantity: str, densities: Sequence[Density]) ->
     for style, density in zip(look.COMPONENTS, densities, strict=True):
         there = density.counts > 0
         look.points(axes, density.centres[there], density.pdf.part(there), style)
-        fit = density.fit
+        fit, a = density.fit, float(density.fit.a.value)
         label = f"{style.name}: a = {look.interval_text(fit.a)}, F = {look.three_digits(float(fit.flatness.value))}"
         x = np.linspace(density.edges[0], density.edges[-1], CURVE_POINTS)
-        known = np.isfinite(fit.a.value)
-        y = stretched_exponential(x, float(fit.a.value)) if known else np.full_like(x, np.nan)
+        y = stretched_exponential(x, a) if np.isfinite(a) else np.full_like(x, np.nan)
         axes.plot(x, y, label=label, **(style.drawn | {"linewidth": 0.9}))
         handles.append(style.handle(label, marker=style.marker, linewidth=0.9))
     _gaussian(axes, densities[0])
@@ -100,12 +115,10 @@ def increments_figure(distributions: Distributions, table: Mapping[str, Moments]
     figure = look.new_figure(look.WIDTH_IN, 4.6)
     left, right = figure.subplots(1, 2)
     _shifted_densities(left, distributions)
-    steps = distributions.increments
-    lag_ms = 1e3 * steps.lag_s
+    steps, lag_ms = distributions.increments, 1e3 * distributions.increments.lag_s
     for i, style in enumerate(FOUR):
         of = steps.flatness.part((slice(None), i))
-        right.plot(lag_ms, of.value, marker=style.marker, label=style.name, **style.drawn)
-        look.band(right, lag_ms, of.low, of.high, style)
+        look.curve(right, lag_ms, of, style, marker=style.marker, label=style.name)
     right.set(xscale="log", xlabel="lag (ms)", ylabel="flatness of increments of ω, lab (–)")
     levels = {"Gaussian": (3.0, look.SECOND.line)}
     for name, key, line in (("ω lab", "omega_lab", (0, (1, 1.5))), ("α lab", "alpha_lab", (0, (8, 2)))):
@@ -148,12 +161,10 @@ def correlations_figure(correlations: Mapping[str, Correlation]) -> Figure:
     figure, panels = look.panel_grid(len(correlations), 3.0, 0.4)
     for axes, (quantity, correlation) in zip(panels, correlations.items(), strict=True):
         _correlation_panel(axes, correlation)
-        axes.set_ylabel(f"autocorrelation of {look.SYMBOLS.get(quantity, quantity)} (–)")
-        axes.set_xlabel("lag (ms)")
+        axes.set(xlabel="lag (ms)", ylabel=f"autocorrelation of {look.SYMBOLS.get(quantity, quantity)} (–)")
     figure.align_ylabels()
-    look.note(
-        figure, "markers below the line of zero: integral times with intervals; each panel has its own range of lags"
-    )
+    words = "markers below the line of zero: integral times with intervals; each panel has its own range of lags"
+    look.note(figure, words)
     return figure
 
 
@@ -161,22 +172,20 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
     lag_ms = 1e3 * correlation.lag_s
     axes.axhline(0.0, color="#444444", linewidth=0.6)
     for i, style in enumerate(FOUR):
-        of = correlation.value.part((slice(None), i))
         words = look.interval_text(correlation.integral_time_s.part(i), "ms", 1e3)
         if words != "unknown" and not correlation.reached_zero[i]:
             words = f"above {words}, no zero"
-        axes.plot(lag_ms, of.value, label=f"{style.name}: {words}", **style.drawn)
-        look.band(axes, lag_ms, of.low, of.high, style)
+        look.curve(axes, lag_ms, correlation.value.part((slice(None), i)), style, label=f"{style.name}: {words}")
     for i, style in enumerate(FOUR):
         time = correlation.integral_time_s.part(i).scaled(1e3)
         place = np.array([-0.05 * (1 + i)])  # one below the other, since they are close together
         axes.plot([float(time.value)], place, marker=style.marker, linestyle="none", color=style.colour, label="_")
         axes.hlines(place, [float(time.low)], [float(time.high)], color=style.colour, linewidth=0.9)
     below = np.flatnonzero((correlation.value.value <= 0).any(1))
-    zero = float(lag_ms[below[0]]) if len(below) else float(lag_ms[-1])
+    zero = float(lag_ms[below[0] if len(below) else -1])
     longest = float(np.nanmax(1e3 * correlation.integral_time_s.value, initial=0.0))
-    axes.set_xlim(0.0, max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3))
-    axes.set_ylim(bottom=min(axes.get_ylim()[0], -0.3), top=1.05)
+    end = max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3)
+    axes.set(xlim=(0.0, end), ylim=(min(axes.get_ylim()[0], -0.3), 1.05))
     look.legend_above(axes, title="integral time")
 
 

@@ -1,6 +1,7 @@
 """Figures of isotropy and of what limits the measurement: orientations, noise, kernel widths, camera distances."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -27,6 +28,26 @@ NEAREST = 30.0  # the smaller median over the first of the geometric bins
 GEOMETRIC_BINS = 36
 
 
+def figures(of: look.Reported) -> Iterator[look.Plan]:
+    """Yield the figures of this file in a report."""
+    summary, _, distances = of
+    if any(len(one.distance_rad) for one in distances):
+        title = "Distance of the cameras (Figure 8 of the paper)"
+        caption = "PDF of the angle between two cameras' own orientations."
+        yield "camera_distance", title, caption, partial(camera_distance_figure, distances)
+    if summary.ensemble.segments:
+        caption = "Share of each variance that is noise, or was smoothed away."
+        yield "noise", "Noise", caption, partial(noise_figure, summary.table, summary.ensemble.error)
+    if (more := summary.distributions) is None:
+        return
+    caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
+    yield "kernel_widths", "Kernel widths", caption, partial(widths_figure, more.widths)
+    caption = "Euler angles against the law of uniform attitudes."
+    yield "angles", "Angles (Figure 10 of the paper)", caption, partial(angles_figure, more.angles, more.uniformity)
+    caption = "Shares of the components in the variance, in the lab and in the body."
+    yield "isotropy", "Isotropy", caption, partial(isotropy_figure, more.isotropies)
+
+
 @look.in_style
 def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Figure:
     """Draw PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
@@ -35,17 +56,14 @@ def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Fig
     for axes, angle, style in zip(panels, angles, look.COMPONENTS, strict=True):
         edges_deg = np.rad2deg(angle.edges_rad)
         look.points(axes, (edges_deg[1:] + edges_deg[:-1]) / 2, angle.pdf.scaled(np.pi / 180), style, angle.name)
-        law = {"color": look.SECOND.colour, "linestyle": look.SECOND.line, "linewidth": 1.1}
-        axes.stairs(angle.uniform * np.pi / 180, edges_deg, baseline=None, **law)
-        axes.set_xlabel(rf"$\theta_{angle.name[-1]}$ (degrees)")
-        step = 45 if edges_deg[-1] < 100 else 90
-        axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=np.arange(edges_deg[0], edges_deg[-1] + 1, step))
-    panels[0].set_ylabel("PDF (1/degree)")
-    panels[0].set_ylim(bottom=0.0)
+        axes.stairs(angle.uniform * np.pi / 180, edges_deg, baseline=None, **look.SECOND.drawn)
+        ticks = np.arange(edges_deg[0], edges_deg[-1] + 1, 45 if edges_deg[-1] < 100 else 90)
+        axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=ticks, xlabel=rf"$\theta_{angle.name[-1]}$ (degrees)")
+    panels[0].set(ylabel="PDF (1/degree)", ylim=(0.0, None))
     bins = look.PLAIN.handle("bins with intervals", marker="o", linestyle="none")
     look.legend_of_figure(figure, [bins, look.SECOND.handle("all attitudes equally likely")], ncols=2)
-    words = "uniformity of the attitudes could not be tested"
-    if np.isfinite((of := uniformity).p_value):
+    words, of = "uniformity of the attitudes could not be tested", uniformity
+    if np.isfinite(of.p_value):
         found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
         words = f"{found}: {look.p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames "
         words += f"in {of.segments:,} segments, worth {of.effective:,.0f} independent attitudes"
@@ -66,12 +84,8 @@ def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
     labels = [f"{look.in_frame(name)}\n{look.p_value_text(one.p_value)}" for name, one in isotropies.items()]
     axes.set_xticks(np.arange(len(labels)), labels)
     axes.grid(visible=False, axis="x")
-    axes.set_xlabel("vector and its frame, p-value of isotropy (–)")
-    axes.set_ylabel("share in the variance (%)")
-    if isotropies:
-        axes.set_xlim(-0.5, len(labels) - 0.5)
-    else:
-        look.say_empty(axes)
+    axes.set(xlabel="vector and its frame, p-value of isotropy (–)", ylabel="share in the variance (%)")
+    axes.set_xlim(-0.5, len(labels) - 0.5)
     handles = [style.handle(style.name, marker=style.marker, linestyle="none") for style in look.COMPONENTS]
     look.legend_of_figure(figure, [*handles, look.SECOND.handle("isotropic: a third")], ncols=4)
     return figure
@@ -98,14 +112,11 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
     limit = axes.axhline(100 * WARN_SHARE, label=f"{100 * WARN_SHARE:.0f} %: worth a warning", **look.SECOND.drawn)
     axes.set_xticks(np.arange(len(table)), [look.in_frame(name) for name in table])
     axes.grid(visible=False, axis="x")
-    axes.set_xlabel("vector and its frame (–)")
-    axes.set_ylabel(NOISE_WORDS[error])
+    axes.set(xlabel="vector and its frame (–)", ylabel=NOISE_WORDS[error])
     top = max([100 * WARN_SHARE, *(float(np.nan_to_num([s.value, s.high]).max()) for s in shares)])
+    axes.set(yscale="log" if floor else "linear", ylim=(floor, (1.5 if floor else 1.2) * top))
     if floor:
-        axes.set(yscale="log", ylim=(floor, 1.5 * top))
         look.plain_logarithms(axes.yaxis)
-    else:
-        axes.set_ylim(0.0, 1.2 * top)
     look.legend_above(axes, ncols=4, handles=[*bars, limit])
     if not any(np.isfinite(share.value).any() for share in shares):
         look.say_empty(axes, "the errors of this track are unknown")
@@ -115,13 +126,12 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
 @look.in_style
 def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
     """Draw rms, flatness and share of noise of a and alpha, else of velocity, against the kernel's width.
-
     Filled markers are corrected for the expected noise; their plateau over several widths is the motion's value.
     Source: Voth et al. 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
     shown = [name for name in WIDTHS_OF if name in widths] or list(widths)[:1]
-    figure = look.new_figure(look.WIDTH_IN * max(len(shown), 1) / 2, 6.6)
-    panels = figure.subplots(3, max(len(shown), 1), sharex="col", squeeze=False)
+    figure = look.new_figure(look.WIDTH_IN * len(shown) / 2, 6.6)
+    panels = figure.subplots(3, len(shown), sharex="col", squeeze=False)
     for column, name in zip(panels.T, shown, strict=True):
         _widths_column(column, widths[name])
     figure.align_ylabels()
@@ -141,10 +151,8 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     open_ = {"markerfacecolor": "white", "linestyle": "none"}
     for i, style in enumerate(look.COMPONENTS):
         x, column = width_ms + (i - 1) * nudge, (slice(None), i)
-        for axes, corrected, measured in (
-            (rms, curve.corrected_rms, curve.rms),
-            (flatness, curve.corrected_flatness, curve.flatness),
-        ):
+        for axes, kind in ((rms, "rms"), (flatness, "flatness")):
+            corrected, measured = getattr(curve, f"corrected_{kind}"), getattr(curve, kind)
             look.points(axes, x, corrected.part(column), style, f"{style.name}, corrected", joined=True)
             label = f"{style.name}, measured"
             axes.plot(x, measured.value[column], marker=style.marker, color=style.colour, label=label, **open_)
@@ -153,27 +161,21 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     if (curve.noise_share.value > 0).any():
         share.set_yscale("log")
         look.plain_logarithms(share.yaxis)
-    rms.set_ylim(bottom=0.0)  # a plateau looks level only above zero
-    rms.set_ylabel(f"rms of {symbol} ({unit})")
+    rms.set(ylim=(0.0, None), ylabel=f"rms of {symbol} ({unit})")  # a plateau looks level only above zero
     flatness.set_ylabel(f"flatness of {symbol} (–)")
-    share.set_ylabel(f"noise in the variance of {symbol} (%)")
-    share.set_xlabel("kernel width σ (ms)")
+    share.set(xlabel="kernel width σ (ms)", ylabel=f"noise in the variance of {symbol} (%)")
 
 
 @look.in_style
 def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
     """Draw the PDF of the distance of the cameras' orientations and its median, a panel for each pair of cameras.
-
     Both axes are logarithmic if even bins would show the smaller distances as one bar; the PDF is per degree.
     Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
     """
-    figure = look.new_figure(look.WIDTH_IN * 0.7, 2.9 * max(len(distances), 1))
-    panels = figure.subplots(max(len(distances), 1), 1, squeeze=False)[:, 0]
-    for axes in panels:
+    figure = look.new_figure(look.WIDTH_IN * 0.7, 2.9 * len(distances))
+    panels = figure.subplots(len(distances), 1, squeeze=False)[:, 0]
+    for axes, distance in zip(panels, distances, strict=True):
         axes.set(xlabel="distance of two cameras' orientations (degrees)", ylabel="PDF (1/degree)")
-    if not distances:
-        look.say_empty(panels[0], "no two cameras to compare")
-    for axes, distance in zip(panels, distances, strict=False):
         _distance_panel(axes, distance)
     return figure
 
@@ -181,12 +183,11 @@ def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
 def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
     names = " and ".join(distance.cameras)
     corrected = "distance" if distance.uncorrected_rad is None else "perspective corrected"
-    laws: list[tuple[Floats, Floats, look.LineStyle, str]] = [
-        (distance.distance_rad, distance.pdf, look.ALL, corrected)
+    known: list[tuple[Any, Any, look.LineStyle, str]] = [
+        (distance.distance_rad, distance.pdf, look.ALL, corrected),
+        (distance.uncorrected_rad, distance.uncorrected_pdf, look.SECOND, "not corrected"),
     ]
-    if distance.uncorrected_rad is not None and distance.uncorrected_pdf is not None:
-        laws.append((distance.uncorrected_rad, distance.uncorrected_pdf, look.SECOND, "not corrected"))
-    laws = [(np.rad2deg(values), pdf, style, what) for values, pdf, style, what in laws if len(values)]
+    laws = [(np.rad2deg(of), pdf, style, what) for of, pdf, style, what in known if of is not None and len(of)]
     if not laws:
         look.say_empty(axes, f"no frame in which {names} both have an orientation")
         return
@@ -206,8 +207,7 @@ def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
         axes.stairs(pdf, edges, color=style.colour, linestyle=style.line, linewidth=1.2, label=label)
         axes.axvline(median, color=style.colour, linestyle=style.line, linewidth=0.8)
     if even:
-        axes.set_xlim(0.0, float(edges[-1]))
-        axes.set_ylim(bottom=0.0)
+        axes.set(xlim=(0.0, float(edges[-1])), ylim=(0.0, None))
     else:
         axes.set(xscale="log", yscale="log", xlim=(edges[0], 1.2 * edges[-1]))
         look.plain_logarithms(axes.xaxis)

@@ -2,7 +2,7 @@
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from sphereorient.files.whole_file import put_aside
-from sphereorient.statistics import Interval
+from sphereorient.statistics import Interval, Summary
+from sphereorient.statistics.cameras import CameraDistance
+from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.trajectory import COLOURS
 
 Floats = NDArray[np.float64]
+Plan = tuple[str, str, str, Callable[[], Figure]]  # a figure of a report: name, title, caption, function
+ByFile = Mapping[str, Trajectory]  # tracks by the name of their file
+Reported = tuple[Summary, ByFile, Sequence[CameraDistance]]  # what a report is of
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
@@ -87,8 +92,8 @@ def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.0) -> Figure:
 
 def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
     """Return a figure of `count` panels, at most two in a row, `row_in` inches high, with room for a head."""
-    columns = min(2, max(count, 1))
-    rows = max(-(-count // columns), 1)
+    columns = min(2, count)
+    rows = -(-count // columns)
     figure = new_figure(WIDTH_IN * columns / 2, head_in + row_in * rows)
     panels = np.ravel(figure.subplots(rows, columns, sharex=shared, sharey=shared, squeeze=False))
     for axes in panels[count:]:
@@ -99,7 +104,6 @@ def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) 
 @in_style
 def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ...]:
     """Write a figure, the same bytes for the same figure, and return the files.
-
     Without a suffix `path` gets PNG and PDF; its folder must exist. Raise OutputError if a file cannot be written.
     """
     undated: dict[str, dict[str, Any]] = {".png": {"Software": None}, ".pdf": {"CreationDate": None}}
@@ -127,21 +131,19 @@ def band(axes: Axes, x: Floats, low: Floats, high: Floats, style: LineStyle) -> 
         axes.fill_between(x, low, high, where=there.tolist(), color=style.colour, alpha=BAND, linewidth=0)
 
 
+def curve(axes: Axes, x: Floats, of: Interval, style: LineStyle, **more: Any) -> None:
+    """Draw a curve (K,) with its intervals; `more` are arguments of `Axes.plot`."""
+    axes.plot(x, of.value, **style.drawn, **more)
+    band(axes, x, of.low, of.high, style)
+
+
 def legend_above(axes: Axes, ncols: int = 1, handles: Sequence[Any] | None = None, title: str | None = None) -> None:
     """Put the legend above the axes, where it covers no data."""
     handles = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
     if handles:
-        axes.legend(
-            handles=handles,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            ncols=ncols,
-            title=title,
-            alignment="left",
-            borderaxespad=0.2,
-            columnspacing=1.2,
-            labelspacing=0.25,
-        )
+        place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "alignment": "left"}
+        space: dict[str, Any] = {"borderaxespad": 0.2, "columnspacing": 1.2, "labelspacing": 0.25}
+        axes.legend(handles=handles, ncols=ncols, title=title, **place, **space)
 
 
 def legend_of_figure(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
@@ -170,6 +172,11 @@ def say_empty(axes: Any, words: str = "nothing measured") -> None:
     write(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
 
 
+def of_tracks(names: Iterable[str], tracks: ByFile) -> str:
+    """Return the label of some of the tracks in a title; empty if there is only one."""
+    return "" if len(tracks) == 1 else f" of {', '.join(names)}"
+
+
 def in_frame(quantity: str) -> str:
     """Return a quantity's symbol with the frame of its components: 'v lab'."""
     symbol = SYMBOLS.get(quantity, quantity)
@@ -180,10 +187,8 @@ def interval_text(of: Interval, unit: str = "", factor: float = 1.0) -> str:
     """Return a scalar times `factor` with its interval as text: '0.921 ms (0.905 to 0.938)'."""
     value, low, high = (factor * float(x) for x in (of.value, of.low, of.high))
     behind = f" {unit}" if unit else ""
-    if not math.isfinite(value):
-        return "unknown"
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return f"{value:.3g}{behind}"
+    if not math.isfinite(value + low + high):
+        return f"{value:.3g}{behind}" if math.isfinite(value) else "unknown"
     places = decimals(high - low)
     return f"{value:.{places}f}{behind} ({low:.{places}f} to {high:.{places}f})"
 

@@ -1,6 +1,8 @@
 """A track in six dimensions against time, and its path through space with the sphere's axes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -21,12 +23,7 @@ Floats = NDArray[np.float64]
 MOST_FRAMES = 2000  # more are not distinguishable on a page
 GAP = 1.5  # typical steps: a longer one is a gap
 SIGMAS = 2.0  # half width of the bands
-NOT_VALID: Final[dict[str, Any]] = {
-    "facecolor": "#E8E8E8",
-    "edgecolor": look.SHADE,
-    "hatch": "//////",
-    "linewidth": 0.0,
-}
+NOT_VALID: Final[dict[str, Any]] = {"facecolor": "#E8E8E8", "edgecolor": look.SHADE, "hatch": "//////", "linewidth": 0}
 LATE_S, LONG_S = 10.0, 2.0  # from here on times are given in seconds
 WRAP_DEG = 90.0  # no sphere turns so far from frame to frame: the angle has wrapped, or passed its pole
 RATES = {
@@ -38,6 +35,21 @@ RATES = {
 TRIPODS = 14
 TRIPOD_SIZE = 0.09  # of the path's largest extent
 THINNEST = 0.35  # of the largest extent: the least length of the box's shortest side
+
+
+def figures(of: look.Reported) -> Iterator[look.Plan]:
+    """Yield the tracks of the recording with most valid frames, and their path."""
+    _, tracks, _ = of
+    name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
+    recording = name.removesuffix(track.sphere)
+    together = {key: one for key, one in tracks.items() if key.removesuffix(one.sphere) == recording}
+    caption, paper = "As measured (dots) and smooth, with bands of two standard errors.", " (Figure 7 of the paper)"
+    for number, (key, one) in enumerate(together.items(), start=1):
+        label, title = ("track", paper) if number == 1 else (f"track_{number}", "")
+        yield label, f"Track{look.of_tracks([key], tracks)}{title}", caption, partial(track_figure, one)
+    if not track.held:
+        draw = partial(path_figure, *together.values())
+        yield "path", f"Path{look.of_tracks(together, tracks)}", "With the sphere's axes.", draw
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,9 +64,8 @@ class TrackPart:
 @look.in_style
 def track_figure(track: Trajectory) -> Figure:
     """Draw position, Tait-Bryan angles, velocities and accelerations against time: smooth with 2 sigma, and measured.
-    Of a ball in its place, the rotation alone.
-
-    Frames that are not valid are shaded. Of a long track, the part of `shown_part` is drawn, with a note.
+    Of a ball in its place, the rotation alone. Frames that are not valid are shaded. Of a long track, the part of
+    `shown_part` is drawn, with a note.
     Source: the paper, figure of a sample track; the angles by docs/errata.md E1.
     """
     part = shown_part(track)
@@ -85,12 +96,11 @@ def track_figure(track: Trajectory) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel(f"time ({unit})")
     figure.align_ylabels()
+    band: dict[str, Any] = {"color": look.COMPONENTS[0].colour, "alpha": look.BAND, "linewidth": 0}
     handles = [
         *(style.handle(style.name) for style in look.COMPONENTS),
         look.PLAIN.handle("measured", marker=".", linestyle="none"),
-        Patch(
-            color=look.COMPONENTS[0].colour, alpha=look.BAND, linewidth=0, label=f"± {SIGMAS:.0f} standard deviations"
-        ),
+        Patch(label=f"± {SIGMAS:.0f} standard deviations", **band),
         Patch(label="frame not valid", **NOT_VALID),
     ]
     look.legend_of_figure(figure, handles, ncols=6)
@@ -125,10 +135,8 @@ def path_figure(*tracks: Trajectory) -> Figure:
         look.say_empty(axes)
     start = look.ALL.handle("start", marker="o", linestyle="none", markersize=5)
     paths = [style.handle(name, linewidth=1.0) for _, style, name in named]
-    arms = [
-        style.handle(f"body axis {style.name}", linestyle="-", marker=style.marker, linewidth=1.6)
-        for style in look.COMPONENTS
-    ]
+    arm: dict[str, Any] = {"linestyle": "-", "linewidth": 1.6}
+    arms = [style.handle(f"body axis {style.name}", marker=style.marker, **arm) for style in look.COMPONENTS]
     look.legend_of_figure(figure, [*paths, start, *arms], ncols=5)
     words = "the sphere's axes are not to scale"
     look.note(figure, f"{parts[0].words}; {words}" if parts[0].words else words)
@@ -139,12 +147,10 @@ def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> TrackPart:
     """Return the whole track, or the `most` consecutive frames of its longest segment that have the most valid ones."""
     rows, words = np.arange(len(track)), ""
     if len(track) > most:
-        inside = np.flatnonzero(track.segment >= 0)
-        if len(inside):
-            labels, counts = np.unique(track.segment[inside], return_counts=True)
-            rows = np.flatnonzero(track.segment == labels[counts.argmax()])
-        which = "the longest segment" if len(rows) <= most else f"the best {most:,} frames of the longest segment"
-        which = which if len(inside) else "none of them in a segment"
+        which = "none of them in a segment"
+        if (frames := np.bincount(track.segment + 1)[1:]).any():
+            rows = np.flatnonzero(track.segment == frames.argmax())
+            which = "the longest segment" if len(rows) <= most else f"the best {most:,} frames of the longest segment"
         if len(rows) > most:
             total = np.concatenate([[0], np.cumsum(track.valid[rows])])
             start = int((total[most:] - total[:-most]).argmax())
@@ -184,8 +190,7 @@ def tait_bryan_deg(R_lab_body: Floats) -> Floats:
 def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
     """Return the sigmas of the angles (N, 3), degrees; NaN near the poles. Source: docs/errata.md E3."""
     theta = np.deg2rad(tait_bryan_deg(R_lab_body))
-    there = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02)
-    out = np.full_like(theta, np.nan)
+    there, out = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02), np.full_like(theta, np.nan)
     inverse = np.linalg.inv(so3.rate_matrix_lab(torch.from_numpy(theta[there])).numpy())
     out[there] = np.rad2deg(_sigma(inverse @ cov_lab_rad2[there] @ inverse.swapaxes(1, 2)))
     return out
@@ -199,9 +204,8 @@ def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDA
     """Draw three components (N, 3) and limit the axis to them: bands are far wider at the ends of segments."""
     for i in range(3):
         _curve(axes, time, values[:, i], sigma[:, i], broken, i)
-    known = values[np.isfinite(values)]
+    known, errors = values[np.isfinite(values)], sigma[np.isfinite(sigma)]
     if len(known):
-        errors = sigma[np.isfinite(sigma)]
         rest = 0.05 * float(np.ptp(known)) + (SIGMAS * float(np.median(errors)) if len(errors) else 0.0)
         rest = rest or 0.05 * abs(float(known[0])) or 1.0
         axes.set_ylim(float(known.min()) - rest, float(known.max()) + rest)
@@ -221,8 +225,6 @@ def _dots(axes: Axes, time: Floats, values: Floats) -> None:
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
-    if not len(known):
-        return
     chosen = known[look.spread(len(known), TRIPODS)]
     start = track.position_smooth[chosen]
     for i, style in enumerate(look.COMPONENTS):

@@ -22,7 +22,6 @@ SAMPLING = Sampling(supersampling=6)
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
     """Least covariance of delta of R = exp([delta]x) R_view_body, view, rad (3), centre (u, v), px, and radius, px.
-
     Made by `cramer_rao_bound`. Undetermined unknowns have infinite variance, and covariance 0 with the others.
     """
 
@@ -76,7 +75,6 @@ def cramer_rao_bound(
     Raises:
         ShapeError: orientations that are not 3 x 3, or a map that is not 2:1.
         SettingsError: a diameter, noise or supersampling that is not positive.
-
     Source: docs/errata.md, The bound.
     """
     check_tail("R_view_body", R_view_body, 3, 3)
@@ -88,8 +86,7 @@ def cramer_rao_bound(
     render = disk_renderer(texture.to(R_view_body), diameter_px, sampling)
     flat = R_view_body.reshape(-1, 3, 3)
     parts = [flat.new_zeros(0, 6, 6)]
-    for R in torch.split(flat, ATTITUDES):
-        J = jacobian(render, R)
+    for J in (jacobian(render, R) for R in torch.split(flat, ATTITUDES)):
         parts.append(J.mT @ J / noise_share**2)
     return Bound(information=torch.cat(parts).reshape(*R_view_body.shape[:-2], 6, 6))
 
@@ -107,9 +104,8 @@ def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
     both = torch.cat([torch.diag(step), -torch.diag(step)])  # (12, 6)
     R = so3.exp(both[:, :3]) @ R_view_body[:, None]
     position = torch.nn.functional.pad(both[:, 3:5], (0, 1))
-    pictures = render(R, position, render.radius_mm + both[:, 5]).flatten(-2)  # (K, 12, S^2)
-    derivative: Tensor = ((pictures[:, :6] - pictures[:, 6:]) / (2 * step[:, None])).mT
-    return derivative
+    pictures: Tensor = render(R, position, render.radius_mm + both[:, 5]).flatten(-2)  # (K, 12, S^2)
+    return ((pictures[:, :6] - pictures[:, 6:]) / (2 * step[:, None])).mT
 
 
 def _inverse(information: Tensor, count: int = 6) -> Tensor:

@@ -1,5 +1,4 @@
 """Gores: a texture map as strips from pole to pole (sinusoidal projection) that wrap a ball, printed at true size.
-
 Sheet: x right, y up, mm, first strip at longitude -180 degrees; north up and east right, seen from outside.
 """
 
@@ -64,17 +63,15 @@ class Gores:
         """Return the closed cutting line of each strip, (2 points, 2), mm."""
         latitude = np.linspace(-math.pi / 2, math.pi / 2, points)
         half = math.pi / self.count * np.cos(latitude)
-        edges = [np.column_stack([side * half, latitude]) for side in (-1, 1)]
-        loop = np.concatenate([edges[1], edges[0][::-1]])
+        loop = np.column_stack([[*half, *-half[::-1]], [*latitude, *latitude[::-1]]])
         return [0.5 * self.diameter_mm * (loop + np.array([middle, 0.0])) for middle in self.middles_rad()]
 
 
 def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return x (columns), y (rows), mm, and texture (rows, columns) of one strip, continued beyond its outline."""
-    radius = 0.5 * gores.diameter_mm
+    radius, middle_rad = 0.5 * gores.diameter_mm, gores.middles_rad()[strip]
     step = min(STEP_MM, radius * STEP_RAD)
     height, half = gores.size_mm[1], math.pi * radius / gores.count
-    middle_rad = gores.middles_rad()[strip]
     x = torch.linspace(-half, half, math.ceil(2 * half / step) + 1, dtype=torch.float64)
     y = torch.linspace(-height / 2, height / 2, math.ceil(height / step) + 1, dtype=torch.float64)
     latitude = (y / radius)[:, None]
@@ -90,9 +87,8 @@ def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
     """Draw the strips at true size; not `filled`: only the borders between black and white, to be cut out or traced."""
     (width, height), (equator, meridian) = gores.sheet_mm, gores.size_mm
     figure = Figure(figsize=(width * MM, height * MM))
-    axes = figure.add_axes((0, 0, 1, 1))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2))
     axes.set_axis_off()
-    axes.set(xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2))
     for strip, (outline, middle_rad) in enumerate(zip(gores.outline_mm(), gores.middles_rad(), strict=True)):
         x, y, grey = _gore_texture(gores, texture, strip)
         if filled:
@@ -136,4 +132,4 @@ def instructions(gores: Gores) -> str:
     sizes = {"width": width, "height": height, "sheet_width": sheet[0], "sheet_height": sheet[1]}
     errors = {"stretch": 100 * (math.hypot(1, slope) - 1), "turn": math.degrees(math.atan(slope))}
     text = Path(__file__).with_name("gores.txt").read_text(encoding="utf-8")
-    return text.format(count=gores.count, diameter_mm=gores.diameter_mm, **sizes, **errors)
+    return text.format(**vars(gores), **sizes, **errors)

@@ -23,7 +23,6 @@ from sphereorient.sphere import Sampling, orthographic_view, reduced_texture
 from sphereorient.sphere.texture import texture_coordinates
 from sphereorient.tools.design import patterns
 from sphereorient.tools.design.bound import cramer_rao_bound
-from sphereorient.tools.design.patterns import facing, patterned_texture, stroke_deg, view_directions
 
 SEARCH = GreySearchSettings()  # normalisation and size of the views, as in the search on grey values
 ALIKE_STEP_DEG = 12.0  # of the first comparison: every view is within 14.5 degrees of the grid
@@ -89,15 +88,15 @@ def lon_lat_deg(direction_body: Tensor) -> Tensor:
 
 
 def _spread(values: Tensor) -> dict[str, float | None]:
-    named = {"min": values.min(), "median": values.median(), "max": values.max()}
-    return {name: float(value) if bool(value.isfinite()) else None for name, value in named.items()}
+    named = {"min": float(values.min()), "median": float(values.median()), "max": float(values.max())}
+    return {name: value if math.isfinite(value) else None for name, value in named.items()}
 
 
 def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Judgement:
     """Judge a map (H, 2 H): balance, bound (docs/errata.md), similarity of normalised views, widest brush."""
     settings = DesignSettings() if settings is None else settings
-    direction = view_directions(settings.views)
-    R = facing(direction)
+    direction = patterns.view_directions(settings.views)
+    R = patterns.facing(direction)
     alike, two = most_similar_views(texture, R, settings.apart_deg)
     return Judgement(
         settings=settings,
@@ -106,14 +105,13 @@ def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Ju
         bound_rad=_bounds(texture, R, settings),
         alike=alike,
         alike_views=two,
-        stroke_deg=stroke_deg(texture),
+        stroke_deg=patterns.stroke_deg(texture),
         border=patterns.border_length(texture),
     )
 
 
 def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
     """Return the greatest similarity, <= 1, of two views at least `apart_deg` apart, and these, (2, 3, 3) float64.
-
     Views (V, 3, 3) of a map (H, 2 H) are compared with all of SO(3).
     """
     size = SEARCH.size_px
@@ -157,23 +155,21 @@ def design_texture(
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Tensor, Judgement, str]:
     """Return the paintable map (512, 1024) with the best worst view, its judgement and its description.
-
     Of each of the `kinds` (of `PATTERNS`) so many `tries` are drawn, with sizes of 1.5 to 5 times the brush, whose
-    width is at least `stroke` degrees; of the best few, the least bound / margin wins: precise, hard to confuse.
-    Raise PaintError if no map can be painted with such a brush.
+    width is at least `stroke` degrees; of the best few, the least bound / margin wins: precise, hard to confuse. Raise
+    PaintError if no map can be painted with such a brush.
     """
     settings = DesignSettings() if settings is None else settings
     # The ratio of bounds hardly depends on the diameter: the first judgement is for a small one.
     small = settings.model_copy(update={"diameter_px": min(40.0, settings.diameter_px)})
-    R, (low, high) = facing(view_directions(FEW_VIEWS)), WHITE_SHARE
+    R, (low, high) = patterns.facing(patterns.view_directions(FEW_VIEWS)), WHITE_SHARE
     found: list[tuple[float, str, float, int]] = []
     for number in range(tries * len(kinds)):
         kind, k = kinds[number // tries], number % tries
-        size = 1.5 * stroke * (5.0 / 1.5) ** (k / max(tries - 1, 1))
-        size = min(max(size, patterns.SIZES_DEG[0]), patterns.SIZES_DEG[1])
-        texture = patterned_texture(kind, size, seed + k, 256)
+        size = float(np.clip(1.5 * stroke * (5.0 / 1.5) ** (k / max(tries - 1, 1)), *patterns.SIZES_DEG))
+        texture = patterns.patterned_texture(kind, size, seed + k, 256)
         white = _white(texture, R)
-        if stroke_deg(texture) >= stroke and low <= float(white.min()) <= float(white.max()) <= high:
+        if patterns.stroke_deg(texture) >= stroke and low <= float(white.min()) <= float(white.max()) <= high:
             found.append((float(_bounds(texture, R, small).amax()), kind, size, seed + k))
         advance(number + 1, tries * len(kinds))
     if not found:
@@ -181,18 +177,15 @@ def design_texture(
         raise PaintError(refusal("texture map", expected=expected, got=f"none of {tries * len(kinds)}", do=do))
     judged = []
     for _, kind, size, own_seed in sorted(found)[:FINALISTS]:
-        texture = patterned_texture(kind, size, own_seed)
-        judgement = judge_texture(texture, settings)
-        cost = float(judgement.bound_rad.amax()) / max(judgement.margin, 1e-3)
-        judged.append((cost, texture, judgement, f"{kind} of {size:.1f} degrees, seed {own_seed}"))
-    _, texture, judgement, words = min(judged, key=lambda one: one[0])
-    return texture, judgement, words
+        texture = patterns.patterned_texture(kind, size, own_seed)
+        words = f"{kind} of {size:.1f} degrees, seed {own_seed}"
+        judged.append((texture, judge_texture(texture, settings), words))
+    return min(judged, key=lambda one: float(one[1].bound_rad.amax()) / max(one[1].margin, 1e-3))
 
 
 def _white(texture: Tensor, R_view_body: Tensor) -> Tensor:
-    size = SEARCH.size_px
-    texture = reduced_texture(texture.float(), size)
-    return orthographic_view(size).paint(texture, R_view_body.float()).mean(-1).double()
+    texture = reduced_texture(texture.float(), SEARCH.size_px)
+    return orthographic_view(SEARCH.size_px).paint(texture, R_view_body.float()).mean(-1).double()
 
 
 def _bounds(texture: Tensor, R_view_body: Tensor, settings: DesignSettings) -> Tensor:
@@ -233,19 +226,19 @@ def _map_part(axes: Axes, texture: Tensor, judgement: Judgement, title: str) -> 
 
 
 def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
-    size = SIDE_PX
-    texture, view = reduced_texture(texture, size), orthographic_view(size)
+    texture, view = reduced_texture(texture, SIDE_PX), orthographic_view(SIDE_PX)
     shown = [*judgement.bound_rad.argsort(descending=True)[:3].tolist(), int(judgement.bound_rad.argmin())]
     drawn = []
     for k, name, colour in zip(shown, ("W: ", "", "", "B: "), (WORST, WORST, WORST, BEST), strict=True):
         angle = math.degrees(float(judgement.bound_rad[k]))
         text = f"{angle:.3f}°" if math.isfinite(angle) else "open"
-        drawn.append((name + text, facing(judgement.direction_body[k]), colour))
+        drawn.append((name + text, patterns.facing(judgement.direction_body[k]), colour))
     drawn += [(f"{n + 1}: alike {judgement.alike:.2f}", R, ALIKE) for n, R in enumerate(judgement.alike_views)]
     for axes, (text, R, colour) in zip(part.subplots(1, len(drawn)), drawn, strict=True):
-        seen, middle = view.render(texture, R.float(), math.nan).numpy(), (size / 2 - 0.5,) * 2
+        seen = view.render(texture, R.float(), math.nan).numpy()
         axes.imshow(seen, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axes.add_patch(Circle(middle, size / 2, fill=False, color=SHADE, lw=0.6, clip_on=False))
+        middle = (SIDE_PX / 2 - 0.5,) * 2
+        axes.add_patch(Circle(middle, SIDE_PX / 2, fill=False, color=SHADE, lw=0.6, clip_on=False))
         axes.set_axis_off()
         axes.set_title(text, fontsize=7, color=colour)
 

@@ -31,24 +31,21 @@ def view_directions(count: int) -> Tensor:
 
 def facing(direction_body: Tensor) -> Tensor:
     """Return R_view_body (..., 3, 3) that turn directions (..., 3) to the camera, north (at a pole: +x) up."""
-    x, y, z = torch.nn.functional.normalize(direction_body, dim=-1).unbind(-1)
-    level = torch.hypot(x, y)
-    polar = level < 1e-9
+    outward = torch.nn.functional.normalize(direction_body, dim=-1)
+    x, y, _ = outward.unbind(-1)
+    polar = torch.hypot(x, y) < 1e-9
     east = torch.stack([torch.where(polar, 0.0, -y), torch.where(polar, 1.0, x), torch.zeros_like(x)], -1)
     east = torch.nn.functional.normalize(east, dim=-1)
-    outward = torch.stack([x, y, z], -1)
     return torch.stack([east, -torch.linalg.cross(outward, east), -outward], dim=-2)
 
 
 def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) -> Tensor:
     """Draw a map (height, 2 height) float32, 0 black .. 1 white, with patches about `size_deg` wide.
-
     `kind`: blobs (wavy), patches (polygons), dots (black on white). Raise PaintError if kind or size is invalid.
     """
     if kind not in PATTERNS:
-        raise PaintError(
-            refusal("kind of texture", expected=" or ".join(PATTERNS), got=f"'{kind}'", do="name one of them")
-        )
+        expected, do = " or ".join(PATTERNS), "name one of them"
+        raise PaintError(refusal("kind of texture", expected=expected, got=f"'{kind}'", do=do))
     low, high = SIZES_DEG
     if not low <= size_deg <= high:
         expected, do = f"{low:g} .. {high:g} degrees", "choose a size in this range"
@@ -65,17 +62,12 @@ def stroke_deg(texture: Tensor) -> float:
     points, white = directions.numpy(), (sample_texture(texture.double(), directions) >= 0.5).numpy()
     if white.all() or not white.any():
         return BRUSHES_DEG[-1]
-    trees = {side: cKDTree(points[white == side]) for side in (False, True)}
     depth = np.empty(len(points))
     for side in (False, True):
-        chord, _ = trees[not side].query(points[white == side])
+        chord, _ = cKDTree(points[white != side]).query(points[white == side])
         depth[white == side] = 2 * np.arcsin(np.clip(chord / 2, 0, 1))
-    best = 0.0
-    for width in BRUSHES_DEG:
-        if _lost(points, white, depth, math.radians(width / 2)) > LOST_SHARE:
-            break
-        best = width
-    return best
+    too_wide = (k for k, w in enumerate(BRUSHES_DEG) if _lost(points, white, depth, math.radians(w / 2)) > LOST_SHARE)
+    return (0.0, *BRUSHES_DEG)[next(too_wide, len(BRUSHES_DEG))]
 
 
 def border_length(texture: Tensor) -> float:
@@ -90,15 +82,11 @@ def border_length(texture: Tensor) -> float:
 def _lost(points: NDArray[np.float64], white: NDArray[np.bool_], depth: NDArray[np.float64], radius: float) -> float:
     """Return the share of points that a brush of this radius does not reach within its own colour."""
     # The nearest point of the other colour lies half a step of the lattice beyond the border.
-    middle = depth >= radius + 0.5 * math.sqrt(4 * math.pi / POINTS)
-    lost = 0
+    half_step = 0.5 * math.sqrt(4 * math.pi / POINTS)
+    reach, lost = 2 * math.sin(min(radius, math.pi) / 2) + half_step, 0
     for side in (False, True):
-        own, middles = points[white == side], points[(white == side) & middle]
-        if len(middles):
-            reach = 2 * math.sin(min(radius, math.pi) / 2) + 0.5 * math.sqrt(4 * math.pi / POINTS)
-            lost += int((np.asarray(cKDTree(middles).query(own)[0]) > reach).sum())
-        else:
-            lost += len(own)
+        own, middles = points[white == side], points[(white == side) & (depth >= radius + half_step)]
+        lost += int((np.asarray(cKDTree(middles).query(own)[0]) > reach).sum()) if len(middles) else len(own)
     return lost / len(points)
 
 
@@ -110,9 +98,9 @@ def _blobs(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
     phase = 2 * math.pi * torch.rand(WAVES, generator=rng, dtype=torch.float64)
     value = torch.cos(map_directions(height) @ wave.T + phase).sum(-1)
     area = torch.cos((torch.arange(height, dtype=torch.float64) + 0.5) * math.pi / height - math.pi / 2)
-    order = value.flatten().argsort()
+    ranked, order = value.flatten().sort()
     share = area[:, None].expand(-1, 2 * height).flatten()[order].cumsum(0)
-    median = value.flatten()[order][int(torch.searchsorted(share, 0.5 * share[-1]))]
+    median = ranked[int(torch.searchsorted(share, 0.5 * share[-1]))]
     slope = number * math.sqrt(WAVES / 2) / math.sqrt(3)  # rms of the slope along a line, per radian
     return (0.5 + (value - median) / (slope * math.pi / height * 2)).clamp(0, 1).float()
 
@@ -121,9 +109,8 @@ def _patches(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
     """Draw the Voronoi cells of spread points, half of them black and half white, at random."""
     count = max(4, round(4 * math.pi / size_rad**2))
     points = _apart(random_directions(count, rng))
-    white = torch.randperm(count, generator=rng) % 2
-    owner = (map_directions(height).float() @ points.T.float()).argmax(-1)
-    return white[owner].float()
+    white = (torch.randperm(count, generator=rng) % 2).float()
+    return white[(map_directions(height).float() @ points.T.float()).argmax(-1)]
 
 
 def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
@@ -131,8 +118,7 @@ def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
     count = max(4, round(4 * math.pi / (1.9 * size_rad) ** 2))
     points = _apart(random_directions(count, rng))
     radius = 0.5 * size_rad * (2 + 2 * torch.rand(count, generator=rng, dtype=torch.float64)) / 3
-    away = torch.full((height, 2 * height), torch.inf, dtype=torch.float64)
-    directions = map_directions(height)
+    directions, away = map_directions(height), torch.full((height, 2 * height), torch.inf, dtype=torch.float64)
     for point, own in zip(points, radius, strict=True):
         away = torch.minimum(away, torch.acos((directions @ point).clamp(-1, 1)) - own)
     return (0.5 + away * height / math.pi).clamp(0, 1).float()

@@ -86,15 +86,15 @@ class Photographs:
     balls: Sequence[BallOutline] | None = None  # where the ball is; None: it is searched
 
     def __post_init__(self) -> None:
-        count, time_s = len(self.pictures), self.time_s
+        count, finite = len(self.pictures), bool(self.time_s.isfinite().all())
         do = "give one time in seconds for each photograph"
         if count < PICTURES_MIN:
             expected = f"{PICTURES_MIN} photographs at least"
             raise PaintError(refusal("spin", expected=expected, got=str(count), do="add pictures of the same flight"))
-        if time_s.shape != (count,) or not bool(time_s.isfinite().all()):
-            got = f"{tuple(time_s.shape)} times" if bool(time_s.isfinite().all()) else "a time that is no number"
+        if self.time_s.shape != (count,) or not finite:
+            got = f"{tuple(self.time_s.shape)} times" if finite else "a time that is no number"
             raise PaintError(refusal("times", expected=f"{count} times", got=got, do=do))
-        if bool((time_s.sort().values.diff() <= 0).any()):
+        if bool((self.time_s.sort().values.diff() <= 0).any()):
             raise PaintError(refusal("times", expected="different times", got="one of them twice", do=do))
 
     def disks(self, size_px: int) -> tuple[Tensor, tuple[BallOutline, ...]]:
@@ -113,8 +113,7 @@ def _own_grey(levels: NDArray[np.float32], ball: BallOutline) -> NDArray[np.floa
     row, column = np.ogrid[: levels.shape[0], : levels.shape[1]]
     inside = np.hypot(row - ball.v_px, column - ball.u_px) < ball.radius_px
     colour = levels[inside].mean(0) if inside.any() else np.ones(levels.shape[2], np.float32)
-    grey: NDArray[np.float32] = (levels @ (colour / max(float(np.linalg.norm(colour)), 1e-6))).astype(np.float32)
-    return grey
+    return np.asarray(levels @ (colour / max(float(np.linalg.norm(colour)), 1e-6)), np.float32)
 
 
 def _channels(picture: Photograph, name: str) -> NDArray[np.float32]:
@@ -156,9 +155,8 @@ def _nothing(name: str, got: str) -> PaintError:
 
 def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
     """Read photographs: files in order of time, or one folder by name.
-
-    `times`: a table .csv with the columns file and t_s, s, or pictures per second at equal intervals.
-    Raise PaintError for missing or unreadable files, too many of them, or times that do not match.
+    `times`: a table .csv with the columns file and t_s, s, or pictures per second at equal intervals. Raise PaintError
+    for missing or unreadable files, too many of them, or times that do not match.
     """
     files = list(paths)
     if len(files) == 1 and files[0].is_dir():
@@ -167,13 +165,11 @@ def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
         expected, do = f"at most {MOST_PHOTOGRAPHS}", "name fewer, or measure a movie with `sphereorient track`"
         raise PaintError(refusal("photographs", expected=expected, got=str(len(files)), do=do))
     time_s = _times(times, files)
-    pictures = [_picture(path) for path in files]
-    return Photographs(pictures=pictures, time_s=time_s, names=[str(path) for path in files])
+    return Photographs(pictures=[_picture(path) for path in files], time_s=time_s, names=[str(path) for path in files])
 
 
 def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
     """Read a texture map, or a table .csv of dots: x, y, z of a direction in each line, no header.
-
     Raise PaintError for a missing table or lines that are no directions, TextureError for a missing or unreadable map.
     """
     if path.suffix.lower() not in (".csv", ".txt"):
@@ -196,7 +192,7 @@ def _times(times: str, files: Sequence[Path]) -> Tensor:
         rate_hz = float(times)
     except ValueError:
         return _table_times(Path(times), files)
-    if not 0 < rate_hz < float("inf"):
+    if not 0 < rate_hz < math.inf:
         do = "give the number of pictures a second"
         raise PaintError(refusal("--times", expected="a rate above 0", got=times, do=do))
     return torch.arange(len(files), dtype=torch.float64) / rate_hz

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.errors import PaintError, check_tail, refusal
 from sphereorient.search import GreySearch, GreySearchSettings
-from sphereorient.search.candidates import Candidates
+from sphereorient.search.candidates import Candidates, DiskSearch
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture import map_directions
@@ -29,7 +29,6 @@ DOT_SEARCH = GreySearchSettings(score_min=0.05, peaks=24, finalists=16)
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DotTable:
     """Directions of a ball's dots, right-handed, and their radius; a left-handed table fits no picture.
-
     Raise PaintError for no dots, lengths over 5 % from 1, or a radius out of range; ShapeError if not (D, 3).
     """
 
@@ -64,7 +63,6 @@ class DotTable:
 
     def measured(self, disks: Tensor, R_view_body: Tensor) -> "DotTable":
         """Return the table with the radius measured in disks (F, S, S) at R_view_body (F, 3, 3), blur included.
-
         R_view_body must be right to half a dot, the present radius to a factor of 2. Raise PaintError if no dot is
         darker than the white around it.
         """
@@ -78,38 +76,30 @@ class DotTable:
         bins = (away[used] / BIN_RAD).long()
         profile = torch.bincount(bins, even[used]) / torch.bincount(bins).clamp_min(1)
         outer = profile[round(2 * guess_deg) :]
-        around = float(outer.median()) if len(outer) else math.nan
-        middle = float(profile[0]) if len(profile) else math.nan
-        half = 0.5 * (middle + around)
-        above = torch.nonzero(profile > half)[:, 0]
-        if not around > middle or not len(above) or int(above[0]) == 0:
+        half = 0.5 * float(profile[0] + outer.median()) if len(outer) else -math.inf
+        k = int((profile > half).long().argmax()) if len(profile) else 0  # the first that is brighter
+        if k == 0:
             do = "check that the attitudes and the table belong to the pictures"
             raise PaintError(refusal("dots", expected="dark dots where the table has them", got="none", do=do))
-        k = int(above[0])
         low, high = float(profile[k - 1]), float(profile[k])
         return replace(self, radius_deg=math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low)))
 
 
-class DotSearch:
+class DotSearch(DiskSearch):
     """Search all of SO(3) for a table of dots: the grey search proposes; missing dots count, other dark hardly."""
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
-        self._search = GreySearch(table.texture(), settings)
-        view = orthographic_view(settings.size_px, torch.float64)
+        super().__init__()
+        self.size_px = size = settings.size_px
+        self._search, self._even, self._direction = (
+            GreySearch(table.texture(), settings),
+            Blur(size, EVEN),
+            table.unit(),
+        )
+        view = orthographic_view(size, torch.float64)
         self._inside, self._normal = view.inside, view.normal_view
-        self._even = Blur(settings.size_px, EVEN)
-        self._weight = view.normal_view[:, 2].square() * rim_share(settings.size_px)[view.inside]
-        self._direction = table.unit()
+        self._weight = view.normal_view[:, 2].square() * rim_share(size)[view.inside]
         self._radius = math.radians(table.radius_deg) * CORE
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._search.size_px
-
-    def likeness(self, disks: Tensor) -> Tensor:
-        """Return the best score of each disk, (F,)."""
-        return self.propose(disks).best_score
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose attitudes; see `GreySearch.propose`.

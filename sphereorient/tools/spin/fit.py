@@ -1,5 +1,4 @@
 """Uniform spins R(t) = exp(omega (t - t0)) R(t0) through candidates.
-
 At multiples of one step, omega and its aliases omega + 2 pi k / step agree; all aliases below a limit are reported.
 """
 
@@ -59,7 +58,7 @@ class Spins:
 
     def of(self, chosen: Tensor) -> "Spins":
         """Select spins by mask or by index."""
-        return Spins(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
+        return Spins(**{name: values[chosen] for name, values in vars(self).items()})
 
     def R_view_body(self, time_s: Tensor) -> Tensor:
         """Return orientations (K, F, 3, 3) at times (F,), s."""
@@ -74,7 +73,6 @@ class Spins:
 
 def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weight: Tensor) -> PictureCandidates:
     """Pad candidates (M, 3, 3): rows offset[f] .. offset[f + 1] belong to the picture at time_s[f] (F,), s.
-
     Weights (M,), not negative, any unit: only ratios within a picture count.
     """
     counts = offset.diff()
@@ -165,18 +163,16 @@ def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
         omega = axis * (angle + 2 * math.pi * k) / gaps[..., None]
         use = both & (omega.norm(dim=-1) <= 1.1 * omega_max_rad_s)
         middle = so3.exp(0.5 * omega * gaps[..., None]) @ first
-        count = int(use.sum())
-        parts.append(
-            Spins(
-                omega_view_rad_s=omega[use],
-                R0_view_body=middle.expand(*both.shape, 3, 3)[use],
-                time0_s=time0[use],
-                evidence=omega.new_zeros(count),
-                scatter_rad=omega.new_full((count,), LOOSE_RAD),
-                covariance=omega.new_zeros(count, 6, 6),
-            )
-        )
-    return _joined(parts)
+        parts.append((omega[use], middle.expand(*both.shape, 3, 3)[use], time0[use]))
+    omega, middle, time0 = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Spins(
+        omega_view_rad_s=omega,
+        R0_view_body=middle,
+        time0_s=time0,
+        evidence=torch.zeros_like(time0),
+        scatter_rad=torch.full_like(time0, LOOSE_RAD),
+        covariance=omega.new_zeros(len(omega), 6, 6),
+    )
 
 
 def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
@@ -200,8 +196,7 @@ def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Ten
     scatter = spins.scatter_rad[:, None, None]
     # Density over SO(3), whose volume is 8 pi^2, over that of random orientations.
     height = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi) - 3 * scatter.log()
-    log = height - 0.5 * turn.square().sum(-1) / scatter**2 + seen.weight.clamp_min(1e-300).log()
-    log = log + math.log(1 - STRAYS)
+    log = height - 0.5 * turn.square().sum(-1) / scatter**2 + seen.weight.clamp_min(1e-300).log() + math.log(1 - STRAYS)
     whole = torch.logaddexp(log.logsumexp(-1), log.new_tensor(math.log(STRAYS)))
     share = torch.where(seen.weight > 0, (log - whole[..., None]).exp(), 0.0)
     return turn, share, torch.where(seen.weight.sum(-1) == 0, 0.0, whole)
@@ -220,7 +215,7 @@ def _slope(omega: Tensor, since: Tensor) -> Tensor:
 
 
 def _joined(parts: Sequence[Spins]) -> Spins:
-    return Spins(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Spins.__dataclass_fields__})
+    return Spins(**{name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 
 
 def _distinct(spins: Spins, time_s: Tensor, by_spin: bool = False) -> Spins:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from matplotlib.figure import Figure
@@ -20,7 +20,7 @@ from sphereorient.sphere.texture_table import texture_table
 from sphereorient.tools.spin import fit
 from sphereorient.tools.spin.disks import BallOutline, Photographs
 from sphereorient.tools.spin.dots import DOT_SEARCH, DotSearch, DotTable
-from sphereorient.tools.spin.fit import PictureCandidates, Spins, fit_spins, picture_candidates
+from sphereorient.tools.spin.fit import PictureCandidates, Spins
 
 FINEST = 0.05  # detail of the last fit, radii: a pixel of a disk of 40
 REFINEMENT_STEPS = 6
@@ -34,9 +34,7 @@ COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: in a row, and altogeth
 class SpinSettings(BaseModel, frozen=True, extra="forbid"):
     """How a spin is searched in photographs."""
 
-    omega_max_rad_s: float = Field(
-        2 * math.pi * 300, gt=0, description="fastest spin, rad/s: all aliases of the frame rate below it are reported"
-    )
+    omega_max_rad_s: float = Field(2 * math.pi * 300, gt=0, description="rad/s; all aliases below it are reported")
     search: GreySearchSettings = Field(DOT_SEARCH, description="of attitudes in each photograph alone")
 
 
@@ -63,7 +61,6 @@ def spin_of(
     progress: Progress = silent,
 ) -> SpinFound:
     """Find the uniform spin of a ball of known texture from photographs of a far, uncalibrated camera.
-
     Times at multiples of one step allow several spins, whole turns per step apart: all below the limit are returned.
     `texture` is the map (H, 2 H), 0 black .. 1 white, or a table of dots. Raise PaintError for no ball, no spin better
     than chance, or a mirrored texture that fits better.
@@ -74,21 +71,21 @@ def spin_of(
     mirrored = texture.mirrored() if isinstance(texture, DotTable) else texture.flip(-1)
     alone, seen = _searched(disks, time_s, texture, settings, progress, "attitudes")
     _, reflected = _searched(disks, time_s, mirrored, settings, progress, "mirror image")
-    spins = fit_spins(seen, settings.omega_max_rad_s)
-    mirrored_evidence = _greatest(fit_spins(reflected, settings.omega_max_rad_s))
+    spins = fit.fit_spins(seen, settings.omega_max_rad_s)
+    mirrored_evidence = _greatest(fit.fit_spins(reflected, settings.omega_max_rad_s))
     _check_evidence(_greatest(spins), mirrored_evidence)
     drawn = texture.texture() if isinstance(texture, DotTable) else texture
     view = orthographic_view(settings.search.size_px)
     level = detail_level(view, texture_table(drawn.float(), FINEST), FINEST, every=1)
     own, _ = _refined(level, disks, spins.R_view_body(time_s)[0], REFINEMENT_STEPS)
     # Refit the spins to one orientation per picture; keep the evidence of all candidates.
-    single = picture_candidates(time_s, torch.arange(len(own) + 1), own, torch.ones(len(own)))
+    single = fit.picture_candidates(time_s, torch.arange(len(own) + 1), own, torch.ones(len(own)))
     fitted = fit.refine_spins(single, spins, iterations=LAST_ITERATIONS)
     total = fit.evidence_of(seen, spins).sum(1)
     close = total > total.max() - AS_EVIDENT
     rate = fitted.omega_view_rad_s.norm(dim=-1)
     order = torch.where(close, rate - rate.max() - 1.0, total.max() - total).argsort(stable=True)
-    spins = Spins(**{**vars(fitted), "evidence": total}).of(order)
+    spins = replace(fitted, evidence=total).of(order)
     predicted = spins.R_view_body(time_s)[0]
     apart = so3.geodesic_distance(own, predicted)
     followed = apart < FOLLOWED_RAD
@@ -110,16 +107,14 @@ def _searched(
     disks: Tensor, time_s: Tensor, texture: Tensor | DotTable, settings: SpinSettings, progress: Progress, stage: str
 ) -> tuple[Candidates, PictureCandidates]:
     """Search each disk alone."""
-    search: Proposer = (
-        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else GreySearch(texture, settings.search)
-    )
-    parts = []
-    for some in torch.split(torch.arange(len(disks)), AT_ONCE):
-        progress(stage, int(some[0]), len(disks))
-        parts.append(search.propose(disks[some]))
+    of, parts = settings.search, []
+    search: Proposer = DotSearch(texture, of) if isinstance(texture, DotTable) else GreySearch(texture, of)
+    for first in range(0, len(disks), AT_ONCE):
+        progress(stage, first, len(disks))
+        parts.append(search.propose(disks[first : first + AT_ONCE]))
     progress(stage, len(disks), len(disks))
     alone = Candidates.joined(parts)
-    return alone, picture_candidates(time_s, alone.offset, alone.R_view_body, alone.score.square())
+    return alone, fit.picture_candidates(time_s, alone.offset, alone.R_view_body, alone.score.square())
 
 
 def _check_evidence(best: float, mirrored: float) -> None:
@@ -140,8 +135,8 @@ def _greatest(spins: Spins) -> float:
 def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Refine each disk's own orientation (F, 3, 3) float64 from a given one; return also its score (F,)."""
     each = [refine_rotation(level, disk, R[None].float(), steps) for disk, R in zip(disks, R_view_body, strict=True)]
-    R = torch.cat([R for R, _ in each]).double()
-    return so3.nearest_rotation(R), torch.cat([score for _, score in each]).double()
+    R, score = (torch.cat(parts).double() for parts in zip(*each, strict=True))
+    return so3.nearest_rotation(R), score
 
 
 @in_style
@@ -157,11 +152,11 @@ def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequen
         each.set_axis_off()
     inside = torch.isfinite(predicted[0])
     for place, k in enumerate(chosen):
-        row, column = 2 * (place // COLUMNS), place % COLUMNS
+        filmed, drawn = axes[2 * (place // COLUMNS) :, place % COLUMNS][:2]
         disk = torch.where(inside, found.disks[k], torch.nan)
-        axes[row, column].imshow(disk.numpy(), cmap="gray", interpolation="nearest")
-        axes[row + 1, column].imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
+        filmed.imshow(disk.numpy(), cmap="gray", interpolation="nearest")
+        drawn.imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
         off = float(found.residual_rad[k])
         words = f"{math.degrees(off):.1f}° off" if math.isfinite(off) else "no attitude"
-        axes[row, column].set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
+        filmed.set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
     return figure

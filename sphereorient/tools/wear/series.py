@@ -90,7 +90,6 @@ class WearSeries:
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
     """Compare maps (H, 2 H), 0 black .. 1 white, NaN unknown, in time order with the first, in its body frame.
-
     `turned`: find the rotations between body frames. Raise PaintError for other balls, ShapeError if not 2:1.
     """
     if len(maps) < 2:
@@ -136,22 +135,23 @@ def _figures(now: Wear, before: Wear | None) -> WearFigures:
         total = float(area[whole].sum())
         return float(area[part & whole].sum()) / total if total else math.nan
 
-    worn = share(now.worn, now.known)
-    known = float(area[now.known].sum())
-    if before is None:
-        return WearFigures(known=known, worn=worn, grown=worn, stays=math.nan)
-    both = now.known & before.known
-    grown = share(now.worn, both) - share(before.worn, both)
-    return WearFigures(known=known, worn=worn, grown=grown, stays=share(now.worn, before.worn & now.known))
+    worn = grown = share(now.worn, now.known)
+    stays = math.nan
+    if before is not None:
+        both = now.known & before.known
+        grown = share(now.worn, both) - share(before.worn, both)
+        stays = share(now.worn, before.worn & now.known)
+    return WearFigures(known=float(area[now.known].sum()), worn=worn, grown=grown, stays=stays)
 
 
 def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
     area = _shares(len(inside))
     direction = map_directions(len(inside))[inside].double()
     x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
+    least = HALF * float(area[inside].sum())
     shares = []
     for one in wear:
-        seen = float(area[inside & one.known].sum()) >= HALF * float(area[inside].sum())
+        seen = float(area[inside & one.known].sum()) >= least
         shares.append(float(area[inside & one.worn].sum()) if seen else math.nan)
     return WornPlace(
         longitude_deg=math.degrees(math.atan2(y, x)),
@@ -167,12 +167,12 @@ def connected_places(worn: Tensor) -> Tensor:
     pairs = [(node, np.roll(node, -1, axis=1)), (node[:-1], node[1:])]
     pairs += [(node[row], np.full_like(node[row], node[row][mask[row]].min())) for row in (0, -1) if mask[row].any()]
     a, b = (np.concatenate([pair[k].reshape(-1) for pair in pairs]) for k in (0, 1))
-    joined = mask.reshape(-1)[a] & mask.reshape(-1)[b]
+    joined = mask.flat[a] & mask.flat[b]
     graph = coo_matrix((np.ones(int(joined.sum())), (a[joined], b[joined])), shape=(mask.size, mask.size))
     label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
-    number = np.zeros(mask.size, np.int64)
-    number[mask.reshape(-1)] = np.unique(label[mask.reshape(-1)], return_inverse=True)[1] + 1
-    return torch.from_numpy(number.reshape(mask.shape))
+    number = np.zeros(mask.shape, np.int64)
+    number[mask] = np.unique(label.reshape(mask.shape)[mask], return_inverse=True)[1] + 1
+    return torch.from_numpy(number)
 
 
 @in_style
@@ -214,14 +214,12 @@ def _mark(axes: Axes, series: WearSeries, k: int) -> None:
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
-    at = np.arange(1, len(series.wear) + 1)
-    whole = 100 * np.array([one.worn for one in series.growth])
-    axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of the known area", **ALL.drawn)
+    at = np.arange(len(series.wear) + 1)
+    whole = 100 * np.array([0, *(one.worn for one in series.growth)])
+    axes.plot(at, whole, marker=ALL.marker, label="all, of the known area", **ALL.drawn)
     for number, place in enumerate(series.places[:NAMED], start=1):
-        shares = 100 * np.array([0, *place.share])
-        axes.plot(np.append(0, at), shares, marker=".", linewidth=0.9, label=f"place {number}")
-    axes.set(ylabel="worn (% of the ball)", xticks=np.append(0, at), ylim=(0, None))
-    axes.set_ylim(0, max(LEAST_PERCENT, axes.get_ylim()[1]))
-    axes.set_xticklabels(list(names))
+        axes.plot(at, 100 * np.array([0, *place.share]), marker=".", linewidth=0.9, label=f"place {number}")
+    axes.set_xticks(at, list(names))
+    axes.set(ylabel="worn (% of the ball)", ylim=(0, max(LEAST_PERCENT, axes.get_ylim()[1])))
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.legend(loc="upper left")
