@@ -84,7 +84,9 @@ def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.f
     profile = np.exp(-0.5 * ((np.arange(height) - height / 2 * (1 + 1.1 * np.cos(angle))) / (4 + 14 * up)) ** 2)
     across = np.where(up > 0, 35 + 65 * up, 0.0) * band[:, None] + 26 * up * mirrored
     of_blades, along = (part.reshape(2 * BLADES, -1).astype(np.float32) for part in (profile, across))
-    return of_blades.T @ along + 20 * band.sum(0)
+    light = of_blades.T @ along
+    light += 20 * band.sum(0)
+    return light
 
 
 def disturb(
@@ -94,17 +96,17 @@ def disturb(
 
     `behind` (H, W) is what the sphere hides; `seeds` are camera, movie and frame.
     """
-    part = exposure.within(round(0.5 * float(disk.radius_px)))
-    rows, columns = part.window
-    corner = torch.tensor([columns.start, rows.start])
-    cover, scene = (
-        torch.from_numpy(np.ascontiguousarray(one, np.float32)) for one in (part.cover, behind[part.window])
-    )
-    inside = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=scene)
     static, moving = (seeded(TEXTURE_SEED, *seeds[:count]) for count in (1, 3))
-    number = float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))
-    lit = degrade(torch.from_numpy(light[part.window]), inside, LAMPS, static)
-    light[part.window] = degrade(lit, inside, {"bubbles": number}, moving)
+    bubbles = {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}
+    beyond = exposure.within(round(0.5 * float(disk.radius_px)))  # bubbles reach beyond the sphere, lamps do not
+    for part, values, rng in (exposure, LAMPS, static), (beyond, bubbles, moving):
+        rows, columns = part.window
+        corner = torch.tensor([columns.start, rows.start])
+        cover, scene = (
+            torch.from_numpy(np.ascontiguousarray(one, np.float32)) for one in (part.cover, behind[part.window])
+        )
+        inside = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=scene)
+        light[part.window] = degrade(torch.from_numpy(light[part.window]), inside, values, rng)
 
 
 def film(folder: Path, number: int, frames: int) -> None:
@@ -125,7 +127,8 @@ def film(folder: Path, number: int, frames: int) -> None:
         disks = picture_of_ball(camera, X[near].mean(1), settings.diameter_mm / 2)
         seen, place = exposures([scene], camera, X[None, near], R[None, near]), near.cumsum(0) - 1
         for k in range(frames):
-            behind = settings.background + impellers(camera.image_size, index, float(times_s[k]))
+            behind = impellers(camera.image_size, index, float(times_s[k]))
+            behind += settings.background
             exposure = next(seen) if near[k] else Exposure.none(size)
             lit = exposure.before(behind)
             if near[k]:

@@ -1,3 +1,4 @@
+import math
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, centre_lab_mm
 from sphereorient.sphere import reduced_texture
 from sphereorient.sphere.renderer import fine_pixels, reach_px
-from sphereorient.sphere.texture import closed_texture, sample_closed
+from sphereorient.sphere.texture import closed_texture
 from sphereorient.synth.settings import SynthSettings
 
 SUPERSAMPLING = 3  # rays per pixel and axis: edges are accurate to a few per cent
@@ -23,6 +24,13 @@ ROOM = 6  # rays are computed for windows that are wider by this part on each si
 LAMPS = ((-0.6, -0.5, 0.6, 0.55), (0.7, -0.3, 0.65, 0.35), (0.0, 0.9, -0.4, 0.1))
 LIT = 0.75  # share of the lamps that the brightest side receives
 
+_, LAMP_SHARES = (_LAMPS := np.array(LAMPS, np.float32))[:, :3], _LAMPS[:, 3] / np.float32(LIT)
+TOWARDS = _LAMPS[:, :3] / np.linalg.norm(_LAMPS[:, :3], axis=1, keepdims=True)
+_ACROSS = fine_pixels(1, SUPERSAMPLING).numpy()
+# Weights of a pixel's middle and of a step to the right and down: those of its fine samples, row by row.
+FINE = np.array([(1, right, down) for down in _ACROSS for right in _ACROSS], np.float32)
+
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Window = tuple[slice, slice]  # rows and columns of a picture
 
@@ -59,7 +67,7 @@ class Exposure:
 
     def before(self, behind: Floats | float) -> Floats:
         """Return the picture (H, W) of the balls before grey levels (H, W), or one level."""
-        picture = np.array(np.broadcast_to(np.float32(behind), self.size))
+        picture = np.broadcast_to(np.asarray(behind, np.float32), self.size).copy()
         picture[self.window] *= 1 - self.cover
         picture[self.window] += self.light
         return picture
@@ -79,40 +87,55 @@ class Exposure:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FineRays:
-    """Rays through the fine samples of a window's pixels, x, y and z apart, float64."""
+class PixelRays:
+    """Rays through the pixels of a window (h, w), and how they change from pixel to pixel; x, y and z apart, lab."""
 
     window: Window
-    origin: Tensor  # (3, h, w, S), lab, mm; (3, 1, 1, 1) where all start in one point
-    direction: Tensor  # (3, h, w, S), lab
+    origin: Doubles  # (3, h, w), mm; (3, 1, 1) where all start in one point
+    direction: Doubles  # (3, h, w)
+    moves: Floats  # (2, *origin), change of the origin per pixel to the right and down, square to the ray
+    turns: Floats  # (2, 3, h, w), that of the direction
+    fine: Floats  # (3, S, h, w), directions of the fine samples: linear within a pixel, to 1e-7 of a radius
 
     @classmethod
     def of(cls, camera: Camera, window: Window) -> Self:
-        """Compute the rays of a window."""
-        within = fine_pixels(1, SUPERSAMPLING)
-        rows, columns = (torch.arange(side.start, side.stop, dtype=torch.float64)[:, None] + within for side in window)
-        shape = len(rows), len(columns), SUPERSAMPLING, SUPERSAMPLING
-        v, u = rows[:, None, :, None].expand(shape), columns[:, None, :].expand(shape)
-        rays = camera.rays(torch.stack([u, v], -1).flatten(2, 3))
-        origin, direction = (part.movedim(-1, 0) for part in (rays.origin_lab_mm, rays.direction_lab))
-        central = origin.stride()[1:] == (0, 0, 0)
-        return cls(
-            window=window,
-            origin=(origin[:, :1, :1, :1] if central else origin).contiguous(),
-            direction=direction.contiguous(),
-        )
+        """Compute the rays of a window; those of a pixel do not depend on it."""
+        wider = _wider(window, 1, camera.image_size[::-1])
+        v, u = torch.meshgrid(*(torch.arange(side.start, side.stop).double() for side in wider), indexing="ij")
+        rays, part = camera.rays(torch.stack([u, v], -1)), (..., *_inside(window, wider))
+        every = [one.movedim(-1, 0).contiguous().numpy() for one in (rays.origin_lab_mm, rays.direction_lab)]
+        moves, turns = (np.stack(np.gradient(one, axis=(2, 1)))[part].astype(np.float32) for one in every)
+        origin, direction = (one[part] for one in every)
+        along = direction.astype(np.float32)
+        moves -= (moves * along).sum(1, keepdims=True) * along
+        if rays.origin_lab_mm.stride()[:2] == (0, 0):
+            origin, moves = origin[:, :1, :1], moves[..., :1, :1]
+        fine = _fine(np.stack([along, *turns], 1))
+        return cls(window=window, origin=origin, direction=direction, moves=moves, turns=turns, fine=fine)
 
-    def holds(self, window: Window) -> bool:
-        """Return whether a window is part of this one."""
-        return all(a.start <= b.start and b.stop <= a.stop for a, b in zip(self.window, window, strict=True))
+    def within(self, window: Window) -> Self:
+        """Return those of a part of the window."""
+        part = (..., *_inside(window, self.window))
+        names = ("direction", "turns", "fine", *(("origin", "moves") if self.origin.size > 3 else ()))
+        return replace(self, window=window, **{name: getattr(self, name)[part] for name in names})
 
-    def through(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return origins (3, M S) or (3, 1) and directions (3, M S) of the M pixels (v, u), (M, 2)."""
-        rows, columns = self.window
-        place = (pixels[:, 0] - rows.start) * (columns.stop - columns.start) + pixels[:, 1] - columns.start
-        parts = [self.direction] if self.origin.numel() == 3 else [self.direction, self.origin]
-        found = [part.flatten(1, 2).index_select(1, place).flatten(1) for part in parts]
-        return (found[1] if len(found) > 1 else self.origin.flatten(1)), found[0]
+    def feet(self, centre: Doubles) -> Floats:
+        """Return where the fine samples pass a centre (3,) nearest, seen from it, (3, S, h, w)."""
+        start = self.origin - centre[:, None, None]
+        ahead = (start * self.direction).sum(0)
+        foot = (start - ahead * self.direction).astype(np.float32)
+        ahead, along = ahead.astype(np.float32), self.direction.astype(np.float32)
+        changes = [
+            move - ((foot * turn).sum(0) * along + ahead * turn)
+            for move, turn in zip(self.moves, self.turns, strict=True)
+        ]
+        return _fine(np.stack([foot, *changes], 1))
+
+
+def _fine(linear: Floats) -> Floats:
+    """Return what fine samples have, (3, S, h, w), of values and their changes to the right and down (3, 3, h, w)."""
+    found: Floats = (FINE @ linear.reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
+    return found
 
 
 def render_frame(
@@ -138,42 +161,54 @@ def exposures(
     """
     size, blur_px = camera.image_size[::-1], scenes[0].settings.blur_px
     radii_mm = position_lab_mm.new_tensor([scene.settings.diameter_mm / 2 for scene in scenes])[:, None, None]
-    rays = [FineRays.of(camera, (slice(0, 0), slice(0, 0))) for _ in scenes]
+    rays: list[PixelRays | None] = [None] * len(scenes)
     parts = (torch.split(poses, AT_ONCE, 1) for poses in (position_lab_mm, R_lab_body))
     for X, R in zip(*parts, strict=True):
         disks = torch.cat([camera.project(X), reach_px(camera, X, radii_mm)[..., None]], -1).numpy()
         away = (X - centre_lab_mm(camera)).norm(dim=-1).sum(-1)
+        centres, turns = X.double().numpy(), R.mT.float().numpy()
         for n in range(X.shape[1]):
             balls = []
             for k in away[:, n].argsort(descending=True).tolist():  # far ones first
-                window = _window(disks[k, n], size)
-                if not rays[k].holds(window):
-                    rays[k] = FineRays.of(camera, _wider(window, (window[0].stop - window[0].start) // ROOM, size))
-                pixels = _near(disks[k, n], window)
-                origin, direction = rays[k].through(pixels)
-                instants = zip(X[k, n], R[k, n], strict=True)
-                seen = torch.stack([_seen(scenes[k], origin, direction, *pose) for pose in instants])
-                balls.append((pixels, seen))
+                window, known = _window(disks[k, n], size), rays[k]
+                if any(side.start == side.stop for side in window):
+                    continue
+                if known is None or not _holds(known.window, window):
+                    room = (window[0].stop - window[0].start) // ROOM
+                    known = rays[k] = PixelRays.of(camera, _wider(window, room, size))
+                own, poses = known.within(window), zip(centres[k, n], turns[k, n], strict=True)
+                balls.append((window, np.stack([_seen(scenes[k], own, *pose) for pose in poses])))
             yield _exposure(balls, blur_px, size)
 
 
-def _exposure(balls: Sequence[tuple[Tensor, Tensor]], blur_px: float, size: tuple[int, int]) -> Exposure:
-    """Put balls before each other, far ones first: pixels (M, 2) as (v, u), and what is seen there, (E, 2, M)."""
-    every = torch.cat([pixels for pixels, _ in balls])
-    if not len(every):
+def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tuple[int, int]) -> Exposure:
+    """Put balls before each other, far ones first: windows and what is seen there, (E, 2, h, w)."""
+    if not balls:
         return Exposure.none(size)
-    (top, left), (bottom, right) = every.amin(0).tolist(), every.amax(0).tolist()
-    window = _wider((slice(top, bottom + 1), slice(left, right + 1)), 2 + round(4 * blur_px), size)
-    rows, columns = window
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    both = torch.zeros(len(balls[0][1]), 2, shape[0] * shape[1])
-    for pixels, seen in balls:
-        place = (pixels[:, 0] - rows.start) * shape[1] + pixels[:, 1] - columns.start
-        both.index_copy_(2, place, (1 - seen[:, 1:]) * both.index_select(2, place) + seen)
-    light, cover = both.mean(0).reshape(2, *shape).numpy()
+    down, right = (
+        slice(min(side.start for side in sides), max(side.stop for side in sides))
+        for sides in zip(*(window for window, _ in balls), strict=True)
+    )
+    window = rows, columns = _wider((down, right), 2 + round(4 * blur_px), size)
+    both = np.zeros((*balls[0][1].shape[:2], rows.stop - rows.start, columns.stop - columns.start), np.float32)
+    for place, seen in balls:
+        there = both[(..., *_inside(place, window))]
+        there *= 1 - seen[:, 1:]
+        there += seen
+    light, cover = both.mean(0)
     if blur_px > 0:
         light, cover = (np.asarray(cv2.GaussianBlur(one, (0, 0), blur_px)) for one in (light, cover))
     return Exposure(size=size, window=window, light=light, cover=cover)
+
+
+def _holds(window: Window, part: Window) -> bool:
+    return all(a.start <= b.start and b.stop <= a.stop for a, b in zip(window, part, strict=True))
+
+
+def _inside(part: Window, window: Window) -> Window:
+    """Return where a part of a window is in it."""
+    down, right = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(part, window, strict=True))
+    return down, right
 
 
 def _window(disks: NDArray[np.float64], size: tuple[int, int]) -> Window:
@@ -192,40 +227,41 @@ def _wider(window: Window, margin_px: int, size: tuple[int, int]) -> Window:
     return down, right
 
 
-def _near(disks: NDArray[np.float64], window: Window) -> Tensor:
-    """Return the pixels (M, 2), (v, u), of a window that lie in one of the disks (E, 3), or at most one beside it."""
-    v, u = np.ogrid[window]
-    near = np.any([(u - at_u) ** 2 + (v - at_v) ** 2 < (reach + 1) ** 2 for at_u, at_v, reach in disks], 0)
-    return torch.from_numpy(np.argwhere(near) + [side.start for side in window])
-
-
-def _seen(
-    scene: RenderedScene, origin: Tensor, direction: Tensor, position_lab_mm: Tensor, R_lab_body: Tensor
-) -> Tensor:
-    """Return shaded paint times coverage, and coverage, (2, M) float32, of M pixels with rays (3, M S), float64.
-    It is what `see_sphere` sees, where a ray hits; with x, y and z apart it takes a fifth of the time.
-    """
+def _seen(scene: RenderedScene, rays: PixelRays, centre: Doubles, R_body_lab: Floats) -> Floats:
+    """Return shaded paint times coverage, and coverage, (2, h, w), of a ball: what `see_sphere` sees where a ray hits."""
     settings, radius_mm = scene.settings, scene.settings.diameter_mm / 2
-    to_centre = position_lab_mm[:, None] - origin
-    along = (to_centre * direction).sum(0)
-    depth2 = along * along - (to_centre * to_centre).sum(0) + radius_mm**2
-    first = along - depth2.clamp_min(0).sqrt()
-    normal = ((first * direction - to_centre) / radius_mm).float()
-    lamps = torch.tensor(LAMPS)
-    lit = (lamps[:, 3] / LIT) @ (torch.nn.functional.normalize(lamps[:, :3], dim=-1) @ normal).clamp_min(0)
-    light = settings.ambient + (1 - settings.ambient) * lit
-    paint = sample_closed(scene.closed, (R_lab_body.mT.float() @ normal).mT)
-    hit = (depth2 > 0).float()
-    grey = (settings.black + (settings.white - settings.black) * paint) * light * hit
-    fine: Tensor = torch.stack([grey, hit]).reshape(2, -1, SUPERSAMPLING**2)
-    return fine.mean(-1)
+    normal = rays.feet(centre)
+    depth2 = np.float32(radius_mm**2) - np.einsum("kshw,kshw->shw", normal, normal)
+    depth, hit = np.maximum(depth2, 0), depth2 > 0
+    normal -= np.sqrt(depth, out=depth) * rays.fine
+    turned = (np.concatenate([R_body_lab, TOWARDS]) / np.float32(radius_mm)) @ normal.reshape(3, -1)
+    grey = _paint(scene.closed, torch.from_numpy(turned[:3]))
+    grey *= settings.white - settings.black
+    grey += settings.black
+    grey *= LAMP_SHARES * (1 - settings.ambient) @ np.maximum(turned[3:], 0, out=turned[3:]) + settings.ambient
+    seen = np.where(hit, grey.reshape(hit.shape), 0)
+    return np.stack([part.mean(0, dtype=np.float32) for part in (seen, hit)])
+
+
+def _paint(closed: Tensor, body: Tensor) -> Floats:
+    """Return the paint `sample_closed` (P,) at directions (3, P), in a third of the time."""
+    height, (x, y, z) = len(closed) - 2, body
+    place = torch.stack([torch.atan2(y, x), torch.atan2(z, (x * x).addcmul_(y, y).sqrt_())])
+    place[0] *= 2 * height / (2 * height + 1) / math.pi  # -1 and 1 are the centres of the outermost texels
+    place[1] *= -2 * height / (height + 1) / math.pi
+    found: Floats = torch.nn.functional.grid_sample(
+        closed[None, None], place.mT[None, None], align_corners=True
+    ).numpy()
+    return found.ravel()
 
 
 def digitise(picture: Floats, settings: SynthSettings, rng: torch.Generator) -> NDArray[np.uint8]:
     """Add camera noise to grey levels (H, W) and round to 8 bits."""
     noise = torch.empty(picture.shape).normal_(generator=rng).numpy()
-    sigma = np.sqrt(settings.read_noise**2 + settings.shot_noise**2 * np.maximum(picture, 0))
-    return np.asarray(cv2.add(picture, cv2.multiply(sigma, noise), dtype=cv2.CV_8U))
+    sigma = cv2.max(picture, 0.0)  # with numpy this and the root take three times as long
+    sigma *= settings.shot_noise**2
+    sigma += settings.read_noise**2
+    return np.asarray(cv2.add(picture, cv2.multiply(cv2.sqrt(sigma, sigma), noise, noise), dtype=cv2.CV_8U))
 
 
 def seeded(*what: str | int) -> torch.Generator:
