@@ -24,8 +24,8 @@ ROOM = 6  # rays are computed for windows that are wider by this part on each si
 LAMPS = ((-0.6, -0.5, 0.6, 0.55), (0.7, -0.3, 0.65, 0.35), (0.0, 0.9, -0.4, 0.1))
 LIT = 0.75  # share of the lamps that the brightest side receives
 
-_, LAMP_SHARES = (_LAMPS := np.array(LAMPS, np.float32))[:, :3], _LAMPS[:, 3] / np.float32(LIT)
-TOWARDS = _LAMPS[:, :3] / np.linalg.norm(_LAMPS[:, :3], axis=1, keepdims=True)
+TOWARDS, LAMP_SHARES = np.array(LAMPS, np.float32)[:, :3], np.array(LAMPS, np.float32)[:, 3] / np.float32(LIT)
+TOWARDS /= np.linalg.norm(TOWARDS, axis=1, keepdims=True)
 _ACROSS = fine_pixels(1, SUPERSAMPLING).numpy()
 # Weights of a pixel's middle and of a step to the right and down: those of its fine samples, row by row.
 FINE = np.array([(1, right, down) for down in _ACROSS for right in _ACROSS], np.float32)
@@ -68,15 +68,20 @@ class Exposure:
     def before(self, behind: Floats | float) -> Floats:
         """Return the picture (H, W) of the balls before grey levels (H, W), or one level."""
         picture = np.broadcast_to(np.asarray(behind, np.float32), self.size).copy()
+        self.put(picture)
+        return picture
+
+    def put(self, picture: Floats) -> None:
+        """Put the balls before the grey levels of a picture (H, W), in place."""
         picture[self.window] *= 1 - self.cover
         picture[self.window] += self.light
-        return picture
 
     def within(self, margin_px: int) -> Self:
         """Return it with a window that is wider on all sides, as far as the picture reaches."""
         window = _wider(self.window, margin_px, self.size)
-        pads = [(old.start - new.start, new.stop - old.stop) for old, new in zip(self.window, window, strict=True)]
-        return replace(self, window=window, light=np.pad(self.light, pads), cover=np.pad(self.cover, pads))
+        light, cover = wider = np.zeros((2, *(side.stop - side.start for side in window)), np.float32)
+        wider[(..., *_inside(self.window, window))] = self.light, self.cover
+        return replace(self, window=window, light=light, cover=cover)
 
     @property
     def covered(self) -> Floats:
@@ -88,53 +93,44 @@ class Exposure:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PixelRays:
-    """Rays through the pixels of a window (h, w), and how they change from pixel to pixel; x, y and z apart, lab."""
+    """Rays through the pixels of a window (h, w): origins, mm, and directions, lab; linear within a pixel."""
 
     window: Window
-    origin: Doubles  # (3, h, w), mm; (3, 1, 1) where all start in one point
-    direction: Doubles  # (3, h, w)
-    moves: Floats  # (2, *origin), change of the origin per pixel to the right and down, square to the ray
-    turns: Floats  # (2, 3, h, w), that of the direction
-    fine: Floats  # (3, S, h, w), directions of the fine samples: linear within a pixel, to 1e-7 of a radius
+    exact: Doubles  # (2, 3, h, w)
+    linear: Floats  # (2, 3, 3, h, w), the same with their changes per pixel to the right and down
 
     @classmethod
     def of(cls, camera: Camera, window: Window) -> Self:
         """Compute the rays of a window; those of a pixel do not depend on it."""
         wider = _wider(window, 1, camera.image_size[::-1])
         v, u = torch.meshgrid(*(torch.arange(side.start, side.stop).double() for side in wider), indexing="ij")
-        rays, part = camera.rays(torch.stack([u, v], -1)), (..., *_inside(window, wider))
-        every = [one.movedim(-1, 0).contiguous().numpy() for one in (rays.origin_lab_mm, rays.direction_lab)]
-        moves, turns = (np.stack(np.gradient(one, axis=(2, 1)))[part].astype(np.float32) for one in every)
-        origin, direction = (one[part] for one in every)
-        along = direction.astype(np.float32)
-        moves -= (moves * along).sum(1, keepdims=True) * along
-        if rays.origin_lab_mm.stride()[:2] == (0, 0):
-            origin, moves = origin[:, :1, :1], moves[..., :1, :1]
-        fine = _fine(np.stack([along, *turns], 1))
-        return cls(window=window, origin=origin, direction=direction, moves=moves, turns=turns, fine=fine)
+        rays = camera.rays(torch.stack([u, v], -1))
+        exact = torch.stack([rays.origin_lab_mm, rays.direction_lab]).movedim(-1, 1).contiguous().numpy()
+        linear = np.stack([exact, *np.gradient(exact, axis=(3, 2))], 1).astype(np.float32)
+        return cls(window=wider, exact=exact, linear=linear).within(window)
 
     def within(self, window: Window) -> Self:
         """Return those of a part of the window."""
         part = (..., *_inside(window, self.window))
-        names = ("direction", "turns", "fine", *(("origin", "moves") if self.origin.size > 3 else ()))
-        return replace(self, window=window, **{name: getattr(self, name)[part] for name in names})
+        return replace(self, window=window, exact=self.exact[part], linear=self.linear[part])
 
     def feet(self, centre: Doubles) -> Floats:
         """Return where the fine samples pass a centre (3,) nearest, seen from it, (3, S, h, w)."""
-        start = self.origin - centre[:, None, None]
-        ahead = (start * self.direction).sum(0)
-        foot = (start - ahead * self.direction).astype(np.float32)
-        ahead, along = ahead.astype(np.float32), self.direction.astype(np.float32)
+        start, direction = self.exact[0] - centre[:, None, None], self.exact[1]
+        ahead = (start * direction).sum(0)
+        foot = (start - ahead * direction).astype(np.float32)
+        (_, *moves), (along, *turns) = self.linear
+        ahead = ahead.astype(np.float32)
         changes = [
-            move - ((foot * turn).sum(0) * along + ahead * turn)
-            for move, turn in zip(self.moves, self.turns, strict=True)
+            move - (move * along + foot * turn).sum(0) * along - ahead * turn
+            for move, turn in zip(moves, turns, strict=True)
         ]
-        return _fine(np.stack([foot, *changes], 1))
+        return _fine(np.stack([foot, *changes]))
 
 
 def _fine(linear: Floats) -> Floats:
     """Return what fine samples have, (3, S, h, w), of values and their changes to the right and down (3, 3, h, w)."""
-    found: Floats = (FINE @ linear.reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
+    found: Floats = (FINE @ linear.swapaxes(0, 1).reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
     return found
 
 
@@ -161,22 +157,22 @@ def exposures(
     """
     size, blur_px = camera.image_size[::-1], scenes[0].settings.blur_px
     radii_mm = position_lab_mm.new_tensor([scene.settings.diameter_mm / 2 for scene in scenes])[:, None, None]
-    rays: list[PixelRays | None] = [None] * len(scenes)
+    rays = dict[int, PixelRays]()
     parts = (torch.split(poses, AT_ONCE, 1) for poses in (position_lab_mm, R_lab_body))
     for X, R in zip(*parts, strict=True):
         disks = torch.cat([camera.project(X), reach_px(camera, X, radii_mm)[..., None]], -1).numpy()
         away = (X - centre_lab_mm(camera)).norm(dim=-1).sum(-1)
+        order = away.argsort(0, descending=True).T.tolist()  # far ones first
         centres, turns = X.double().numpy(), R.mT.float().numpy()
         for n in range(X.shape[1]):
             balls = []
-            for k in away[:, n].argsort(descending=True).tolist():  # far ones first
-                window, known = _window(disks[k, n], size), rays[k]
+            for k in order[n]:
+                window = _window(disks[k, n], size)
                 if any(side.start == side.stop for side in window):
                     continue
-                if known is None or not _holds(known.window, window):
-                    room = (window[0].stop - window[0].start) // ROOM
-                    known = rays[k] = PixelRays.of(camera, _wider(window, room, size))
-                own, poses = known.within(window), zip(centres[k, n], turns[k, n], strict=True)
+                if k not in rays or not _holds(rays[k].window, window):
+                    rays[k] = PixelRays.of(camera, _wider(window, (window[0].stop - window[0].start) // ROOM, size))
+                own, poses = rays[k].within(window), zip(centres[k, n], turns[k, n], strict=True)
                 balls.append((window, np.stack([_seen(scenes[k], own, *pose) for pose in poses])))
             yield _exposure(balls, blur_px, size)
 
@@ -228,37 +224,38 @@ def _wider(window: Window, margin_px: int, size: tuple[int, int]) -> Window:
 
 
 def _seen(scene: RenderedScene, rays: PixelRays, centre: Doubles, R_body_lab: Floats) -> Floats:
-    """Return shaded paint times coverage, and coverage, (2, h, w), of a ball: what `see_sphere` sees where a ray hits."""
+    """Return shaded paint times coverage, and coverage, (2, h, w), of a ball: as `see_sphere`, where a ray hits."""
     settings, radius_mm = scene.settings, scene.settings.diameter_mm / 2
     normal = rays.feet(centre)
     depth2 = np.float32(radius_mm**2) - np.einsum("kshw,kshw->shw", normal, normal)
-    depth, hit = np.maximum(depth2, 0), depth2 > 0
-    normal -= np.sqrt(depth, out=depth) * rays.fine
-    turned = (np.concatenate([R_body_lab, TOWARDS]) / np.float32(radius_mm)) @ normal.reshape(3, -1)
-    grey = _paint(scene.closed, torch.from_numpy(turned[:3]))
+    hit, depth = depth2 > 0, torch.from_numpy(depth2).clamp_min_(0).numpy()
+    normal -= np.sqrt(depth, out=depth) * _fine(rays.linear[1])
+    towards = np.concatenate([R_body_lab, TOWARDS], dtype=np.float32) / np.float32(radius_mm)
+    turned: Floats = np.matmul(towards, normal.reshape(3, -1), dtype=np.float32)
+    grey = _paint(scene.closed, turned[:3])
     grey *= settings.white - settings.black
     grey += settings.black
-    grey *= LAMP_SHARES * (1 - settings.ambient) @ np.maximum(turned[3:], 0, out=turned[3:]) + settings.ambient
-    seen = np.where(hit, grey.reshape(hit.shape), 0)
-    return np.stack([part.mean(0, dtype=np.float32) for part in (seen, hit)])
+    lit = torch.from_numpy(turned[3:]).clamp_min_(0).numpy()
+    grey *= LAMP_SHARES * (1 - settings.ambient) @ lit + settings.ambient
+    return np.stack([part.mean(0, dtype=np.float32) for part in (grey.reshape(hit.shape) * hit, hit)])
 
 
-def _paint(closed: Tensor, body: Tensor) -> Floats:
-    """Return the paint `sample_closed` (P,) at directions (3, P), in a third of the time."""
+def _paint(closed: Tensor, body: Floats) -> Floats:
+    """Return the paint of `sample_closed` (P,) at directions (3, P), in a third of the time."""
     height, (x, y, z) = len(closed) - 2, body
-    place = torch.stack([torch.atan2(y, x), torch.atan2(z, (x * x).addcmul_(y, y).sqrt_())])
-    place[0] *= 2 * height / (2 * height + 1) / math.pi  # -1 and 1 are the centres of the outermost texels
-    place[1] *= -2 * height / (height + 1) / math.pi
-    found: Floats = torch.nn.functional.grid_sample(
-        closed[None, None], place.mT[None, None], align_corners=True
-    ).numpy()
-    return found.ravel()
+    place = torch.empty(2, len(x))
+    torch.atan2(*map(torch.from_numpy, (y, x)), out=place[0])
+    torch.atan2(*map(torch.from_numpy, (z, np.sqrt(x * x + y * y))), out=place[1])
+    place *= torch.tensor([[2 * height / (2 * height + 1)], [-2 * height / (height + 1)]]) / math.pi
+    # -1 and 1 are the centres of the outermost texels.
+    grey = torch.nn.functional.grid_sample(closed[None, None], place.mT[None, None], align_corners=True)
+    return np.asarray(grey.numpy().ravel())
 
 
 def digitise(picture: Floats, settings: SynthSettings, rng: torch.Generator) -> NDArray[np.uint8]:
     """Add camera noise to grey levels (H, W) and round to 8 bits."""
     noise = torch.empty(picture.shape).normal_(generator=rng).numpy()
-    sigma = cv2.max(picture, 0.0)  # with numpy this and the root take three times as long
+    sigma = torch.from_numpy(picture).clamp_min(0).numpy()  # with numpy this and the root take three times as long
     sigma *= settings.shot_noise**2
     sigma += settings.read_noise**2
     return np.asarray(cv2.add(picture, cv2.multiply(cv2.sqrt(sigma, sigma), noise, noise), dtype=cv2.CV_8U))
