@@ -117,6 +117,7 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
     """Return longitude -pi .. pi and latitude -pi/2 .. pi/2, rad, of directions (..., 3); finite gradients at poles."""
     check_tail("direction_body", direction_body, 3)
     x, y, z = direction_body.unbind(-1)
+    x, y = x.contiguous(), y.contiguous()  # on strides atan2 is slower, and another in the last digit
     if direction_body.requires_grad:
         # At the poles the gradient of the longitude is infinite: replace x by a constant nudge and detach y.
         nudge = torch.finfo(direction_body.dtype).eps
