@@ -170,7 +170,7 @@ def exposures(
                 window = _window(disks[k, n], size)
                 if any(side.start == side.stop for side in window):
                     continue
-                if k not in rays or not _holds(rays[k].window, window):
+                if k not in rays or _around([rays[k].window, window]) != rays[k].window:
                     rays[k] = PixelRays.of(camera, _wider(window, (window[0].stop - window[0].start) // ROOM, size))
                 own, poses = rays[k].within(window), zip(centres[k, n], turns[k, n], strict=True)
                 balls.append((window, np.stack([_seen(scenes[k], own, *pose) for pose in poses])))
@@ -181,12 +181,8 @@ def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tupl
     """Put balls before each other, far ones first: windows and what is seen there, (E, 2, h, w)."""
     if not balls:
         return Exposure.none(size)
-    down, right = (
-        slice(min(side.start for side in sides), max(side.stop for side in sides))
-        for sides in zip(*(window for window, _ in balls), strict=True)
-    )
-    window = rows, columns = _wider((down, right), 2 + round(4 * blur_px), size)
-    both = np.zeros((*balls[0][1].shape[:2], rows.stop - rows.start, columns.stop - columns.start), np.float32)
+    window = _wider(_around([place for place, _ in balls]), 2 + round(4 * blur_px), size)
+    both = np.zeros((*balls[0][1].shape[:2], *(side.stop - side.start for side in window)), np.float32)
     for place, seen in balls:
         there = both[(..., *_inside(place, window))]
         there *= 1 - seen[:, 1:]
@@ -197,8 +193,12 @@ def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tupl
     return Exposure(size=size, window=window, light=light, cover=cover)
 
 
-def _holds(window: Window, part: Window) -> bool:
-    return all(a.start <= b.start and b.stop <= a.stop for a, b in zip(window, part, strict=True))
+def _around(windows: Sequence[Window]) -> Window:
+    """Return the smallest window that holds some."""
+    down, right = (
+        slice(min(s.start for s in sides), max(s.stop for s in sides)) for sides in zip(*windows, strict=True)
+    )
+    return down, right
 
 
 def _inside(part: Window, window: Window) -> Window:

@@ -1,7 +1,6 @@
 """Random texture maps of three kinds, seamless on the sphere."""
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -19,14 +18,15 @@ def blobs(height: int, rng: torch.Generator) -> Tensor:
     """Draw smooth blobs, half of the sphere white."""
     wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
     phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
-    value = _by_rows(height, lambda body: torch.cos(body @ wave.T + phase).sum(-1))
+    rows = torch.split(map_directions(height), 2)  # all at once would fill 250 MB
+    value = torch.cat([torch.cos(body @ wave.T + phase).sum(-1) for body in rows])
     return _edge(value - value.median(), 0.25)
 
 
 def polygons(height: int, rng: torch.Generator) -> Tensor:
     """Draw black and white regions nearest to random points."""
     points = random_directions(60, rng)
-    owner = _by_rows(height, lambda body: (body @ points.T).argmax(-1))
+    owner = (map_directions(height) @ points.T).argmax(-1)
     return (owner % 2).float()
 
 
@@ -34,13 +34,8 @@ def dots(height: int, rng: torch.Generator) -> Tensor:
     """Draw black dots of 8 to 14 degrees radius on white."""
     points = random_directions(34, rng)
     radius = torch.deg2rad(8 + 6 * torch.rand(34, generator=rng, dtype=torch.float64))
-    outside = _by_rows(height, lambda body: (torch.acos((body @ points.T).clamp(-1, 1)) - radius).amin(-1))
+    outside = (torch.acos((map_directions(height) @ points.T).clamp(-1, 1)) - radius).amin(-1)
     return _edge(outside, math.pi / height)
-
-
-def _by_rows(height: int, value: Callable[[Tensor], Tensor]) -> Tensor:
-    """Return the values (H, 2 H) of body directions (..., 3), a few rows at a time: all at once would fill 250 MB."""
-    return torch.cat([value(rows) for rows in torch.split(map_directions(height), 2)])
 
 
 def _edge(value: Tensor, width: float) -> Tensor:
