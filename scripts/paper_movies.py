@@ -79,32 +79,30 @@ def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.f
     width, height = size
     band, mirrored = reflections(width)
     turned = IMPELLER_HZ * time_s * np.array([[1.0], [-1.0]]) + (np.arange(BLADES) + 0.3 * camera) / BLADES
-    angle = (2 * np.pi * turned)[..., None]  # (2, BLADES, 1)
-    up = np.maximum(np.sin(angle), 0.0)
+    before = np.nonzero(np.sin(2 * np.pi * turned) > 0)  # side and blade
+    angle = 2 * np.pi * turned[before][:, None]
+    up = np.sin(angle)
     profile = np.exp(-0.5 * ((np.arange(height) - height / 2 * (1 + 1.1 * np.cos(angle))) / (4 + 14 * up)) ** 2)
-    across = np.where(up > 0, 35 + 65 * up, 0.0) * band[:, None] + 26 * up * mirrored
-    of_blades, along = (part.reshape(2 * BLADES, -1).astype(np.float32) for part in (profile, across))
-    return of_blades.T @ along + 20 * band.sum(0)
+    across = (35 + 65 * up) * band[before[0]] + 26 * up * mirrored[before]
+    light = np.asarray(profile.astype(np.float32).T @ across.astype(np.float32))
+    light += 20 * band.sum(0)
+    return light
 
 
-def disturb(
-    light: NDArray[np.float32], behind: Floats, exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]
-) -> None:
-    """Put what real pictures have on the sphere in grey levels (H, W): lamps of the tank, and bubbles of each frame.
+def put(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]) -> None:
+    """Put the sphere before grey levels (H, W), with what real pictures have: lamps of the tank, and bubbles.
 
-    `behind` (H, W) is what the sphere hides; `seeds` are camera, movie and frame.
+    `seeds` are camera, movie and frame: lamps stay, bubbles are of each frame.
     """
-    part = exposure.within(round(0.5 * float(disk.radius_px)))
-    rows, columns = part.window
-    corner = torch.tensor([columns.start, rows.start])
-    cover, scene = (
-        torch.from_numpy(np.ascontiguousarray(one, np.float32)) for one in (part.cover, behind[part.window])
-    )
-    inside = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=scene)
     static, moving = (seeded(TEXTURE_SEED, *seeds[:count]) for count in (1, 3))
-    number = float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))
-    lit = degrade(torch.from_numpy(light[part.window]), inside, LAMPS, static)
-    light[part.window] = degrade(lit, inside, {"bubbles": number}, moving)
+    bubbles = {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}
+    behind, cover = torch.from_numpy(light[exposure.window].copy()), torch.from_numpy(exposure.cover)
+    exposure.put(light)
+    beyond = exposure.within(round(0.5 * float(disk.radius_px)))  # bubbles reach beyond the sphere, lamps do not
+    for part, values, rng in (exposure, LAMPS, static), (beyond, bubbles, moving):
+        corner = torch.tensor([side.start for side in part.window[::-1]])
+        inside = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=behind)
+        light[part.window] = degrade(torch.from_numpy(light[part.window]), inside, values, rng)
 
 
 def film(folder: Path, number: int, frames: int) -> None:
@@ -119,19 +117,18 @@ def film(folder: Path, number: int, frames: int) -> None:
     X, R = (part.unflatten(0, (frames, -1)) for part in (poses.position_lab_mm, poses.R_lab_body))
 
     def pictures(index: int, camera: Camera) -> Iterator[NDArray[np.uint8]]:
-        rng, size = seeded(number, index), camera.image_size[::-1]
+        rng = seeded(number, index)
         at, width = camera.project(X.mean(1)), torch.tensor(camera.image_size)
         near = ((at > -width) & (at < 2 * width)).all(1)  # the lens's distortion is defined nearby only
         disks = picture_of_ball(camera, X[near].mean(1), settings.diameter_mm / 2)
         seen, place = exposures([scene], camera, X[None, near], R[None, near]), near.cumsum(0) - 1
         for k in range(frames):
-            behind = settings.background + impellers(camera.image_size, index, float(times_s[k]))
-            exposure = next(seen) if near[k] else Exposure.none(size)
-            lit = exposure.before(behind)
+            light = impellers(camera.image_size, index, float(times_s[k]))
+            light += settings.background
             if near[k]:
                 disk = Disk(centre_px=disks.centre_px[place[k]], radius_px=disks.radius_px[place[k]])
-                disturb(lit, behind, exposure, disk, (index, number, k))
-            yield digitise(lit, settings, rng)
+                put(light, next(seen), disk, (index, number, k))
+            yield digitise(light, settings, rng)
 
     for index, (name, camera) in enumerate(cameras.items()):
         write_ffv1(folder / f"{name}.mkv", pictures(index, camera), settings.frame_rate)

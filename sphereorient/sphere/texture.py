@@ -117,17 +117,19 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
     """Return longitude -pi .. pi and latitude -pi/2 .. pi/2, rad, of directions (..., 3); finite gradients at poles."""
     check_tail("direction_body", direction_body, 3)
     x, y, z = direction_body.unbind(-1)
-    # At the poles the gradient of the longitude is infinite: replace x by a constant nudge and detach y.
-    nudge = torch.finfo(direction_body.dtype).eps
-    polar = (x.abs() < nudge) & (y.abs() < nudge)
-    x, y = torch.where(polar, x.detach() + nudge, x), torch.where(polar, y.detach(), y)
+    x, y = x.contiguous(), y.contiguous()  # on strides atan2 is slower, and another in the last digit
+    if direction_body.requires_grad:
+        # At the poles the gradient of the longitude is infinite: replace x by a constant nudge and detach y.
+        nudge = torch.finfo(direction_body.dtype).eps
+        polar = (x.abs() < nudge) & (y.abs() < nudge)
+        x, y = torch.where(polar, x.detach() + nudge, x), torch.where(polar, y.detach(), y)
     return torch.atan2(y, x), torch.atan2(z, torch.sqrt(x * x + y * y))
 
 
 def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
     """Return the bilinear grey (...) of a map (H, 2 H) at body directions (..., 3) of any length but zero.
     Differentiable, continuous over the date line and the poles; map and directions share dtype and device.
-    Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
+    Source: docs/conventions.md (texture map).
     """
     check_texture_shape(texture)
     return sample_closed(closed_texture(texture), direction_body)
@@ -140,16 +142,13 @@ def closed_texture(texture: Tensor) -> Tensor:
 
 def sample_closed(closed: Tensor, direction_body: Tensor) -> Tensor:
     """Return the grey of `sample_texture`, of a map that is sampled more than once."""
-    from kornia.geometry.transform import remap  # late: half a second, and tables do without it
-
     column, row = texel_coordinates(direction_body, len(closed) - 2)
-    grey = remap(
-        closed[None, None],
-        (column + 1).reshape(1, 1, -1),
-        (row + 1).reshape(1, 1, -1),
-        align_corners=True,
+    height, width = closed.shape
+    # -1 and 1 are the centres of the outermost texels.
+    place = torch.stack([(column + 1) * (2 / (width - 1)) - 1, (row + 1) * (2 / (height - 1)) - 1])
+    return F.grid_sample(closed[None, None], place.reshape(2, -1).mT[None, None], align_corners=True).reshape(
+        column.shape
     )
-    return grey.reshape(column.shape)
 
 
 def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ CHUNK = 1 << 14  # directions per batch while a table is built
 STEPS = 127.0  # of a direction table: white paint; black is its negative
 AT_ONCE = 1 << 17  # pixels looked up at once: temporaries stay in the cache
 SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
+WIDER = 1.6  # most of a step of blur: the 9-point rule is exact if the map is smooth over the added width
 CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
 
@@ -137,8 +138,14 @@ class TextureTable:
         """Return a table whose total blur is `blur_rad`, or itself if that is not wider."""
         if blur_rad <= self.blur_rad:
             return self
-        # The 9-point rule is exact if the map is smooth over the added width: widen by 1.6 at most.
-        target = min(blur_rad, 1.6 * self.blur_rad)
+        return self._wider.blurred(blur_rad) if blur_rad > WIDER * self.blur_rad else self._widened(blur_rad)
+
+    @cached_property
+    def _wider(self) -> "TextureTable":
+        """A step on the way to all that are blurred more."""
+        return self._widened(WIDER * self.blur_rad)
+
+    def _widened(self, target: float) -> "TextureTable":
         added = math.sqrt(target**2 - self.blur_rad**2)
         # A cell is 2.2 / side wide: a wider blur needs fewer cells.
         side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
@@ -152,7 +159,7 @@ class TextureTable:
             return _rows(value, slope, centre.float())
 
         unseen = self.unseen and self.unseen.blurred(target)
-        return TextureTable(_in_chunks(rows, side), target, unseen).blurred(blur_rad)
+        return TextureTable(_in_chunks(rows, side), target, unseen)
 
 
 def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Tensor | None = None) -> TextureTable:

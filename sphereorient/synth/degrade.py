@@ -91,8 +91,7 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
     for lobe in range(LOBES):
         angle = 2 * math.pi * (draw[..., 0, :, :] + lobe / LOBES)
         away = (0.2 + 0.5 * draw[..., 1 + lobe, :, :]) * radius
-        square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()
-        light = light + torch.exp(-0.5 * square / (LOBE_RADII * radius).square())
+        light = light + _glow(right - away * angle.cos(), down - away * angle.sin(), LOBE_RADII * radius)
     return pictures + peak * disk.covered(pictures) * light
 
 
@@ -137,15 +136,31 @@ def bubbles(pictures: Tensor, number: float, disk: Disk, rng: torch.Generator) -
     radius = disk.radius(pictures)
     size = BUBBLE_RADII * radius
     right, down = disk.offset(pictures)
-    for k in range(count):  # a loop: all at once would hold `count` copies of each picture
+    pictures = pictures.clone()
+    for k in range(count):
         angle = 2 * math.pi * draw[..., k, 0, None, None]
         away = draw[..., k, 1, None, None].sqrt() * radius
         x, y = right - away * angle.cos(), down - away * angle.sin()
+        rows, columns = _reached(y.mT.abs() < size + 1), _reached(x.abs() < size + 1)
+        x, y, there = x[..., columns], y[..., rows, :], pictures[..., rows, columns].clone()
         inside = _round(x, y, size)
         fourth = ((x.square() + y.square()) / size.square()).square()
-        glint = torch.exp(-0.5 * ((x + 0.4 * size).square() + (y + 0.4 * size).square()) / (0.15 * size).square())
-        pictures = pictures * (1 - inside * (0.15 + 0.6 * fourth).clamp_max(0.75)) + GLINT * inside * glint
+        glint = _glow(x + 0.4 * size, y + 0.4 * size, 0.15 * size)
+        there = there * (1 - inside * (0.15 + 0.6 * fourth).clamp_max(0.75)) + GLINT * inside * glint
+        pictures[..., rows, columns] = there
     return pictures
+
+
+def _reached(near: Tensor) -> slice:
+    """Return the part of the last axis of (..., 1, N) bool that is true anywhere."""
+    places = near.flatten(0, -2).any(0).nonzero()[:, 0].tolist()
+    return slice(places[0], places[-1] + 1) if places else slice(0)
+
+
+def _glow(right: Tensor, down: Tensor, sigma: Tensor) -> Tensor:
+    """Return a Gaussian of peak 1."""
+    across, along = (torch.exp(-0.5 * (offset / sigma).square()) for offset in (right, down))
+    return across * along
 
 
 def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -> Tensor:

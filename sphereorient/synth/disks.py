@@ -25,13 +25,9 @@ AMBIENT = (0.3, 1.0)  # range of the ambient share
 LAMPS = 2
 READ_NOISE, SHOT_NOISE, BLUR_PX = 1.5, 0.3, 0.55  # always present, as in `SynthSettings`
 IN_PX = ("dirt", "defocus", "centre_error", "radius_error")  # values that scale with the picture
+OF_MAPS_AND_DISKS = {"ball_size", "motion_blur", "paint_wear", "centre_error", "radius_error", "texture_error"}
 # without those of movies and of two cameras
-DISK_DEGRADATIONS = tuple(
-    name
-    for name in DEGRADATIONS
-    if name in OPERATIONS
-    or name in ("ball_size", "motion_blur", "paint_wear", "centre_error", "radius_error", "texture_error")
-)
+DISK_DEGRADATIONS = tuple(name for name in DEGRADATIONS if name in OPERATIONS or name in OF_MAPS_AND_DISKS)
 
 
 class DiskSettings(BaseModel, frozen=True, extra="forbid"):

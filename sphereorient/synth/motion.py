@@ -1,6 +1,9 @@
 import math
 from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import accumulate
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -97,14 +100,9 @@ def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8
     begin = start[:, None] + step * torch.arange(substeps, dtype=time_s.dtype)
     early, late = (begin + step * (0.5 + sign * math.sqrt(3) / 6) for sign in (-1, 1))
     turn = magnus_rotation(omega(early), omega(late), step[..., None])
-    R = R_start
-    out = []
-    for per_frame in turn:
-        for dR in per_frame:
-            R = dR @ R
-        R = so3.nearest_rotation(R)
-        out.append(R)
-    return torch.stack(out)
+    steps = reduce(lambda done, k: turn[:, k] @ done, range(1, substeps), turn[:, 0]).numpy()
+    R = accumulate(steps, lambda before, step: step @ before, initial=R_start.numpy())
+    return so3.nearest_rotation(torch.from_numpy(np.stack(list(R)[1:])))
 
 
 def magnus_rotation(early: Tensor, late: Tensor, step_s: Tensor | float) -> Tensor:

@@ -1,3 +1,4 @@
+import math
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, centre_lab_mm
 from sphereorient.sphere import reduced_texture
 from sphereorient.sphere.renderer import fine_pixels, reach_px
-from sphereorient.sphere.texture import closed_texture, sample_closed
+from sphereorient.sphere.texture import closed_texture
 from sphereorient.synth.settings import SynthSettings
 
 SUPERSAMPLING = 3  # rays per pixel and axis: edges are accurate to a few per cent
@@ -23,6 +24,13 @@ ROOM = 6  # rays are computed for windows that are wider by this part on each si
 LAMPS = ((-0.6, -0.5, 0.6, 0.55), (0.7, -0.3, 0.65, 0.35), (0.0, 0.9, -0.4, 0.1))
 LIT = 0.75  # share of the lamps that the brightest side receives
 
+TOWARDS, LAMP_SHARES = np.array(LAMPS, np.float32)[:, :3], np.array(LAMPS, np.float32)[:, 3] / np.float32(LIT)
+TOWARDS /= np.linalg.norm(TOWARDS, axis=1, keepdims=True)
+_ACROSS = fine_pixels(1, SUPERSAMPLING).numpy()
+# Weights of a pixel's middle and of a step to the right and down: those of its fine samples, row by row.
+FINE = np.array([(1, right, down) for down in _ACROSS for right in _ACROSS], np.float32)
+
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Window = tuple[slice, slice]  # rows and columns of a picture
 
@@ -59,16 +67,21 @@ class Exposure:
 
     def before(self, behind: Floats | float) -> Floats:
         """Return the picture (H, W) of the balls before grey levels (H, W), or one level."""
-        picture = np.array(np.broadcast_to(np.float32(behind), self.size))
+        picture = np.broadcast_to(np.asarray(behind, np.float32), self.size).copy()
+        self.put(picture)
+        return picture
+
+    def put(self, picture: Floats) -> None:
+        """Put the balls before the grey levels of a picture (H, W), in place."""
         picture[self.window] *= 1 - self.cover
         picture[self.window] += self.light
-        return picture
 
     def within(self, margin_px: int) -> Self:
         """Return it with a window that is wider on all sides, as far as the picture reaches."""
         window = _wider(self.window, margin_px, self.size)
-        pads = [(old.start - new.start, new.stop - old.stop) for old, new in zip(self.window, window, strict=True)]
-        return replace(self, window=window, light=np.pad(self.light, pads), cover=np.pad(self.cover, pads))
+        light, cover = wider = np.zeros((2, *(side.stop - side.start for side in window)), np.float32)
+        wider[(..., *_inside(self.window, window))] = self.light, self.cover
+        return replace(self, window=window, light=light, cover=cover)
 
     @property
     def covered(self) -> Floats:
@@ -79,40 +92,46 @@ class Exposure:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FineRays:
-    """Rays through the fine samples of a window's pixels, x, y and z apart, float64."""
+class PixelRays:
+    """Rays through the pixels of a window (h, w): origins, mm, and directions, lab; linear within a pixel."""
 
     window: Window
-    origin: Tensor  # (3, h, w, S), lab, mm; (3, 1, 1, 1) where all start in one point
-    direction: Tensor  # (3, h, w, S), lab
+    exact: Doubles  # (2, 3, h, w)
+    linear: Floats  # (2, 3, 3, h, w), the same with their changes per pixel to the right and down
 
     @classmethod
     def of(cls, camera: Camera, window: Window) -> Self:
-        """Compute the rays of a window."""
-        within = fine_pixels(1, SUPERSAMPLING)
-        rows, columns = (torch.arange(side.start, side.stop, dtype=torch.float64)[:, None] + within for side in window)
-        shape = len(rows), len(columns), SUPERSAMPLING, SUPERSAMPLING
-        v, u = rows[:, None, :, None].expand(shape), columns[:, None, :].expand(shape)
-        rays = camera.rays(torch.stack([u, v], -1).flatten(2, 3))
-        origin, direction = (part.movedim(-1, 0) for part in (rays.origin_lab_mm, rays.direction_lab))
-        central = origin.stride()[1:] == (0, 0, 0)
-        return cls(
-            window=window,
-            origin=(origin[:, :1, :1, :1] if central else origin).contiguous(),
-            direction=direction.contiguous(),
-        )
+        """Compute the rays of a window; those of a pixel do not depend on it."""
+        wider = _wider(window, 1, camera.image_size[::-1])
+        v, u = torch.meshgrid(*(torch.arange(side.start, side.stop).double() for side in wider), indexing="ij")
+        rays = camera.rays(torch.stack([u, v], -1))
+        exact = torch.stack([rays.origin_lab_mm, rays.direction_lab]).movedim(-1, 1).contiguous().numpy()
+        linear = np.stack([exact, *np.gradient(exact, axis=(3, 2))], 1).astype(np.float32)
+        return cls(window=wider, exact=exact, linear=linear).within(window)
 
-    def holds(self, window: Window) -> bool:
-        """Return whether a window is part of this one."""
-        return all(a.start <= b.start and b.stop <= a.stop for a, b in zip(self.window, window, strict=True))
+    def within(self, window: Window) -> Self:
+        """Return those of a part of the window."""
+        part = (..., *_inside(window, self.window))
+        return replace(self, window=window, exact=self.exact[part], linear=self.linear[part])
 
-    def through(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return origins (3, M S) or (3, 1) and directions (3, M S) of the M pixels (v, u), (M, 2)."""
-        rows, columns = self.window
-        place = (pixels[:, 0] - rows.start) * (columns.stop - columns.start) + pixels[:, 1] - columns.start
-        parts = [self.direction] if self.origin.numel() == 3 else [self.direction, self.origin]
-        found = [part.flatten(1, 2).index_select(1, place).flatten(1) for part in parts]
-        return (found[1] if len(found) > 1 else self.origin.flatten(1)), found[0]
+    def feet(self, centre: Doubles) -> Floats:
+        """Return where the fine samples pass a centre (3,) nearest, seen from it, (3, S, h, w)."""
+        start, direction = self.exact[0] - centre[:, None, None], self.exact[1]
+        ahead = (start * direction).sum(0)
+        foot = (start - ahead * direction).astype(np.float32)
+        (_, *moves), (along, *turns) = self.linear
+        ahead = ahead.astype(np.float32)
+        changes = [
+            move - (move * along + foot * turn).sum(0) * along - ahead * turn
+            for move, turn in zip(moves, turns, strict=True)
+        ]
+        return _fine(np.stack([foot, *changes]))
+
+
+def _fine(linear: Floats) -> Floats:
+    """Return what fine samples have, (3, S, h, w), of values and their changes to the right and down (3, 3, h, w)."""
+    found: Floats = (FINE @ linear.swapaxes(0, 1).reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
+    return found
 
 
 def render_frame(
@@ -138,42 +157,54 @@ def exposures(
     """
     size, blur_px = camera.image_size[::-1], scenes[0].settings.blur_px
     radii_mm = position_lab_mm.new_tensor([scene.settings.diameter_mm / 2 for scene in scenes])[:, None, None]
-    rays = [FineRays.of(camera, (slice(0, 0), slice(0, 0))) for _ in scenes]
+    rays = dict[int, PixelRays]()
     parts = (torch.split(poses, AT_ONCE, 1) for poses in (position_lab_mm, R_lab_body))
     for X, R in zip(*parts, strict=True):
         disks = torch.cat([camera.project(X), reach_px(camera, X, radii_mm)[..., None]], -1).numpy()
         away = (X - centre_lab_mm(camera)).norm(dim=-1).sum(-1)
+        order = away.argsort(0, descending=True).T.tolist()  # far ones first
+        centres, turns = X.double().numpy(), R.mT.float().numpy()
         for n in range(X.shape[1]):
             balls = []
-            for k in away[:, n].argsort(descending=True).tolist():  # far ones first
+            for k in order[n]:
                 window = _window(disks[k, n], size)
-                if not rays[k].holds(window):
-                    rays[k] = FineRays.of(camera, _wider(window, (window[0].stop - window[0].start) // ROOM, size))
-                pixels = _near(disks[k, n], window)
-                origin, direction = rays[k].through(pixels)
-                instants = zip(X[k, n], R[k, n], strict=True)
-                seen = torch.stack([_seen(scenes[k], origin, direction, *pose) for pose in instants])
-                balls.append((pixels, seen))
+                if any(side.start == side.stop for side in window):
+                    continue
+                if k not in rays or _around([rays[k].window, window]) != rays[k].window:
+                    rays[k] = PixelRays.of(camera, _wider(window, (window[0].stop - window[0].start) // ROOM, size))
+                own, poses = rays[k].within(window), zip(centres[k, n], turns[k, n], strict=True)
+                balls.append((window, np.stack([_seen(scenes[k], own, *pose) for pose in poses])))
             yield _exposure(balls, blur_px, size)
 
 
-def _exposure(balls: Sequence[tuple[Tensor, Tensor]], blur_px: float, size: tuple[int, int]) -> Exposure:
-    """Put balls before each other, far ones first: pixels (M, 2) as (v, u), and what is seen there, (E, 2, M)."""
-    every = torch.cat([pixels for pixels, _ in balls])
-    if not len(every):
+def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tuple[int, int]) -> Exposure:
+    """Put balls before each other, far ones first: windows and what is seen there, (E, 2, h, w)."""
+    if not balls:
         return Exposure.none(size)
-    (top, left), (bottom, right) = every.amin(0).tolist(), every.amax(0).tolist()
-    window = _wider((slice(top, bottom + 1), slice(left, right + 1)), 2 + round(4 * blur_px), size)
-    rows, columns = window
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    both = torch.zeros(len(balls[0][1]), 2, shape[0] * shape[1])
-    for pixels, seen in balls:
-        place = (pixels[:, 0] - rows.start) * shape[1] + pixels[:, 1] - columns.start
-        both.index_copy_(2, place, (1 - seen[:, 1:]) * both.index_select(2, place) + seen)
-    light, cover = both.mean(0).reshape(2, *shape).numpy()
+    window = _wider(_around([place for place, _ in balls]), 2 + round(4 * blur_px), size)
+    both = np.zeros((*balls[0][1].shape[:2], *(side.stop - side.start for side in window)), np.float32)
+    for place, seen in balls:
+        there = both[(..., *_inside(place, window))]
+        there *= 1 - seen[:, 1:]
+        there += seen
+    light, cover = both.mean(0)
     if blur_px > 0:
         light, cover = (np.asarray(cv2.GaussianBlur(one, (0, 0), blur_px)) for one in (light, cover))
     return Exposure(size=size, window=window, light=light, cover=cover)
+
+
+def _around(windows: Sequence[Window]) -> Window:
+    """Return the smallest window that holds some."""
+    down, right = (
+        slice(min(s.start for s in sides), max(s.stop for s in sides)) for sides in zip(*windows, strict=True)
+    )
+    return down, right
+
+
+def _inside(part: Window, window: Window) -> Window:
+    """Return where a part of a window is in it."""
+    down, right = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(part, window, strict=True))
+    return down, right
 
 
 def _window(disks: NDArray[np.float64], size: tuple[int, int]) -> Window:
@@ -192,40 +223,42 @@ def _wider(window: Window, margin_px: int, size: tuple[int, int]) -> Window:
     return down, right
 
 
-def _near(disks: NDArray[np.float64], window: Window) -> Tensor:
-    """Return the pixels (M, 2), (v, u), of a window that lie in one of the disks (E, 3), or at most one beside it."""
-    v, u = np.ogrid[window]
-    near = np.any([(u - at_u) ** 2 + (v - at_v) ** 2 < (reach + 1) ** 2 for at_u, at_v, reach in disks], 0)
-    return torch.from_numpy(np.argwhere(near) + [side.start for side in window])
-
-
-def _seen(
-    scene: RenderedScene, origin: Tensor, direction: Tensor, position_lab_mm: Tensor, R_lab_body: Tensor
-) -> Tensor:
-    """Return shaded paint times coverage, and coverage, (2, M) float32, of M pixels with rays (3, M S), float64.
-    It is what `see_sphere` sees, where a ray hits; with x, y and z apart it takes a fifth of the time.
-    """
+def _seen(scene: RenderedScene, rays: PixelRays, centre: Doubles, R_body_lab: Floats) -> Floats:
+    """Return shaded paint times coverage, and coverage, (2, h, w), of a ball: as `see_sphere`, where a ray hits."""
     settings, radius_mm = scene.settings, scene.settings.diameter_mm / 2
-    to_centre = position_lab_mm[:, None] - origin
-    along = (to_centre * direction).sum(0)
-    depth2 = along * along - (to_centre * to_centre).sum(0) + radius_mm**2
-    first = along - depth2.clamp_min(0).sqrt()
-    normal = ((first * direction - to_centre) / radius_mm).float()
-    lamps = torch.tensor(LAMPS)
-    lit = (lamps[:, 3] / LIT) @ (torch.nn.functional.normalize(lamps[:, :3], dim=-1) @ normal).clamp_min(0)
-    light = settings.ambient + (1 - settings.ambient) * lit
-    paint = sample_closed(scene.closed, (R_lab_body.mT.float() @ normal).mT)
-    hit = (depth2 > 0).float()
-    grey = (settings.black + (settings.white - settings.black) * paint) * light * hit
-    fine: Tensor = torch.stack([grey, hit]).reshape(2, -1, SUPERSAMPLING**2)
-    return fine.mean(-1)
+    normal = rays.feet(centre)
+    depth2 = np.float32(radius_mm**2) - np.einsum("kshw,kshw->shw", normal, normal)
+    hit, depth = depth2 > 0, torch.from_numpy(depth2).clamp_min_(0).numpy()
+    normal -= np.sqrt(depth, out=depth) * _fine(rays.linear[1])
+    towards = np.concatenate([R_body_lab, TOWARDS], dtype=np.float32) / np.float32(radius_mm)
+    turned: Floats = np.matmul(towards, normal.reshape(3, -1), dtype=np.float32)
+    grey = _paint(scene.closed, turned[:3])
+    grey *= settings.white - settings.black
+    grey += settings.black
+    lit = torch.from_numpy(turned[3:]).clamp_min_(0).numpy()
+    grey *= LAMP_SHARES * (1 - settings.ambient) @ lit + settings.ambient
+    return np.stack([part.mean(0, dtype=np.float32) for part in (grey.reshape(hit.shape) * hit, hit)])
+
+
+def _paint(closed: Tensor, body: Floats) -> Floats:
+    """Return the paint of `sample_closed` (P,) at directions (3, P), in a third of the time."""
+    height, (x, y, z) = len(closed) - 2, body
+    place = torch.empty(2, len(x))
+    torch.atan2(*map(torch.from_numpy, (y, x)), out=place[0])
+    torch.atan2(*map(torch.from_numpy, (z, np.sqrt(x * x + y * y))), out=place[1])
+    place *= torch.tensor([[2 * height / (2 * height + 1)], [-2 * height / (height + 1)]]) / math.pi
+    # -1 and 1 are the centres of the outermost texels.
+    grey = torch.nn.functional.grid_sample(closed[None, None], place.mT[None, None], align_corners=True)
+    return np.asarray(grey.numpy().ravel())
 
 
 def digitise(picture: Floats, settings: SynthSettings, rng: torch.Generator) -> NDArray[np.uint8]:
     """Add camera noise to grey levels (H, W) and round to 8 bits."""
     noise = torch.empty(picture.shape).normal_(generator=rng).numpy()
-    sigma = np.sqrt(settings.read_noise**2 + settings.shot_noise**2 * np.maximum(picture, 0))
-    return np.asarray(cv2.add(picture, cv2.multiply(sigma, noise), dtype=cv2.CV_8U))
+    sigma = torch.from_numpy(picture).clamp_min(0).numpy()  # with numpy this and the root take three times as long
+    sigma *= settings.shot_noise**2
+    sigma += settings.read_noise**2
+    return np.asarray(cv2.add(picture, cv2.multiply(cv2.sqrt(sigma, sigma), noise, noise), dtype=cv2.CV_8U))
 
 
 def seeded(*what: str | int) -> torch.Generator:

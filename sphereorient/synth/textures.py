@@ -18,7 +18,8 @@ def blobs(height: int, rng: torch.Generator) -> Tensor:
     """Draw smooth blobs, half of the sphere white."""
     wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
     phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
-    value = torch.cos(map_directions(height) @ wave.T + phase).sum(-1)
+    rows = torch.split(map_directions(height), 2)  # all at once would fill 250 MB
+    value = torch.cat([torch.cos(body @ wave.T + phase).sum(-1) for body in rows])
     return _edge(value - value.median(), 0.25)
 
 
