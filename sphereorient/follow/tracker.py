@@ -12,10 +12,11 @@ from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
-from sphereorient.follow.poses import Poses, supported
+from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.trajectory import Reason
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 
@@ -164,8 +165,16 @@ class Tracker:
             for n, row in enumerate(found)
         ]
         rows = list(zip(found, known, frames, past, strict=True))
-        whole = all(poses is not None for row in found for poses in row.values())
-        return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
+        away = [all(of_ball[n].rests(of_ball[n].first + k) for of_ball in chunks.values()) for n in range(len(frames))]
+        looked = [row for row, rests in zip(rows, away, strict=True) if not rests]
+        whole = all(poses is not None for found_, *_ in looked for poses in found_.values())
+        done = iter(map(self._completed, looked) if whole else side_by_side(self._completed, looked))
+        return [self._not_looked_at(shots) if rests else next(done) for shots, rests in zip(frames, away, strict=True)]
+
+    def _not_looked_at(self, shots: Sequence[Frame]) -> dict[str, Poses]:
+        """Return that no ball is found in the pictures of one instant."""
+        reason = [Reason.NOT_FOUND if shot.readable else shot.read for shot in shots]
+        return dict.fromkeys(self.balls, no_pose(len(shots), reason))
 
     def _followed(
         self,
