@@ -107,6 +107,15 @@ def test_a_late_time_stamp_does_not_bend_the_motion(late):
     assert_close(f64(expected.position_lab_mm), place(3.0, 0.0), 1e-9)
 
 
+@pytest.mark.parametrize(("why", "rest"), [(Reason.OUTLINE, [1, 2, 4, 5]), (Reason.LOW_SCORE, []), (Reason.DARK, [])])
+def test_after_a_look_without_a_disk_two_frames_rest_but_not_the_last_one_of_the_chunk(why, rest):
+    chunk, rested = Chunk(0, 8, range(8)), []
+    for frame in range(8):
+        rested += [frame] if chunk.rests(frame) else []
+        chunk.saw(frame, no_pose(2, [Reason.NOT_FOUND, why]), AXIS.numpy())
+    assert rested == rest
+
+
 def test_after_a_frame_without_the_ball_nothing_is_expected():
     assert lane([0, 1], 0.0).expected(3, RADIUS_MM) is None
 
