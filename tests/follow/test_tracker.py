@@ -107,10 +107,13 @@ def test_a_late_time_stamp_does_not_bend_the_motion(late):
     assert_close(f64(expected.position_lab_mm), place(3.0, 0.0), 1e-9)
 
 
-@pytest.mark.parametrize(("why", "rest"), [(Reason.OUTLINE, [1, 2, 4, 5]), (Reason.LOW_SCORE, []), (Reason.DARK, [])])
-def test_after_a_look_without_a_disk_two_frames_rest_but_not_the_last_one_of_the_chunk(why, rest):
-    chunk, rested = Chunk(0, 8, range(8)), []
-    for frame in range(8):
+@pytest.mark.parametrize(
+    ("why", "rest"), [(Reason.OUTLINE, [4, 5, 6, 7, 8, 10]), (Reason.LOW_SCORE, []), (Reason.DARK, [])]
+)
+def test_frames_after_looks_without_a_disk_rest_but_not_the_first_and_not_the_last_of_the_chunk(why, rest):
+    chunk, rested = Chunk(0, 12, range(12)), []
+    chunk.saw(1, seen(1.0, 0.0), AXIS.numpy())
+    for frame in range(2, 12):
         rested += [frame] if chunk.rests(frame) else []
         chunk.saw(frame, no_pose(2, [Reason.NOT_FOUND, why]), AXIS.numpy())
     assert rested == rest
