@@ -164,17 +164,10 @@ class Tracker:
             }
             for n, row in enumerate(found)
         ]
-        rows = list(zip(found, known, frames, past, strict=True))
-        away = [all(of_ball[n].rests(of_ball[n].first + k) for of_ball in chunks.values()) for n in range(len(frames))]
-        looked = [row for row, rests in zip(rows, away, strict=True) if not rests]
-        whole = all(poses is not None for found_, *_ in looked for poses in found_.values())
-        done = iter(map(self._completed, looked) if whole else side_by_side(self._completed, looked))
-        return [self._not_looked_at(shots) if rests else next(done) for shots, rests in zip(frames, away, strict=True)]
-
-    def _not_looked_at(self, shots: Sequence[Frame]) -> dict[str, Poses]:
-        """Return that no ball is found in the pictures of one instant."""
-        reason = [Reason.NOT_FOUND if shot.readable else shot.read for shot in shots]
-        return dict.fromkeys(self.balls, no_pose(len(shots), reason))
+        rests = [all(of_ball[n].rests(of_ball[n].first + k) for of_ball in chunks.values()) for n in range(len(frames))]
+        rows = list(zip(found, known, frames, past, rests, strict=True))
+        whole = all(poses is not None for row in found for poses in row.values())
+        return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
 
     def _followed(
         self,
@@ -194,10 +187,13 @@ class Tracker:
 
     def _completed(
         self,
-        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead]],
+        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead], bool],
     ) -> dict[str, Poses]:
-        """Return the poses of all balls of a frame: those followed, and those that a search finds."""
-        followed, known, shots, past = frame
+        """Return the poses of all balls of a frame: those followed, and those that a search finds unless it rests."""
+        followed, known, shots, past, rests = frame
+        if rests:
+            reason = [Reason.NOT_FOUND if shot.readable else shot.read for shot in shots]
+            return dict.fromkeys(self.balls, no_pose(len(shots), reason))
         done = {name: poses for name, poses in followed.items() if poses is not None}
         lost = [name for name in self.balls if name not in done]
         if not lost:
