@@ -36,6 +36,7 @@ SURE_NLL = 20.0  # by so much less likely
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
 STEP, REACH = 0.2, 2  # of `relocalise`: step, radii, and steps to each side of the blob
 RIVAL_BLOB, RIVAL_SCORE = 0.3, 0.8  # of the best blob's merit, of the best score: could be the sphere as well
+FAINT = 0.3  # of the merit of the faintest blob that is proven to be the sphere: fainter ones are not looked at
 LOOSE = 0.15  # of the radius: error of a position from `relocalise`
 
 
@@ -140,8 +141,16 @@ class Initialiser:
         return found
 
     def _relocalised(self, picture: Picture, view: CameraView) -> Found:
-        proposer = self.proposers[view.name]
-        places, radius = [(blob.u_px, blob.v_px) for blob in self._blobs(picture, view)], view.diameter_px / 2
+        proposer, radius, blobs = self.proposers[view.name], view.diameter_px / 2, self._blobs(picture, view)
+        if self.outline(picture, view)[0] is None:
+            # A ball without an outline is as clear as those that are proven, or the border of the picture cuts it.
+            clear, size = view.merit_min / FAINT, torch.tensor(radius)
+            blobs = [
+                one
+                for one in blobs
+                if one.merit >= clear or not view.shows_whole(torch.tensor([one.u_px, one.v_px]), size)
+            ]
+        places = [(blob.u_px, blob.v_px) for blob in blobs]
         if not places:
             return None, Reason.NOT_FOUND
         steps = [STEP * radius * k for k in range(-REACH, REACH + 1)]

@@ -12,10 +12,11 @@ from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
-from sphereorient.follow.poses import Poses, supported
+from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.trajectory import Reason
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 
@@ -163,7 +164,8 @@ class Tracker:
             }
             for n, row in enumerate(found)
         ]
-        rows = list(zip(found, known, frames, past, strict=True))
+        rests = [all(of_ball[n].rests(of_ball[n].first + k) for of_ball in chunks.values()) for n in range(len(frames))]
+        rows = list(zip(found, known, frames, past, rests, strict=True))
         whole = all(poses is not None for row in found for poses in row.values())
         return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
 
@@ -185,10 +187,13 @@ class Tracker:
 
     def _completed(
         self,
-        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead]],
+        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead], bool],
     ) -> dict[str, Poses]:
-        """Return the poses of all balls of a frame: those followed, and those that a search finds."""
-        followed, known, shots, past = frame
+        """Return the poses of all balls of a frame: those followed, and those that a search finds unless it rests."""
+        followed, known, shots, past, rests = frame
+        if rests:
+            reason = [Reason.NOT_FOUND if shot.readable else shot.read for shot in shots]
+            return dict.fromkeys(self.balls, no_pose(len(shots), reason))
         done = {name: poses for name, poses in followed.items() if poses is not None}
         lost = [name for name in self.balls if name not in done]
         if not lost:

@@ -107,6 +107,18 @@ def test_a_late_time_stamp_does_not_bend_the_motion(late):
     assert_close(f64(expected.position_lab_mm), place(3.0, 0.0), 1e-9)
 
 
+@pytest.mark.parametrize(
+    ("why", "rest"), [(Reason.OUTLINE, [4, 5, 6, 7, 8, 10]), (Reason.LOW_SCORE, []), (Reason.DARK, [])]
+)
+def test_frames_after_looks_without_a_disk_rest_but_not_the_first_and_not_the_last_of_the_chunk(why, rest):
+    chunk, rested = Chunk(0, 12, range(12)), []
+    chunk.saw(1, seen(1.0, 0.0), AXIS.numpy())
+    for frame in range(2, 12):
+        rested += [frame] if chunk.rests(frame) else []
+        chunk.saw(frame, no_pose(2, [Reason.NOT_FOUND, why]), AXIS.numpy())
+    assert rested == rest
+
+
 def test_after_a_frame_without_the_ball_nothing_is_expected():
     assert lane([0, 1], 0.0).expected(3, RADIUS_MM) is None
 

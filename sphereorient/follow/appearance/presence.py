@@ -10,7 +10,7 @@ from torch import Tensor
 from sphereorient.errors import ExperimentError, Reason, refusal
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance.record import ALWAYS, clear_of, soft
-from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.initialise import FAINT, Initialiser
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import CameraView
@@ -21,7 +21,6 @@ BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
 TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
 LOOK_ALIKE = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
-FAINT = 0.3  # of the merit of the faintest blob that is proven to be the sphere: fainter ones are not looked at
 RIVALS = 0.1  # share of the frames with two claimants, two frames at least: there is a second ball
 
 
