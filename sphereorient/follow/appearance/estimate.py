@@ -74,7 +74,8 @@ def estimate_appearance(
         studied, sharper = with_motion(studied, search, sample.frame, following, others)
     check_white(studied.fitter)
     moves = studied.fitter.instants > 1
-    studied, rivals = lit_in_the_lab(studied, preferred=among is not None)
+    # One camera hardly tells light that goes with the disk from a turn: the light of fewer freedoms.
+    studied, rivals = lit_in_the_lab(studied, preferred=among is not None or len(studied.fitter.views) == 1)
     studied = without_occluders(studied)
     score_min = _score_min(studied, still.right_score if moves else studied.right_score, best, wrong)
     sure = [frames[k] for k in proven(found)] if among is None else []

@@ -16,7 +16,7 @@ from sphereorient.pose.poses import FittedPoses
 
 KINDS: tuple[type[Light], ...] = (DiskLight, LabLight)
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
-CLEARLY_MORE = 2.0  # standard errors of the gain by which it must leave less
+CLEARLY_MORE = 1.0  # standard errors of the gain by which it must leave less
 # Shares of the variance by which it may leave more, and by which it never gets less.
 MORE_EXPLAINED, HOPELESS = 0.05, 0.2
 
@@ -36,21 +36,22 @@ def lit_in_the_lab(
     """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
     Both are learnt from every other row of `use` (B, C); what counts is what they leave in the pictures of the rows
     between, beside its standard error. Return the fits of these rows by both where neither explains clearly more.
-    `preferred`: where it does not explain clearly less.
+    `preferred`: where it does not explain clearly less, half-way or at the end.
     """
     if len(use) < FEWEST_LIT:
         return fitter, fit, None
     every = torch.arange(len(use))
     learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
     maps, lit = fitter.with_light_of(*learning), fitter
-    maps_leave = maps.logs_left(*held)
+    maps_leave, most = maps.logs_left(*held), -math.inf
     for light in lab_lights(*learning, fitter.model()):
         lit = replace(fitter, light=light)
         gains = maps_leave - lit.logs_left(*held)
         gain, error = float(gains.mean()), float(gains.std()) / math.sqrt(len(gains))
+        most = max(most, gain)
         if gain < -HOPELESS:  # half-way, too
             return fitter, fit, None
-    if gain < (-MORE_EXPLAINED if preferred else CLEARLY_MORE * error):
+    if (most < -MORE_EXPLAINED) if preferred else (gain < CLEARLY_MORE * error):
         return fitter, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
     for _ in range(4):  # the poses, too, were found with the maps
         lit = lit.with_light_of(pixels, fit, use)
