@@ -111,17 +111,18 @@ def test_a_gap_turns_a_pose_between_two_pictures_but_not_that_of_one_camera():
 def test_what_lasts_is_added_by_the_cameras_that_measured_a_frame():
     rng = np.random.default_rng(5)
     whole, cam1, cam2 = (torch.from_numpy(a @ np.swapaxes(a, -1, -2)) for a in (rng.normal(size=(3, 6, 6))))
-    lasting = Lasting(covariance=whole, own_rad2=torch.stack([cam1, cam2])[:, :3, :3])
+    alone = torch.stack([cam1, cam2])
+    lasting = Lasting(covariance=whole, own_rad2=torch.zeros(2, 3, 3), alone=alone)
     track = track_of({}, {})
     track = replace(track, orientation_smooth_cov=2 * track.orientation_cov, position_smooth_cov=2 * track.position_cov)
     reason = (Reason.OK, Reason.CONTRADICTS, Reason.NOT_FOUND, *[Reason.OK] * (FRAMES - 3))
     reasons = {"cam1": reason[::-1], "cam2": reason}
     one = {name: replace(camera, reason=reasons[name]) for name, camera in track.cameras.items()}
     added = with_lasting_errors(replace(track, cameras=one), lasting)
-    turn = np.stack([whole.numpy()[:3, :3]] * FRAMES)
-    turn[1:3], turn[-3:-1] = cam1.numpy()[:3, :3], cam2.numpy()[:3, :3]
+    more = np.stack([whole.numpy()] * FRAMES)
+    more[1:3], more[-3:-1] = cam1.numpy(), cam2.numpy()
     for kind in ("_cov", "_smooth_cov"):
-        for name, what in (("orientation", turn), ("position", whole.numpy()[3:, 3:])):
+        for name, what in (("orientation", more[:, :3, :3]), ("position", more[:, 3:, 3:])):
             np.testing.assert_allclose(getattr(added, name + kind), getattr(track, name + kind) + what, rtol=1e-12)
 
 

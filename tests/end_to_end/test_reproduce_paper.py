@@ -60,12 +60,12 @@ def test_impellers_turn_against_each_other_and_their_light_moves():
 
 def test_lamps_stand_still_and_bubbles_change():
     disk = paper_movies.Disk(centre_px=torch.tensor([60.0, 50.0]), radius_px=torch.tensor(30.0))
-    lit = [np.full((100, 120), 90.0, np.float32) for _ in range(4)]
+    lit = [np.full((100, 120), 90.0, np.float32) for _ in range(4)]  # as bright as the ball
     cover = np.ones((60, 60), np.float32)
     window = slice(20, 80), slice(30, 90)
     exposure = paper_movies.Exposure(size=(100, 120), window=window, light=90 * cover, cover=cover)
     for light, frame in zip(lit, (1, 1, 2, 3), strict=True):
-        paper_movies.disturb(light, np.zeros_like(light), exposure, disk, (0, 5, frame))
+        paper_movies.put(light, exposure, disk, (0, 5, frame))
     np.testing.assert_array_equal(lit[0], lit[1])
     assert np.abs(lit[0] - 90).max() > 10
     unlike = [np.abs(lit[0] - other).mean() for other in lit[2:]]
