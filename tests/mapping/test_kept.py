@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import astuple
 
 import pytest
@@ -41,14 +40,14 @@ def test_a_damaged_file_is_no_state(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("of_cameras", [8, 1], ids=["light of each camera", "one light in the lab"])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch, of_cameras):
-    for module in (iterations, learn):
-        monkeypatch.setattr(module, "LIGHT_ITERATIONS", of_cameras)
-    monkeypatch.setattr(kinds, "MORE_EXPLAINED", -math.inf)  # whether it is better or not
+    monkeypatch.setattr(iterations, "LIGHT_ITERATIONS", of_cameras)
+    for limit in ("CHANGED", "CLEARLY_MORE"):
+        monkeypatch.setattr(kinds, limit, -1e9)  # whether it is better or not
     path, kept = unpainted(tmp_path / "scene", frames=16), tmp_path / "map.h5"
     with open_recording(path, ["cam1"], textured=False) as recording:
         crops = take_crops(recording, QUICK, LocateSettings(), silent)
     whole = fit_map(crops, QUICK, silent)
-    iterate = learn.iterate
+    iterate = iterations.iterate
 
     def interrupted(state, settings, k):
         if k == 2:
@@ -58,10 +57,10 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch, of_
     def again(*_):
         raise PaintError("the chain is searched again")
 
-    monkeypatch.setattr(learn, "iterate", interrupted)
+    monkeypatch.setattr(iterations, "iterate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit_map(crops, QUICK, silent, kept)
-    monkeypatch.setattr(learn, "iterate", iterate)
+    monkeypatch.setattr(iterations, "iterate", iterate)
     monkeypatch.setattr(learn, "_start_from_movie", again)
     resumed = fit_map(crops, QUICK, silent, kept)
     assert len(resumed.rounds) == 3

@@ -342,7 +342,7 @@ def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
     first = fitter_of(rig)
     fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
     maps = first.with_light_of(pixels, fit, use)
-    monkeypatch.setattr(kinds, "MORE_EXPLAINED", math.inf)  # neither explains clearly more
+    monkeypatch.setattr(kinds, "ALIKE", math.inf)  # neither explains clearly more
     lit, kept, rivals = lit_in_the_lab(maps, pixels, fit, use)
     assert lit is maps
     assert kept is fit
@@ -351,6 +351,17 @@ def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
     assert not one.R_lab_body.equal(other.R_lab_body)
     off = [so3.geodesic_distance(part.R_lab_body, R[1::2]).max() for part in (one, other)]
     assert max(off) < 0.01
+
+
+def test_one_light_of_two_cameras_must_leave_clearly_less(monkeypatch):
+    rig, pixels, X, R, _ = pictures()
+    use = torch.ones(12, 2, dtype=torch.bool)
+    first = fitter_of(rig)
+    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
+    maps = first.with_light_of(pixels, fit, use)
+    monkeypatch.setattr(kinds, "CHANGED", 0.9)  # no light leaves a tenth
+    assert lit_in_the_lab(maps, pixels, fit, use)[0] is maps
+    assert isinstance(lit_in_the_lab(maps, pixels, fit, use, preferred=True)[0].light, LabLight)
 
 
 def test_few_poses_stay_with_maps():

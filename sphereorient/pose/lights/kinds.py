@@ -17,8 +17,9 @@ from sphereorient.pose.poses import FittedPoses
 KINDS: tuple[type[Light], ...] = (DiskLight, LabLight)
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
 CLEARLY_MORE = 1.0  # standard errors of the gain by which it must leave less
-# Shares of the variance: by which it must leave less, by which it may leave more, and by which it never gets less.
-LESS_LEFT, MORE_EXPLAINED, HOPELESS = 0.01, 0.05, 0.2
+# Shares of the variance: by which it must leave less, or may leave more where it is preferred; within which two lights
+# explain about as much; and by which it never gets less.
+CHANGED, ALIKE, HOPELESS = 0.01, 0.05, 0.2
 
 Rivals = tuple[FittedPoses, FittedPoses, Tensor] | None  # fits of the same pictures by two models, and `use` (B, C)
 
@@ -51,8 +52,8 @@ def lit_in_the_lab(
         most = max(most, gain)
         if gain < -HOPELESS:  # half-way, too
             return fitter, fit, None
-    if (most < -MORE_EXPLAINED) if preferred else (gain < max(LESS_LEFT, CLEARLY_MORE * error)):
-        return fitter, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
+    if (most < -CHANGED) if preferred else (gain < max(CHANGED, CLEARLY_MORE * error)):
+        return fitter, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -ALIKE else None
     for _ in range(4):  # the poses, too, were found with the maps
         lit = lit.with_light_of(pixels, fit, use)
         fit = lit.again(pixels, fit, use)
