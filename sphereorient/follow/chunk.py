@@ -24,7 +24,7 @@ ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
 # Frames from one look for a ball that is away to the next: it moves by less than its diameter meanwhile. One that comes
 # wholly into view shows half of its disk at a look.
 LOOKS = int(2 / MOVE_SHARE)
-AWAY = {Reason.NOT_FOUND, Reason.OUTLINE}  # a picture without a disk
+AWAY = {Reason.NOT_FOUND}  # a picture without a blob that could be a ball, or a part of it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +61,7 @@ class Chunk:
     time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
     turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
-    in_vain: float = -math.inf  # frame, not the first without the ball, at which a look found no disk in any picture
+    in_vain: float = -math.inf  # frame, not the first without the ball, at which a look found no blob of its size in any picture
 
     def rests(self, frame: int) -> bool:
         """Return whether a frame is not looked at: shortly before, no ball was there. One that has come by the next

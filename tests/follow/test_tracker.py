@@ -108,9 +108,10 @@ def test_a_late_time_stamp_does_not_bend_the_motion(late):
 
 
 @pytest.mark.parametrize(
-    ("why", "rest"), [(Reason.OUTLINE, [4, 5, 6, 7, 8, 10]), (Reason.LOW_SCORE, []), (Reason.DARK, [])]
+    ("why", "rest"),
+    [(Reason.NOT_FOUND, [4, 5, 6, 7, 8, 10]), (Reason.OUTLINE, []), (Reason.LOW_SCORE, []), (Reason.DARK, [])],
 )
-def test_frames_after_looks_without_a_disk_rest_but_not_the_first_and_not_the_last_of_the_chunk(why, rest):
+def test_frames_after_looks_without_a_blob_rest_but_not_the_first_and_not_the_last_of_the_chunk(why, rest):
     chunk, rested = Chunk(0, 12, range(12)), []
     chunk.saw(1, seen(1.0, 0.0), AXIS.numpy())
     for frame in range(2, 12):
