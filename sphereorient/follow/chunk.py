@@ -61,7 +61,7 @@ class Chunk:
     time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
     turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
-    in_vain: float = -math.inf  # frame, not the first without the ball, at which a look found no blob of its size in any picture
+    in_vain: float = -math.inf  # frame, not the first without the ball, of a look that found no blob of its size
 
     def rests(self, frame: int) -> bool:
         """Return whether a frame is not looked at: shortly before, no ball was there. One that has come by the next
