@@ -5,13 +5,30 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 from conftest import assert_close
-from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, refined, rig_of
+from refine_examples import (
+    BEHIND,
+    BLUR_PX,
+    balls,
+    base_of,
+    cut,
+    fitted,
+    fitter_of,
+    model_of,
+    noisy,
+    pictures_of,
+    refined,
+    rig_of,
+    scene_of,
+)
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.follow.appearance.light import light_and_blur
+from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.lasting import Lasting, lasting_errors, limb_wider_px, of_left_out
 from sphereorient.pose.lights.disk import no_glints
 from sphereorient.pose.poses import FittedPoses, PoseStart
@@ -102,6 +119,22 @@ def test_the_blur_of_the_limb_is_found(wider_px: float):
     model = replace(model, blur_px=model.blur_px - wider_px)
     fit = refined(pixels, PoseStart(X, R, use), model)
     assert limb_wider_px(pixels, fit, use, model) == pytest.approx(wider_px, abs=0.012)
+
+
+def test_the_blur_of_the_limb_is_learnt_where_that_of_the_paint_is_another():
+    X, R = balls(COUNT, 4)
+    pictures = pictures_of(RIG, "patches", X, R)
+    use, blur_px = torch.ones(COUNT, 2, dtype=torch.bool), 0.9 * BLUR_PX  # as of disks larger than the table's
+    empty = scene_of(np.full(pictures.shape[-2:], BEHIND, np.float32))
+    fitter = fitter_of(RIG, blur_px)
+    fitter = replace(fitter, views=[replace(view, background=empty) for view in fitter.views])
+    grey = [list(of_frame) for of_frame in noisy(pictures, 1.0, 7).numpy()]
+    optics = light_and_blur(
+        Studied.begun(fitter, base_of("patches"), grey, (X, R, use), None), given=True
+    ).fitter.optics
+    assert optics.blur_px == blur_px
+    assert optics.limb_blur_px == pytest.approx(BLUR_PX, rel=0.04)
+    assert optics.middle.blur_px**2 - optics.middle.extra_px**2 == pytest.approx(optics.limb_blur_px**2)
 
 
 def test_leaving_out_is_fitting_again():
