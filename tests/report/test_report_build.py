@@ -137,9 +137,9 @@ def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, t
     assert max(scales) - min(scales) < 0.01  # text of one size
     assert re.findall(r"<b>([^<]* of the paper\))", page) == [
         "Track of b/track.h5 (Figure 7 of the paper)",
+        "Angles (Figure 10 of the paper)",
         "PDFs (Figures 11 and 12 of the paper)",
         "Increments (Figure 11 of the paper)",
-        "Angles (Figure 10 of the paper)",
         "Durations (Figure 9 of the paper)",
     ]
     assert {"track", "densities", "increments", "durations", "correlations", "angles", "isotropy"} <= drawn
@@ -201,7 +201,7 @@ def test_half_a_report_never_stands_under_its_name(place, report, tmp_path, monk
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(build.plots, "write_figure", full)
+    monkeypatch.setattr(build, "write_figure", full)
     code, _, said = report(place / "a/track.h5", "--out", tmp_path / "page", *QUICK, "--quiet")
     assert code == 2
     assert "No space left on device" in said
