@@ -30,7 +30,9 @@ def known(tmp_path_factory):
 def assert_same_poses(track, other):
     assert track.valid.all()
     turn = so3.geodesic_distance(*(torch.from_numpy(one.orientation) for one in (track, other)))
-    assert float(turn.max()) < np.radians(0.02)
+    # The first frame of a chunk is fitted without the motion in its exposure, one that is followed back with it.
+    sigma = np.sqrt(np.trace(other.orientation_cov, axis1=1, axis2=2))
+    assert (turn.numpy() < 0.5 * sigma).all()
     assert np.abs(track.position - other.position).max() < 0.005
 
 
