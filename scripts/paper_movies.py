@@ -98,10 +98,11 @@ def put(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple
     bubbles = {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}
     behind, cover = torch.from_numpy(light[exposure.window].copy()), torch.from_numpy(exposure.cover)
     exposure.put(light)
+    lit = replace(disk, cover=cover, behind=behind)
     beyond = exposure.within(round(0.5 * float(disk.radius_px)))  # bubbles reach beyond the sphere, lamps do not
-    for part, values, rng in (exposure, LAMPS, static), (beyond, bubbles, moving):
+    for part, one, values, rng in (exposure, lit, LAMPS, static), (beyond, disk, bubbles, moving):
         corner = torch.tensor([side.start for side in part.window[::-1]])
-        inside = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=behind)
+        inside = replace(one, centre_px=one.centre_px - corner)
         light[part.window] = degrade(torch.from_numpy(light[part.window]), inside, values, rng)
 
 

@@ -24,7 +24,6 @@ ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
 # Frames from one look for a ball that is away to the next: it moves by less than its diameter meanwhile. One that comes
 # wholly into view shows half of its disk at a look.
 LOOKS = int(2 / MOVE_SHARE)
-AWAY = {Reason.NOT_FOUND}  # a picture without a blob that could be a ball, or a part of it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,7 +142,7 @@ class Chunk:
     def saw(self, frame: int, poses: Poses, turn: Floats) -> None:
         """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
         just_lost = len(self.past) > 0 and self.past[-1][0] == frame - 1
-        if not (len(poses) or just_lost or self.rests(frame)) and set(poses.reason) <= AWAY:
+        if not (len(poses) or just_lost or self.rests(frame)) and set(poses.reason) == {Reason.NOT_FOUND}:
             self.in_vain = frame
         if supported(poses):
             if self.past:

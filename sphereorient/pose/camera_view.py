@@ -100,24 +100,21 @@ class Optics:
     ) -> None:
         self.blur_px = blur_px
         self._radius_px = diameter_px / 2
-        self.fine = level_of(base, blur_px, 0.0, self._radius_px)
-        if limb_blur_px is not None:
-            self.fine = replace(self.fine, blur_px=limb_blur_px)
+        self.fine = level_of(base, blur_px, 0.0, self._radius_px, limb_blur_px)
 
     # Each from the one before: a wider blur allows a smaller table.
     @cached_property
     def middle(self) -> PyramidLevel:
         """The level of a fit that is right to a few degrees."""
-        return self._blurred(self.fine, MIDDLE)
+        return self._blurred(self.fine.paint, MIDDLE)
 
     @cached_property
     def coarse(self) -> PyramidLevel:
         """The level of a fit from a candidate."""
-        return self._blurred(self.middle, COARSE)
+        return self._blurred(self.middle.paint, COARSE)
 
-    def _blurred(self, before: PyramidLevel, extra: float) -> PyramidLevel:
-        level = level_of(before.paint, self.blur_px, extra * self._radius_px, self._radius_px)
-        return replace(level, blur_px=math.hypot(self.limb_blur_px, level.extra_px))
+    def _blurred(self, paint: TextureTable, extra: float) -> PyramidLevel:
+        return level_of(paint, self.blur_px, extra * self._radius_px, self._radius_px, self.limb_blur_px)
 
     @property
     def limb_blur_px(self) -> float:
@@ -146,10 +143,15 @@ class Optics:
         return moved
 
 
-def level_of(base: TextureTable, blur_px: float, extra_px: float, radius_px: float) -> PyramidLevel:
-    """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`."""
-    whole = math.hypot(blur_px, extra_px)
-    return PyramidLevel(extra_px=extra_px, blur_px=whole, paint=base.blurred(whole / radius_px))
+def level_of(
+    base: TextureTable, blur_px: float, extra_px: float, radius_px: float, limb_blur_px: float | None = None
+) -> PyramidLevel:
+    """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`; that of the limb: as
+    `Optics`.
+    """
+    limb_px = math.hypot(blur_px if limb_blur_px is None else limb_blur_px, extra_px)
+    paint = base.blurred(math.hypot(blur_px, extra_px) / radius_px)
+    return PyramidLevel(extra_px=extra_px, blur_px=limb_px, paint=paint)
 
 
 def base_table(texture: Tensor, diameter_px: float, unseen: Tensor | None = None) -> TextureTable:

@@ -12,7 +12,7 @@ from sphereorient.pose.lights.disk import RIDGE, light_columns
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
+from sphereorient.pose.residuals import by_pose, fitted_residuals
 from sphereorient.so3 import inverse_damped, solve_damped
 from sphereorient.trajectory import Trajectory
 
@@ -68,9 +68,7 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     place of every picture shows, and what light or limb could take of it; of few frames their noise as well.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
-    cameras = use.shape[1]
-    at = fitted_residuals(pixels, fit, model)
-    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), _px_mm(pixels, fit), cameras)
+    normal, right, ridge = _by_tile(pixels, fit, use, model)
     others = normal.shape[-1] - 6
 
     def by_each(kept: list[int], count: int) -> Tensor:
@@ -88,14 +86,11 @@ def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMo
     """Return by how much the limb of B * C disks, those of `use` (B, C), is blurred more than in the model, px.
     One turn and move of all poses, with the light of each camera and the place of its limb, may change with it.
     """
-    cameras = use.shape[1]
-    at = fitted_residuals(pixels, fit, model)
-    normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), _px_mm(pixels, fit), cameras)
+    normal, right, ridge = _by_tile(pixels, fit, use, model)
     joined, pulled, ridges = _joined(normal, right, ridge)
-    wider = torch.arange(1, cameras + 1) * (normal.shape[-1] - 6) + 5
+    wider = torch.arange(1, len(normal) + 1) * (normal.shape[-1] - 6) + 5
     bread = inverse_damped(joined.sum(0) + ridges)
-    seen = use.any(0).double()
-    told = seen / bread.diagonal()[wider].clamp_min(1e-30)
+    told = use.any(0).double() / bread.diagonal()[wider].clamp_min(1e-30)
     found = (bread @ pulled.sum(0))[wider]
     return -float((told * found).sum() / told.sum().clamp_min(1e-30))
 
@@ -145,12 +140,14 @@ def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
     return covariance + (1 - 1 / size.clamp_min(1)) * difference[..., :, None] * difference[..., None, :]
 
 
-def _by_tile(at: Residuals, precision: Tensor, px_mm: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:
+def _by_tile(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> tuple[Tensor, Tensor, Tensor]:
     """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
     the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
-    tiles of its own.
+    tiles of its own; the last two unknowns are its place and width, px.
     """
-    limb = px_mm[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
+    cameras, at = use.shape[1], fitted_residuals(pixels, fit, model)
+    precision = at.weight / at.variance * use.reshape(-1, 1)
+    limb = _px_mm(pixels, fit)[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
     wider = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
     columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack([limb, wider], dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]

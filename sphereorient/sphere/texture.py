@@ -129,7 +129,7 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
 def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
     """Return the bilinear grey (...) of a map (H, 2 H) at body directions (..., 3) of any length but zero.
     Differentiable, continuous over the date line and the poles; map and directions share dtype and device.
-    Source: docs/conventions.md (texture map).
+    Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
     """
     check_texture_shape(texture)
     return sample_closed(closed_texture(texture), direction_body)
@@ -142,13 +142,16 @@ def closed_texture(texture: Tensor) -> Tensor:
 
 def sample_closed(closed: Tensor, direction_body: Tensor) -> Tensor:
     """Return the grey of `sample_texture`, of a map that is sampled more than once."""
+    from kornia.geometry.transform import remap  # late: half a second, and tables that are kept do without it
+
     column, row = texel_coordinates(direction_body, len(closed) - 2)
-    height, width = closed.shape
-    # -1 and 1 are the centres of the outermost texels.
-    place = torch.stack([(column + 1) * (2 / (width - 1)) - 1, (row + 1) * (2 / (height - 1)) - 1])
-    return F.grid_sample(closed[None, None], place.reshape(2, -1).mT[None, None], align_corners=True).reshape(
-        column.shape
+    grey = remap(
+        closed[None, None],
+        (column + 1).reshape(1, 1, -1),
+        (row + 1).reshape(1, 1, -1),
+        align_corners=True,
     )
+    return grey.reshape(column.shape)
 
 
 def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lights import kinds
 from sphereorient.pose.lights.kinds import light_of, lit_in_the_lab
 from sphereorient.pose.lights.lab import (
@@ -309,15 +310,21 @@ def test_normals_look_at_the_camera_and_mirrored_rays_leave_the_sphere():
 # --- which light
 
 
-def test_a_light_that_both_cameras_see_is_learnt_in_the_lab():
-    rig, pixels, X, R, _ = pictures()
+def of_maps(rig: Rig, pixels: Pixels, X: Tensor, R: Tensor) -> tuple[Fitter, FittedPoses, Tensor]:
+    """A fitter with maps of the disks of 12 poses, the poses' fit without light, and which pictures are used: all."""
     use = torch.ones(12, 2, dtype=torch.bool)
     first = fitter_of(rig)
     fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
-    maps = first.with_light_of(pixels, fit, use)
+    return first.with_light_of(pixels, fit, use), fit, use
+
+
+def test_a_light_that_both_cameras_see_is_learnt_in_the_lab():
+    rig, pixels, X, R, _ = pictures()
+    maps, fit, use = of_maps(rig, pixels, X, R)
     lit, again, rivals = lit_in_the_lab(maps, pixels, fit, use, preferred=True)
     assert rivals is None
     assert isinstance(lit.light, LabLight)
+    first = fitter_of(rig)
     smooth = first.with_light_of(pixels, fit, use, glints=False)
     assert again.score.mean() > smooth.fit(pixels, PoseStart(X, R, use), first.optics.fine, 3).score.mean()
 
@@ -329,19 +336,13 @@ def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
     lit = view.coverage * (view.paint * (100 + 50 * side) + 20 + 10 * side)
     noise = SIGMA * torch.randn(lit.shape, generator=torch.Generator().manual_seed(2))
     pixels = replace(pixels, grey=lit + (1 - view.coverage) * pixels.behind + noise)
-    use = torch.ones(12, 2, dtype=torch.bool)
-    first = fitter_of(rig)
-    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
-    maps = first.with_light_of(pixels, fit, use)
+    maps, fit, use = of_maps(rig, pixels, X, R)
     assert lit_in_the_lab(maps, pixels, fit, use)[:2] == (maps, fit)
 
 
 def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
     rig, pixels, X, R, _ = pictures()
-    use = torch.ones(12, 2, dtype=torch.bool)
-    first = fitter_of(rig)
-    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
-    maps = first.with_light_of(pixels, fit, use)
+    maps, fit, use = of_maps(rig, pixels, X, R)
     monkeypatch.setattr(kinds, "ALIKE", math.inf)  # neither explains clearly more
     lit, kept, rivals = lit_in_the_lab(maps, pixels, fit, use)
     assert lit is maps
@@ -355,10 +356,7 @@ def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
 
 def test_one_light_of_two_cameras_must_leave_clearly_less(monkeypatch):
     rig, pixels, X, R, _ = pictures()
-    use = torch.ones(12, 2, dtype=torch.bool)
-    first = fitter_of(rig)
-    fit = first.fit(pixels, PoseStart(X, R, use), first.optics.fine, 4)
-    maps = first.with_light_of(pixels, fit, use)
+    maps, fit, use = of_maps(rig, pixels, X, R)
     monkeypatch.setattr(kinds, "CHANGED", 0.9)  # no light leaves a tenth
     assert lit_in_the_lab(maps, pixels, fit, use)[0] is maps
     assert isinstance(lit_in_the_lab(maps, pixels, fit, use, preferred=True)[0].light, LabLight)
