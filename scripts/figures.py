@@ -204,8 +204,8 @@ def main() -> None:
         sys.exit(bool(older))
     for name in options.only or older:
         print(f"{name}: {FIGURES[name].command}", file=sys.stderr, flush=True)
-        made = rows() | {name: make(name, FIGURES[name])}
-        write_page(made)
+        row = make(name, FIGURES[name])
+        write_page(rows() | {name: row})  # another call may have added its rows meanwhile
     write_page(rows())
 
 
