@@ -1,9 +1,11 @@
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
@@ -11,6 +13,7 @@ from sphereorient.cameras.checks import check_known
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.files.yaml_file import read_document, short, validated
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
+from sphereorient.movies.response import Response
 from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"
@@ -48,6 +51,7 @@ class Experiment:
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
     start_given: bool = False  # whether the file has `start`; time stamps then begin there
     flip: dict[str, str] = field(default_factory=dict)  # mirrored movies, see movies.flipped
+    response: dict[str, Response] = field(default_factory=dict)  # of the cameras for which the file gives one
     frames: tuple[int, int] | None = None  # first, last + 1; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
     camera_covariance: ParameterCovariance | None = None  # parameters are named camera.parameter
@@ -149,6 +153,7 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     start: dict[str, FrameNumber] = Field(default_factory=dict)
     frames: tuple[FrameNumber, FrameNumber] | None = None
     flip: dict[str, Literal["none", "vertical", "horizontal", "both"]] = Field(default_factory=dict)
+    response: Any = None
     flow: FlowKeys = FlowKeys()
 
 
@@ -201,6 +206,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
         start={name: keys.start.get(name, 0) for name in keys.movies},
         start_given=bool(keys.start),
         flip=dict(keys.flip),
+        response=_responses(f"{path}, response", keys.response, list(keys.movies)),
         frames=keys.frames,
         flow=keys.flow.model_dump(exclude_none=True),
     )
@@ -242,6 +248,29 @@ def outside_paths(experiment: Experiment) -> list[Path]:
     """Return the inputs outside the experiment's folder."""
     folder = Path(os.path.realpath(experiment.folder))
     return [path for path in input_files(experiment) if not Path(os.path.realpath(path)).is_relative_to(folder)]
+
+
+def _responses(where: str, given: Any, cameras: Sequence[str]) -> dict[str, Response]:
+    """Return the response of each camera for which the key gives one; one response is that of all."""
+    if given is None:
+        return {}
+    if not isinstance(given, dict) or given.keys() == {"gamma"}:
+        return dict.fromkeys(cameras, _response(where, given))
+    check_known(given, cameras, where, ExperimentError)
+    return {name: _response(f"{where}.{name}", one) for name, one in given.items()}
+
+
+def _response(where: str, given: Any) -> Response:
+    with suppress(ValueError, TypeError, AttributeError):
+        if given in ("linear", "srgb"):
+            return Response(srgb=given == "srgb")
+        if isinstance(given, dict) and given.keys() == {"gamma"} and 0.1 <= float(given["gamma"]) <= 10.0:
+            return Response(gamma=float(given["gamma"]))
+        table = np.array(given, np.float64)
+        if table.shape == (len(table), 2) and not table[0].any() and bool((np.diff(table, axis=0) > 0).all()):
+            return Response(table=tuple(map(tuple, table / table[-1])))
+    expected = "linear, srgb, {gamma: NUMBER}, or a table [[0, 0], ...] of grey level and light, both increasing"
+    raise refused(where, expected, short(given), "write one of these, or leave it out: it is learnt then")
 
 
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:

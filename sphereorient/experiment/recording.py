@@ -103,7 +103,8 @@ def open_recording(
     for name, movie in movies.items():
         shown = given_mask(experiment, name, movie.frame_shape)
         camera, rows = experiment.cameras[name], frames.rows[name]
-        streams.append(CameraStream(name=name, camera=camera, movie=movie, rows=rows, shown=shown))
+        response = experiment.response.get(name)
+        streams.append(CameraStream(name=name, camera=camera, movie=movie, rows=rows, shown=shown, response=response))
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
     remarks += [
         f"{path}: {100 * unseen_share(one.unseen):.0f} % of the ball is unseen and no paint"

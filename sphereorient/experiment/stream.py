@@ -17,6 +17,7 @@ from sphereorient.experiment.timeline import NONE
 from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import Grey, Movie, flipped_picture
+from sphereorient.movies.response import Response
 
 Shown = TypeVar("Shown", bound=Grey | OnDemand)
 
@@ -34,6 +35,7 @@ class CameraStream:
     movie: Movie
     rows: NDArray[np.int64]  # (N,), number in the movie, or NONE
     shown: NDArray[np.bool_] | None = None  # (H, W), False where something hides the sphere; None: nowhere
+    response: Response | None = None  # of the camera; None: not given
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -16,6 +16,7 @@ from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
+from sphereorient.movies.response import Response
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
@@ -34,6 +35,7 @@ class CameraScene:
     background: Background
     diameter_px: float
     merit_min: float = 0.0  # of a blob that may be the sphere; 0: not known
+    response: Response | None = None  # of the camera; None: not known, grey levels count as light
 
 
 def known_diameter_px(recording: Recording, name: str, settings: LocateSettings) -> float | None:
@@ -56,10 +58,10 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
         outline, guess = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
         diameter_px = diameter_px or 2 * outline.radius_px
         if empty is None:
-            return CameraScene(background=guess, diameter_px=diameter_px)
+            return CameraScene(background=guess, diameter_px=diameter_px, response=stream.response)
     assert diameter_px is not None
     background = learn_background(stream.spread(count), diameter_px, settings, empty, stream.shown)
-    return CameraScene(background=background, diameter_px=diameter_px)
+    return CameraScene(background=background, diameter_px=diameter_px, response=stream.response)
 
 
 def find_scenes(
@@ -77,7 +79,8 @@ def find_scenes(
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     pictures = stream.spread(count)
     background = learn_background(pictures, tuple(diameters_px.values()), settings, empty, stream.shown)
-    return {name: CameraScene(background=background, diameter_px=size) for name, size in diameters_px.items()}
+    first = CameraScene(background=background, diameter_px=0.0, response=stream.response)
+    return {name: replace(first, diameter_px=size) for name, size in diameters_px.items()}
 
 
 def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:

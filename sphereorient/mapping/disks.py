@@ -139,7 +139,7 @@ def _fixed_scene(
     pictures = stream.spread(4 * settings.background_frames)
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     outline, background = fixed_ball(pictures, locating, empty, stream.shown)
-    scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
+    scene = CameraScene(background=background, diameter_px=2 * outline.radius_px, response=stream.response)
     each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
     seen = torch.tensor([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], dtype=torch.float64)
     if len(seen) >= OUTLINES_MIN:

@@ -3,9 +3,10 @@
 From what another run learnt, a run measures the same to the last bit.
 """
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
+from sphereorient.movies.response import Response
 from sphereorient.pose import CameraView, Fitter, Optics
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.lights.kinds import light_of
@@ -199,6 +201,8 @@ def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
         group, background = file.create_group(f"cameras/{name}"), scene.background
         group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
         group.attrs["merit_min"] = scene.merit_min
+        if scene.response is not None:
+            group.attrs["response"] = json.dumps(asdict(scene.response))
         for part in ("mean", "noise", "shown"):
             if getattr(background, part) is not None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
@@ -239,7 +243,11 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
             shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
         )
         numbers = {part: float(group.attrs[part]) for part in ("diameter_px", "merit_min")}
-        scenes[name] = CameraScene(background=background, **numbers)
+        response = None
+        if "response" in group.attrs:
+            told = json.loads(str(group.attrs["response"]))
+            response = Response(**told | {"table": tuple(map(tuple, told["table"]))})
+        scenes[name] = CameraScene(background=background, response=response, **numbers)
     return scenes
 
 

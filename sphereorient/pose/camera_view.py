@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, centre_lab_mm, holds_disk, sphere_radius_px
 from sphereorient.files.picture import OnDemand
 from sphereorient.locate import Background, CameraScene
+from sphereorient.movies.response import Response
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
@@ -39,6 +40,7 @@ class CameraView:
     diameter_px: float  # of the sphere in the middle of the volume
     sight: LinesOfSight
     merit_min: float = 0.0  # see `CameraScene`
+    response: Response | None = None
 
     @classmethod
     def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":
@@ -48,7 +50,25 @@ class CameraView:
     @property
     def scene(self) -> CameraScene:
         """What is known of the camera's movie."""
-        return CameraScene(background=self.background, diameter_px=self.diameter_px, merit_min=self.merit_min)
+        return CameraScene(**{part.name: getattr(self, part.name) for part in fields(CameraScene)})
+
+    @cached_property
+    def behind(self) -> Background:
+        """The light of the scene without the sphere."""
+        if self.response is None:
+            return self.background
+        mean = self.response.light(self.background.mean, self.background.full_scale)
+        return replace(self.background, mean=mean)
+
+    def light(self, picture: Picture, window: tuple[int, int, int, int]) -> Picture:
+        """Return the light of a picture (H, W) within left, top, right and bottom, included, px; 0 beyond."""
+        if self.response is None or self.response.linear:
+            return picture
+        left, top, right, bottom = window
+        there = np.s_[top : bottom + 1, left : right + 1]
+        light = np.zeros(picture.shape, np.float32)
+        light[there] = self.response.light(picture[there], self.background.full_scale)
+        return light
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
         """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
@@ -179,7 +199,7 @@ class FrameDisks:
     """The disks of B spheres in the frames of C cameras; made by `FrameDisks.of`."""
 
     views: Sequence[CameraView]  # C
-    frames: Sequence[Sequence[Picture]]  # B of C, decoded at least where the disks are
+    frames: Sequence[Sequence[Picture]]  # B of C, light, decoded at least where the disks are
     middle_px: Tensor  # (C, B, 2)
     stencil: Stencil
     hidden: Tensor | None  # (B * C, P) bool, places that do not count; None: all count
@@ -204,10 +224,13 @@ class FrameDisks:
             for c, frame in enumerate(row):
                 if isinstance(frame, OnDemand):  # all of them, before the first is waited for
                     frame.ask(*window(b, c))
-        frames = [
-            [frame.part(*window(b, c)) if isinstance(frame, OnDemand) else frame for c, frame in enumerate(row)]
-            for b, row in enumerate(pictures)
-        ]
+        frames = []
+        for b, row in enumerate(pictures):
+            windows = [window(b, c) for c in range(len(row))]
+            shown = zip(views, row, windows, strict=True)
+            frames.append(
+                [view.light(one.part(*at) if isinstance(one, OnDemand) else one, at) for view, one, at in shown]
+            )
         return cls(views=views, frames=frames, middle_px=middle_px, stencil=stencil, hidden=hidden)
 
     def pixels(self, blur_px: float = 0.0) -> Pixels:
@@ -215,7 +238,7 @@ class FrameDisks:
         middles = self.middle_px.nan_to_num().tolist()
         pixels = stacked(
             [
-                cut_pixels(frame, view.background, view.sight, middles[c][b], self.stencil, blur_px)
+                cut_pixels(frame, view.behind, view.sight, middles[c][b], self.stencil, blur_px)
                 for b, frames in enumerate(self.frames)
                 for c, (view, frame) in enumerate(zip(self.views, frames, strict=True))
             ]

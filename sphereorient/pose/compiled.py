@@ -154,7 +154,7 @@ class _Addresses:
 @lru_cache(maxsize=16)
 def _of_view(view: CameraView) -> tuple[ctypes.Structure, _Addresses]:
     """Return the record of a camera, and what it points to."""
-    at, sight, background = _Addresses(), view.sight, view.background
+    at, sight, background = _Addresses(), view.sight, view.behind
     (width, height), shown = sight.size, background.shown
     pointers = {name: at(getattr(sight, name)) for name in ("direction", "origin", "axes", "pitch_rad", "pitch_mm")}
     pointers["behind"] = at(torch.from_numpy(np.ascontiguousarray(background.mean)))

@@ -17,6 +17,7 @@ from sphereorient.so3 import inverse_damped, solve_damped
 from sphereorient.trajectory import Trajectory
 
 TILES = 4  # along each axis of the disk: errors of light are wide
+DARKEST = 0.5  # grey levels; darker places tell no power of their light
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
 
 
@@ -61,15 +62,18 @@ class Lasting:
         )
 
 
-def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Lasting:
+def lasting_errors(
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, response: bool = False
+) -> Lasting:
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
-    One turn and move of all poses, with the light of each camera and the place and width of its limb, are fitted to all
-    frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
+    One turn and move of all poses, with the light of each camera, the place and width of its limb and, where that was
+    learnt, its response, are fitted to all frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
     place of every picture shows, and what light or limb could take of it; of few frames their noise as well.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
-    normal, right, ridge = _by_tile(pixels, fit, use, model)
+    normal, right, ridge = _by_tile(pixels, fit, use, model, response=response)
     others = normal.shape[-1] - 6
+    limb = normal.shape[-1] - 2 - response
 
     def by_each(kept: list[int], count: int) -> Tensor:
         parts = [part[..., kept] for part in (normal[..., kept, :], right, ridge[..., kept, :])]
@@ -78,7 +82,7 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     together = of_left_out(*_joined(normal, right, ridge))[:6, :6]
     own = by_each([0, 1, 2, *range(6, 6 + others)], 3)
     # One camera does not tell the place of its limb from the distance.
-    alone = by_each([*range(4 + others), 5 + others], 6)
+    alone = by_each([k for k in range(6 + others) if k != limb], 6)
     return Lasting(covariance=together, own_rad2=own, alone=alone)
 
 
@@ -93,6 +97,16 @@ def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMo
     told = use.any(0).double() / bread.diagonal()[wider].clamp_min(1e-30)
     found = (bread @ pulled.sum(0))[wider]
     return -float((told * found).sum() / told.sum().clamp_min(1e-30))
+
+
+def response_exponents(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> tuple[Tensor, Tensor]:
+    """Return the logarithm of the power of their light by which the pictures of each camera fit best, (C,), and its
+    standard deviation by the jackknife of `lasting_errors`. What else may change: as there.
+    """
+    joined, pulled, ridge = _joined(*_by_tile(pixels, fit, use, model, response=True))
+    last = torch.arange(1, use.shape[1] + 1) * ((ridge.shape[-1] - 6) // use.shape[1]) + 5
+    found = solve_damped(joined.sum(0) + ridge, pulled.sum(0))[last]
+    return found, of_left_out(joined, pulled, ridge).diagonal()[last].sqrt()
 
 
 def _px_mm(pixels: Pixels, fit: FittedPoses) -> Tensor:
@@ -140,16 +154,23 @@ def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
     return covariance + (1 - 1 / size.clamp_min(1)) * difference[..., :, None] * difference[..., None, :]
 
 
-def _by_tile(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> tuple[Tensor, Tensor, Tensor]:
+def _by_tile(
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, response: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
     the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
-    tiles of its own; the last two unknowns are its place and width, px.
+    tiles of its own; the last two unknowns are its place and width, px, then, where asked for, the logarithm of the
+    power of the light.
     """
     cameras, at = use.shape[1], fitted_residuals(pixels, fit, model)
     precision = at.weight / at.variance * use.reshape(-1, 1)
     limb = _px_mm(pixels, fit)[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
     wider = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
-    columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack([limb, wider], dim=1)], dim=1)
+    own = [limb, wider]
+    if response:
+        scale = at.model.mean()  # that of the light is free
+        own.append((1.0 - at.view.coverage) * by_power(at.beside, scale) - by_power(at.model, scale))
+    columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack(own, dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]
     mixed = solve_damped(
         (weighted @ at.design[:, 6:].mT).double()[:, None], (columns @ weighted.mT).double(), ridge=1e-7
@@ -171,6 +192,12 @@ def _by_tile(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) 
             pulls = here * precision[own][there][:, None]
             normal[camera, k], right[camera, k] = pulls.mT @ here, at.residual[own][there] @ pulls
     return normal.double(), right.double(), torch.diag_embed(RIDGE * size)
+
+
+def by_power(light: Tensor, scale: Tensor) -> Tensor:
+    """Return the derivative of light, grey levels, by the logarithm of a power of it that leaves `scale` as it is."""
+    some = light.clamp_min(DARKEST)
+    return some * (some / scale).log()
 
 
 def of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:

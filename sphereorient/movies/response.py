@@ -1,0 +1,56 @@
+"""The response of a camera: which light made a grey level."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+NODES = 1 << 12  # of a table for 16 bit pictures and for means of pictures; between them it is linear
+
+
+@dataclass(frozen=True)
+class Response:
+    """Light as a function of the grey level, both as shares of full scale: a power, the sRGB curve, or a table."""
+
+    gamma: float = 1.0  # light = grey ** gamma
+    srgb: bool = False
+    table: tuple[tuple[float, float], ...] = ()  # (grey, light), both increasing, from (0, 0) to (1, 1)
+
+    @property
+    def linear(self) -> bool:
+        """Whether grey levels are proportional to the light."""
+        return self == LINEAR
+
+    def light(self, grey: NDArray[Any], full_scale: float) -> NDArray[np.float32]:
+        """Return the light of grey levels (...), in grey levels of a linear camera with the same full scale."""
+        if self.linear:
+            return np.asarray(grey, np.float32)
+        known = _light(self, full_scale, 256 if full_scale == 255.0 else NODES)
+        if grey.dtype == np.uint8:
+            return known.take(grey)
+        return np.interp(grey, np.linspace(0.0, full_scale, len(known)), known).astype(np.float32)
+
+    def __str__(self) -> str:
+        """Return it as experiment.yaml has it."""
+        if self.table:
+            return f"a table of {len(self.table)} levels"
+        return "srgb" if self.srgb else "linear" if self.linear else f"gamma {self.gamma:.3g}"
+
+
+LINEAR = Response()
+SRGB = Response(srgb=True)
+
+
+@lru_cache(maxsize=16)
+def _light(response: Response, full_scale: float, count: int) -> NDArray[np.float32]:
+    """Return the light of `count` grey levels from 0 to full scale."""
+    grey = np.linspace(0.0, 1.0, count)
+    if response.table:
+        light = np.interp(grey, *np.array(response.table).T)
+    elif response.srgb:  # IEC 61966-2-1
+        light = np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
+    else:
+        light = grey**response.gamma
+    return np.asarray(full_scale * light, np.float32)
