@@ -63,17 +63,17 @@ class Lasting:
 
 
 def lasting_errors(
-    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, response: bool = False
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel | None = None
 ) -> Lasting:
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
-    One turn and move of all poses, with the light of each camera, the place and width of its limb and, where that was
-    learnt, its response, are fitted to all frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
+    One turn and move of all poses, with the light of each camera, the place and width of its limb and, with a model of
+    `wider` blur, that of the paint and its response, are fitted to all frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
     place of every picture shows, and what light or limb could take of it; of few frames their noise as well.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
-    normal, right, ridge = _by_tile(pixels, fit, use, model, response=response)
+    normal, right, ridge = _by_tile(pixels, fit, use, model, wider)
     others = normal.shape[-1] - 6
-    limb = normal.shape[-1] - 2 - response
+    limb = normal.shape[-1] - (2 if wider is None else 4)
 
     def by_each(kept: list[int], count: int) -> Tensor:
         parts = [part[..., kept] for part in (normal[..., kept, :], right, ridge[..., kept, :])]
@@ -99,11 +99,13 @@ def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMo
     return -float((told * found).sum() / told.sum().clamp_min(1e-30))
 
 
-def response_exponents(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> tuple[Tensor, Tensor]:
+def response_exponents(
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel
+) -> tuple[Tensor, Tensor]:
     """Return the logarithm of the power of their light by which the pictures of each camera fit best, (C,), and its
-    standard deviation by the jackknife of `lasting_errors`. What else may change: as there.
+    standard deviation by the jackknife of `lasting_errors`. What else may change, and `wider`: as there.
     """
-    joined, pulled, ridge = _joined(*_by_tile(pixels, fit, use, model, response=True))
+    joined, pulled, ridge = _joined(*_by_tile(pixels, fit, use, model, wider))
     last = torch.arange(1, use.shape[1] + 1) * ((ridge.shape[-1] - 6) // use.shape[1]) + 5
     found = solve_damped(joined.sum(0) + ridge, pulled.sum(0))[last]
     return found, of_left_out(joined, pulled, ridge).diagonal()[last].sqrt()
@@ -155,19 +157,20 @@ def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
 
 
 def _by_tile(
-    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, response: bool = False
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
     the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
-    tiles of its own; the last two unknowns are its place and width, px, then, where asked for, the logarithm of the
-    power of the light.
+    tiles of its own; the last two unknowns are its place and width, px; with a model of `wider` blur there follow the
+    share of that and the logarithm of the power of the light.
     """
     cameras, at = use.shape[1], fitted_residuals(pixels, fit, model)
     precision = at.weight / at.variance * use.reshape(-1, 1)
     limb = _px_mm(pixels, fit)[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
-    wider = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
-    own = [limb, wider]
-    if response:
+    width = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
+    own = [limb, width]
+    if wider is not None:
+        own.append(fitted_residuals(pixels, fit, wider).model - at.model)
         scale = at.model.mean()  # that of the light is free
         own.append((1.0 - at.view.coverage) * by_power(at.beside, scale) - by_power(at.model, scale))
     columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack(own, dim=1)], dim=1)

@@ -24,7 +24,7 @@ from sphereorient.follow.appearance.presence import (
     with_least_merit,
 )
 from sphereorient.follow.appearance.record import Among, Appearance, Following, Studied, clear_of, soft
-from sphereorient.follow.appearance.response import with_response
+from sphereorient.follow.appearance.response import with_more_blur, with_response
 from sphereorient.follow.appearance.worn import without_worn
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
@@ -60,14 +60,14 @@ def estimate_appearance(
     others = None if among is None else among.neighbours.of(sample.frame)
     pictures = [[shot.picture for shot in frames[k]] for k in sample.frame]
     studied = light_and_blur(Studied.begun(search.fitter, base, pictures, sample.poses, others), given=given)
+    linear, studied = studied, with_response(studied, given=given)
+    coded = studied is not linear
+    search = replace(search, fitter=replace(search.fitter, views=studied.fitter.views))
     if not given and (matched := _matched(search, studied)) is not None:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
             known = settings.model_copy(update={"blur_px": matched.fitter.optics.blur_px})
             return estimate_appearance(matched, frames, base, known, following, among)
-    linear, studied = studied, with_response(studied)
-    if coded := studied is not linear:
-        studied = light_and_blur(studied, given=given)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, wrong = explained(sample.found)
     studied, worn = without_worn(studied) if settings.learn_paint else (studied, None)
@@ -87,7 +87,7 @@ def estimate_appearance(
     views = with_least_merit(search, sure, sample.poses[2]) if alone else studied.fitter.views
     fitter, fit, use = _as_followed(studied, views), studied.fit, studied.use
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
-    lasting = lasting_errors(studied.pixels, fit, use, fitter.model(), response=coded)
+    lasting = lasting_errors(studied.pixels, fit, use, fitter.model(), with_more_blur(studied) if coded else None)
     return Appearance(
         fitter=fitter,
         still=replace(fitter, optics=still.fitter.optics, instants=1) if moves else fitter,
