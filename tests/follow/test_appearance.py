@@ -11,9 +11,25 @@ import yaml
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.follow.appearance.presence import explained, proven
+from sphereorient.follow.poses import Poses
+from sphereorient.pose.poses import blank_parts
 from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.trajectory import Reason
+
+
+def found_by(camera, right, wrong):
+    """The best pose and a wrong one of one camera's picture, with their scores."""
+    parts = blank_parts(2, 2)
+    parts["score"][:, camera] = torch.tensor([right, wrong])
+    return Poses(**parts, use=torch.arange(2) == camera, reason=(Reason.OK, Reason.OK))
+
+
+def test_a_camera_is_explained_by_its_own_proven_frames_where_another_camera_shows_nothing_but_wrong_poses():
+    found = [found_by(0, 0.3, 0.95)] * 10 + [found_by(1, 0.9, 0.1)]
+    assert proven(found) == []  # by all of them together
+    assert explained(found, [10]) == pytest.approx((0.9, 0.1))
 
 
 @pytest.mark.slow

@@ -39,6 +39,14 @@ class ProvenPoses:
     camera: list[int] | None = None  # of each of the B poses, where each camera is studied alone
     together: bool = True  # whether the cameras see the sphere at one position
 
+    @property
+    def rows(self) -> list[int]:
+        """Where the B poses stand in `found`."""
+        if self.camera is None:
+            return self.frame
+        frames = len(self.found) // self.poses[2].shape[1]
+        return [camera * frames + frame for frame, camera in zip(self.frame, self.camera, strict=True)]
+
     def majority(self, fitter: Fitter, fit: FittedPoses) -> tuple[int, ...]:
         """Return the cameras that agree where these are more than half of more than two; `fit`: of the B poses."""
         if self.together or self.camera is None:

@@ -69,7 +69,7 @@ def estimate_appearance(
             known = settings.model_copy(update={"blur_px": matched.fitter.optics.blur_px})
             return estimate_appearance(matched, frames, base, known, following, among)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
-    best, wrong = explained(sample.found)
+    best, wrong = explained(sample.found, sample.rows)
     studied, worn = without_worn(studied) if settings.learn_paint else (studied, None)
     if worn is not None:  # the blur, too, was found with it
         studied = light_and_blur(studied, given=given)

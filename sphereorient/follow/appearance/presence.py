@@ -52,25 +52,24 @@ def proven(found: Sequence[Poses]) -> list[int]:
     return [k for k, score in enumerate(best.tolist()) if score >= least]
 
 
-def explained(found: Sequence[Poses]) -> tuple[float, float]:
-    """Return the median score of the best poses of proven frames, and the highest typical score of wrong ones.
+def explained(found: Sequence[Poses], clear: Sequence[int]) -> tuple[float, float]:
+    """Return the median score of the best poses of proven frames, `clear`, and the highest typical score of wrong ones.
 
     Raises:
         ExperimentError: the map explains the pictures no better at the best poses than at wrong ones.
     """
-    clear = proven(found)
     right = torch.cat([found[k].score[0][found[k].use] for k in clear])
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in clear])
     best, highest = float(right.median()), float(wrong.quantile(0.9)) if len(wrong) else 0.0
-    if best < highest + NO_BETTER and _times_better(found) < TELLING:
+    if best < highest + NO_BETTER and _times_better(found, clear) < TELLING:
         got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
         raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
     return best, highest
 
 
-def _times_better(found: Sequence[Poses]) -> float:
+def _times_better(found: Sequence[Poses], clear: Sequence[int]) -> float:
     """Return the median ratio of the variances left by second and best pose; blurred pictures need the ratio."""
-    rows = [(found[k].score[:2], found[k].use) for k in proven(found) if len(found[k]) > 1]
+    rows = [(found[k].score[:2], found[k].use) for k in clear if len(found[k]) > 1]
     if not rows:
         return math.inf
     left = torch.stack([(1 - score[:, use]).mean(1).clamp_min(LEAST_LEFT) for score, use in rows])
