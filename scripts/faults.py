@@ -15,7 +15,7 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -243,8 +243,8 @@ def rendered(folder: Path, frames: int, turn_deg: float) -> Scene:
 
 
 def tracked(
-    scene: Scene, spoilt: Spoilt, folder: Path, given: Learnt | None
-) -> tuple[Trajectory, Learnt, tuple[str, ...]]:
+    scene: Scene, spoilt: Spoilt, folder: Path, given: Mapping[str, Learnt] | None
+) -> tuple[Trajectory, Mapping[str, Learnt], tuple[str, ...]]:
     """Write the spoilt movies and track them."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
@@ -259,7 +259,7 @@ def tracked(
     settings = load_settings(None, [f"refine.chunk_frames={BLOCK}"])
     known = folder / "learnt.h5"
     track = run(Request(experiment=path, settings=settings, learnt=given, save_learnt=known), MemoryStore())
-    return track, load_learnt(known)[""], tuple(track.provenance["remarks"])
+    return track, load_learnt(known), tuple(track.provenance["remarks"])
 
 
 def compared(clean: Trajectory, track: Trajectory, rows: NDArray[np.int64]) -> tuple[bool, float, float]:
@@ -278,7 +278,7 @@ def compared(clean: Trajectory, track: Trajectory, rows: NDArray[np.int64]) -> t
     return same, float(np.sqrt(np.nanmean(both**2))), float(np.nanmax(np.abs(both)))
 
 
-def judged(name: str, scene: Scene, clean: Trajectory, learnt: Learnt, folder: Path) -> dict[str, Any]:
+def judged(name: str, scene: Scene, clean: Trajectory, learnt: Mapping[str, Learnt], folder: Path) -> dict[str, Any]:
     """Spoil, track twice, and say what came out."""
     spoilt = FAULTS[name](scene)
     track, _, remarks = tracked(scene, spoilt, folder, learnt)
