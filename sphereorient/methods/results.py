@@ -17,6 +17,7 @@ from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
+from sphereorient.movies.response import LINEAR
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
@@ -34,6 +35,10 @@ SHARPER = (
 WORN = (
     "the paint differs from the texture map on about {share:.0f} % of the ball: it is not used; "
     "learn it anew with `sphereorient map --init`"
+)
+CODED = (
+    "grey levels of {name} are not proportional to the light: {found} was learnt; "
+    "write `response:` where it is known (docs/movies.md)"
 )
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
@@ -169,6 +174,13 @@ def precise_track(
     flags = flags | torch.where(smoothed.rejected, int(Flag.DOUBTFUL_FIT), 0)
     noticed = ((learnt.second_ball, TWO_BALLS), (learnt.sharper, SHARPER))
     told: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
+    responses = {view.name: view.response or LINEAR for view in learnt.fitter.views}
+    told["response"] = ", ".join(f"{name} {found}" for name, found in responses.items())
+    told["remarks"] += [
+        CODED.format(name=name, found=found)
+        for name, found in responses.items()
+        if name not in experiment.response and not found.linear
+    ]
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)

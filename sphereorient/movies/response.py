@@ -27,10 +27,10 @@ class Response:
         """Return the light of grey levels (...), in grey levels of a linear camera with the same full scale."""
         if self.linear:
             return np.asarray(grey, np.float32)
-        known = _light(self, full_scale, 256 if full_scale == 255.0 else NODES)
         if grey.dtype == np.uint8:
-            return known.take(grey)
-        return np.interp(grey, np.linspace(0.0, full_scale, len(known)), known).astype(np.float32)
+            return np.asarray(_light(self, full_scale, 255.0, 256).take(grey))
+        known = _light(self, full_scale, full_scale, NODES)
+        return np.asarray(np.interp(grey, np.linspace(0.0, full_scale, NODES), known), np.float32)
 
     def __str__(self) -> str:
         """Return it as experiment.yaml has it."""
@@ -44,9 +44,9 @@ SRGB = Response(srgb=True)
 
 
 @lru_cache(maxsize=16)
-def _light(response: Response, full_scale: float, count: int) -> NDArray[np.float32]:
-    """Return the light of `count` grey levels from 0 to full scale."""
-    grey = np.linspace(0.0, 1.0, count)
+def _light(response: Response, full_scale: float, brightest: float, count: int) -> NDArray[np.float32]:
+    """Return the light of `count` grey levels from 0 to the brightest."""
+    grey = np.linspace(0.0, brightest / full_scale, count)
     if response.table:
         light = np.interp(grey, *np.array(response.table).T)
     elif response.srgb:  # IEC 61966-2-1

@@ -11,7 +11,16 @@ import numpy as np
 
 from sphereorient.errors import MovieError
 from sphereorient.files.picture import claimed_pixels, decoded, luma
-from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, MOST_MISSING, MOST_PIXELS, Grey, Movie, refused
+from sphereorient.movies.movie import (
+    COLOUR_REMARK,
+    GAMMA_CODED,
+    LARGEST_RATIO,
+    MOST_MISSING,
+    MOST_PIXELS,
+    Grey,
+    Movie,
+    refused,
+)
 from sphereorient.movies.tiff import TiffMovie
 
 TIFF = (".tif", ".tiff")
@@ -43,7 +52,7 @@ class SequenceMovie(Movie):
         self.remarks = (
             *_number_remarks(numbers, step, count),
             *([COLOUR_REMARK] if colour else []),
-            *(["JPEG loses fine detail of the pictures"] if suffix in LOSSY else []),
+            *([f"JPEG loses fine detail of the pictures; {GAMMA_CODED}"] if suffix in LOSSY else []),
         )
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:

@@ -15,7 +15,7 @@ import numpy as np
 from sphereorient.errors import MovieError, error_words
 from sphereorient.files.picture import OnDemand, luma
 from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, refused
+from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, Grey, Movie, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
 Found = TypeVar("Found")
@@ -255,7 +255,7 @@ def _remarks(container: av.container.InputContainer, pixels: str, index: PacketI
     if av.VideoFormat(pixels).is_rgb:
         yield COLOUR_REMARK
     elif not pixels.startswith("gray"):
-        yield f"stored as colour ({pixels}): its brightness is taken as it is"
+        yield f"stored as colour ({pixels}): its brightness is taken as it is; {GAMMA_CODED}"
 
 
 def _stated_frames(container: av.container.InputContainer, count: int) -> int:

@@ -67,8 +67,9 @@ def lasting_errors(
 ) -> Lasting:
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
     One turn and move of all poses, with the light of each camera, the place and width of its limb and, with a model of
-    `wider` blur, that of the paint and its response, are fitted to all frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
-    place of every picture shows, and what light or limb could take of it; of few frames their noise as well.
+    `wider` blur, that of the paint and its response, are fitted to all frames but for one tile of one camera's disk: by
+    how much that changes them from tile to tile. What is wrong in a place of every picture shows, and what light or
+    limb could take of it; of few frames their noise as well.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     normal, right, ridge = _by_tile(pixels, fit, use, model, wider)
@@ -168,12 +169,12 @@ def _by_tile(
     precision = at.weight / at.variance * use.reshape(-1, 1)
     limb = _px_mm(pixels, fit)[:, None] * at.over * at.view.coverage_by_position.norm(dim=1)
     width = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
-    own = [limb, width]
+    of_camera = [limb, width]
     if wider is not None:
-        own.append(fitted_residuals(pixels, fit, wider).model - at.model)
+        of_camera.append(fitted_residuals(pixels, fit, wider).model - at.model)
         scale = at.model.mean()  # that of the light is free
-        own.append((1.0 - at.view.coverage) * by_power(at.beside, scale) - by_power(at.model, scale))
-    columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack(own, dim=1)], dim=1)
+        of_camera.append((1.0 - at.view.coverage) * by_power(at.beside, scale) - by_power(at.model, scale))
+    columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack(of_camera, dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]
     mixed = solve_damped(
         (weighted @ at.design[:, 6:].mT).double()[:, None], (columns @ weighted.mT).double(), ridge=1e-7

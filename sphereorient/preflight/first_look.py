@@ -134,6 +134,7 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
         key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
         key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
         key("flip", "mirrored movies: vertical, horizontal, both", example=each("vertical")),
+        key("response", "of the cameras: linear, srgb, {gamma: 2.2}, or a table; learnt without it", example="srgb"),
         key("flow", "SI, for reports", example=FLOW),
     ]
 

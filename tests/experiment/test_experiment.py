@@ -22,6 +22,7 @@ from sphereorient.experiment import (
     recording,
 )
 from sphereorient.experiment.experiment import outside_paths
+from sphereorient.movies.response import Response
 from sphereorient.sphere import load_texture
 
 
@@ -138,6 +139,9 @@ FAULTS = {
     "times beside a rate": (SHORT + "times: times.csv\n", "expected either frame_rate or times, got both"),
     "neither": (SHORT.replace("frame_rate: 30", "name: none"), "expected either frame_rate or times, got neither"),
     "a flip that there is not": (SHORT + "flip: {cam1: upside}\n", "flip.cam1"),
+    "a response that falls": (SHORT + "response: [[0, 0], [90, 120], [255, 100]]\n", "response"),
+    "a response that is no curve": (SHORT + "response: {gamma: bright}\n", "response"),
+    "a response of no camera": (SHORT + "response: {cam7: srgb}\n", "got 'cam7'"),
     "a flip of no camera": (SHORT + "flip: {cam7: both}\n", "got 'cam7'"),
     "schema": (
         SHORT.replace("experiment/1", "experiment/7"),
@@ -218,6 +222,23 @@ def test_a_flipped_movie_is_read_flipped(folder):
     for how, expected in (flips | {"both": picture[:, ::-1, ::-1]}).items():
         movies = open_movies(load_experiment(written(folder, SHORT + f"flip: {{cam1: {how}}}\n")))
         np.testing.assert_array_equal(movies["cam1"].sample([0]), expected)
+
+
+@pytest.mark.parametrize(
+    ("written_as", "expected"),
+    [
+        ("linear", Response()),
+        ("srgb", Response(srgb=True)),
+        ("{gamma: 2.2}", Response(gamma=2.2)),
+        ("[[0, 0], [50, 10], [100, 40]]", Response(table=((0.0, 0.0), (0.5, 0.25), (1.0, 1.0)))),
+    ],
+)
+def test_a_response_is_of_all_cameras_or_of_one(folder, written_as, expected):
+    keys = FULL + f"response: {written_as}\n", FULL + f"response: {{cam2: {written_as}}}\n", FULL
+    every, second, none = (load_experiment(written(folder, text)).response for text in keys)
+    assert every == {"cam1": expected, "cam2": expected}
+    assert second == {"cam2": expected}
+    assert none == {}
 
 
 # several balls

@@ -23,6 +23,7 @@ from refine_examples import (
 
 from sphereorient import so3
 from sphereorient.locate import CameraScene
+from sphereorient.movies.response import Response
 from sphereorient.pose import compiled
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fitter import first_fitter
@@ -89,6 +90,27 @@ def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
     expected = fitter.settled(frames, begin)
     assert_same(found, expected)
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, R)).max()) < 0.5
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_coded_pictures_are_measured_by_their_light(scene, kind):
+    fitter, pictures, X, R = scene
+    code, begin = Response(gamma=2.2), start(X, R)
+
+    def coded(light):
+        return 190.0 * (np.asarray(light) / 190.0) ** (1 / 2.2)
+
+    views = [
+        replace(view, response=code, background=replace(view.background, mean=coded(view.background.mean)))
+        for view in fitter.views
+    ]
+    frames = [list(row) for row in coded(pictures).round().astype(kind)]
+    found = replace(fitter, views=views).settled(frames, begin)
+    expected = fitter.settled([list(row) for row in pictures], begin)
+    off = so3.geodesic_distance(found.R_lab_body, expected.R_lab_body)
+    assert float((off / expected.covariance.diagonal(dim1=-2, dim2=-1)[:, :3].sum(-1).sqrt()).max()) < 0.5  # sigmas
+    as_linear = so3.geodesic_distance(fitter.settled(frames, begin).R_lab_body, expected.R_lab_body)
+    assert float(off.median()) < 0.3 * float(as_linear.median())
 
 
 def test_a_fit_goes_on_while_its_steps_are_long(scene):

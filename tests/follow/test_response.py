@@ -1,0 +1,52 @@
+"""The response of a camera is learnt where the pictures tell it, told, and kept with what was learnt."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from run_examples import off_deg
+
+from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.methods.method import load_learnt
+from sphereorient.run.stages import run
+from sphereorient.run.store import MemoryStore, Request
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
+
+GAMMA = 2.2
+
+
+def coded_grey(light):
+    """Grey levels of a camera with gamma."""
+    return (255.0 * (light / 255.0) ** (1 / GAMMA)).round().astype(np.uint8)
+
+
+@pytest.mark.slow
+def test_a_coded_camera_beside_a_linear_one_is_learnt_told_and_kept(tmp_path):
+    linear = write_synthetic_experiment(tmp_path, SynthSettings(frames=48, seed=5))
+    as_filmed = run(Request(experiment=linear), MemoryStore())
+    document = yaml.safe_load(linear.read_text())
+    movie = open_movies(load_experiment(linear))["cam2"]
+    np.save(tmp_path / "coded.npy", coded_grey(np.stack(list(movie.frames()))))
+    empty = Image.open(tmp_path / document["backgrounds"]["cam2"])
+    Image.fromarray(coded_grey(np.asarray(empty))).save(tmp_path / "coded.png")
+    document["movies"]["cam2"], document["backgrounds"]["cam2"] = "coded.npy", "coded.png"
+    coded, known = tmp_path / "coded.yaml", tmp_path / "learnt.h5"
+    coded.write_text(yaml.safe_dump(document))
+
+    track = run(Request(experiment=coded, save_learnt=known), MemoryStore())
+    response = [scene.response for scene in load_learnt(known)[""].scenes.values()]
+    assert response[0] is None
+    assert abs(response[1].gamma - GAMMA) < 0.1
+    assert track.provenance["response"] == f"cam1 linear, cam2 gamma {response[1].gamma:.3g}"
+    assert [line.split(" are ")[0] for line in track.provenance["remarks"]] == ["grey levels of cam2"]
+    assert np.median(off_deg(track, linear)) < 1.3 * np.median(off_deg(as_filmed, linear))
+    again = run(Request(experiment=coded, learnt=known), MemoryStore())
+    np.testing.assert_array_equal(again.orientation, track.orientation)
+
+    document["response"] = {"cam2": "linear"}
+    coded.write_text(yaml.safe_dump(document))
+    undone = run(Request(experiment=coded), MemoryStore())
+    assert undone.provenance["response"] == "cam1 linear, cam2 linear"
+    assert np.median(off_deg(undone, linear)) > np.median(off_deg(track, linear))
