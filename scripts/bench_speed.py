@@ -32,9 +32,10 @@ import yaml
 
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.cache import WITHOUT as WITHOUT_CACHE
 from sphereorient.files.compiled import WITHOUT
+from sphereorient.files.threads import silent
 from sphereorient.follow import Appearance, Tracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.ball import BallTracker

@@ -31,7 +31,8 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import save_cameras
 from sphereorient.errors import PaintError
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.mapping import take_crops
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.mapping.disks import disks_of

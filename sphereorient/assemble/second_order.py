@@ -12,7 +12,7 @@ from sphereorient.assemble.beam import BeamSearch, CandidateRows, Histories, Int
 from sphereorient.assemble.second_order_cost import Floats, SecondOrderCost
 from sphereorient.assemble.segments import flags_where, number_segments
 from sphereorient.assemble.settings import PathSettings
-from sphereorient.trajectory import Flag
+from sphereorient.errors import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
 LINKS_MIN = 8  # fewer do not determine an acceleration

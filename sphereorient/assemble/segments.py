@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble.settings import AssembleSettings
-from sphereorient.trajectory import Flag
+from sphereorient.errors import Flag
 
 DEVIATIONS_PER_MAD = 1.4826  # of a normal distribution
 

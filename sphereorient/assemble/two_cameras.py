@@ -12,9 +12,8 @@ from sphereorient import so3
 from sphereorient.assemble.path import Graph, Path, Track, graph_of
 from sphereorient.assemble.segments import find_spikes, flags_where, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
-from sphereorient.errors import ExperimentError, ShapeError, refusal
+from sphereorient.errors import ExperimentError, Flag, ShapeError, refusal
 from sphereorient.search import Candidates
-from sphereorient.trajectory import Flag
 
 CHI2_3_MEDIAN = 2.366  # median of a sum of three squared standard normals
 LINKS_MIN = 3  # in the window; fewer give no variance worth the name

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from sphereorient import so3
 from sphereorient.bench.score import orientations_at
 from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.page_server import HOST
+from sphereorient.files.threads import Progress, silent
 from sphereorient.live.shared import SharedFrames
 from sphereorient.live.sources import movie_frames
 from sphereorient.report.frame_warnings import distance_deg

@@ -18,8 +18,8 @@ from sphereorient.calibration.solve import inverse_information, least_squares, s
 from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras
 from sphereorient.cameras.checks import camera_error, check_known
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
-from sphereorient.errors import TrackError
-from sphereorient.trajectory import Reason, Tracks, Trajectory
+from sphereorient.errors import Reason, TrackError
+from sphereorient.trajectory import Tracks, Trajectory
 
 OBSERVED = (str(Reason.OK), str(Reason.CONTRADICTS))
 PARTS = ("centre_px", "orientation")  # of a camera in a track

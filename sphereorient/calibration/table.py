@@ -10,7 +10,8 @@ from sphereorient.calibration.calibrated import Calibrated
 from sphereorient.calibration.self_calibration import MOVED, OBSERVED, CameraCheck, Repaired
 from sphereorient.cameras import Camera, PortCamera, in_air
 from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
-from sphereorient.trajectory import Reason, Trajectory
+from sphereorient.errors import Reason
+from sphereorient.trajectory import Trajectory
 
 CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
 

@@ -1,4 +1,4 @@
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +13,6 @@ from sphereorient.experiment.timeline import Rows, Timeline, timeline
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
 UNKNOWN = 0.5  # grey of texels that are no paint, for searches
-
-Progress = Callable[[str, int, int], None]  # (stage, frames done, all frames); the command line draws a bar
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """Report no progress."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

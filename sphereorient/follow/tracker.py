@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
@@ -16,7 +17,6 @@ from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.trajectory import Reason
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import CheckpointError, refusal
-from sphereorient.experiment.recording import Progress
+from sphereorient.files.threads import Progress
 from sphereorient.learn.checkpoint import Checkpoint, check_texture, correlator_of
 from sphereorient.learn.network import Correlator, find_modes, first_right, smoothed_target
 from sphereorient.learn.pictures import VALIDATION_SEED, TrainingBatch, draw_values, film, generator_of, make_textures

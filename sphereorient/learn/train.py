@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader
 
 from sphereorient import __version__
 from sphereorient.errors import CheckpointError, SettingsError, refusal
-from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import make_folder, put_aside, writing
 from sphereorient.learn import metrics
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256

@@ -11,7 +11,8 @@ import torch
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment
-from sphereorient.experiment.recording import Recording, open_recording, silent
+from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.files.threads import silent
 from sphereorient.files.whole_file import writing
 from sphereorient.follow.online import OnlineTracker
 from sphereorient.live.feed import Feed, Tell

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from sphereorient.calibration.systematic import with_systematic_errors
+from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import input_files
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
@@ -15,7 +16,7 @@ from sphereorient.live.live import LiveTracker, Measured
 from sphereorient.methods.results import measured_track
 from sphereorient.methods.settings import Settings, settings_yaml
 from sphereorient.pose.lasting import with_lasting_errors
-from sphereorient.trajectory import Flag, Reason, Trajectory
+from sphereorient.trajectory import Trajectory
 
 MOST_MISSING = 100_000  # frames between two that are written as missing
 REMARK = "measured frame by frame by `sphereorient live`: no smoother ran, so no smooth poses and no velocities"

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras import Camera, Rays, nearest_point
-from sphereorient.errors import ExperimentError, refusal
+from sphereorient.errors import ExperimentError, Flag, refusal
 from sphereorient.locate.sightings import Sightings
-from sphereorient.trajectory import Flag
 
 NOT_MEASURED = int(Flag.POSITION_INTERPOLATED | Flag.POSITION_OUTLIER_REPLACED)
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import PaintError
-from sphereorient.experiment.recording import Progress
+from sphereorient.files.threads import Progress
 from sphereorient.mapping.compare import MapComparison, compare_maps, fit_levels, turned_map
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.mapping.learn import LearntMap

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import PaintError, refusal
-from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.recording import Recording
+from sphereorient.files.threads import Progress
 from sphereorient.locate import LocateSettings, screened_frames
 from sphereorient.locate.disks import find_disks
 from sphereorient.locate.matching import Match, assigned, match_disks, places_of

@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
-from sphereorient.experiment.recording import Progress
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
+from sphereorient.files.threads import Progress
 from sphereorient.files.whole_file import writing
 from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, input_files
-from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
+from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.provenance import provenance
+from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map, take_crops
 from sphereorient.mapping.alike import SharedMap, corrected, shared_maps
 from sphereorient.mapping.balls import take_crops_of_all

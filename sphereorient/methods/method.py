@@ -14,8 +14,9 @@ import numpy as np
 import torch
 
 from sphereorient.errors import TrackError, error_words, refusal
-from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.recording import Recording
 from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, whole_hdf5
+from sphereorient.files.threads import Progress
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream
+from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Among, Following
 from sphereorient.follow.follower import frames_at, frames_showing, sample_frames
 from sphereorient.follow.initialise import UNPROVEN, Initialiser

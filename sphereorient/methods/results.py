@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
+from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
 from sphereorient.follow.appearance import LOOK_ALIKE
@@ -21,7 +22,7 @@ from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance
-from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+from sphereorient.trajectory import CameraTrack, Trajectory
 
 TWO_BALLS = (
     "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from sphereorient.errors import PaintError
 from sphereorient.experiment import Sphere
-from sphereorient.experiment.recording import Progress, Recording, load_map
+from sphereorient.experiment.recording import Recording, load_map
+from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses

@@ -10,7 +10,7 @@ from typing import Any
 
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import ROOM, has_mark, unfinished
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text
 from sphereorient.report.frame_warnings import bad_stretches

@@ -13,8 +13,9 @@ from sphereorient.calibration.contradictions import with_contradictions
 from sphereorient.calibration.systematic import with_systematic_errors
 from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
-from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.provenance import provenance, sha256
+from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import check_folder, check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results

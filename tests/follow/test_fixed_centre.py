@@ -16,7 +16,8 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, follows_place, mean_place
 from sphereorient.follow.follower import sample_frames

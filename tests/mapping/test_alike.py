@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.experiment.recording import silent
+from sphereorient.files.threads import silent
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.alike import shared_maps
 from sphereorient.mapping.compare import turned_map

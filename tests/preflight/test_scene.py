@@ -9,7 +9,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.experiment import Sphere
-from sphereorient.experiment.recording import silent
+from sphereorient.files.threads import silent
 from sphereorient.locate.outline import Outline
 from sphereorient.mapping.compare import turned_map
 from sphereorient.preflight.finding import FAULT, OK, WARNING

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import Progress, silent
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure
 from sphereorient.search import Candidates, GreySearch, GreySearchSettings, Proposer
 from sphereorient.search.refine_rotation import DetailLevel, detail_level, refine_rotation
