@@ -47,7 +47,7 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import kalman
-from sphereorient.motion.matern import Prior
+from sphereorient.motion.kalman import Prior
 from sphereorient.motion.path import RotationTrack, rotation_of
 from sphereorient.movies import write_ffv1
 from sphereorient.pose import CameraView, base_table, compiled

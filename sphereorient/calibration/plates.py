@@ -15,8 +15,8 @@ from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
 from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubts
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
-from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
+from sphereorient.calibration.tsai_method import guess_from_points, guess_rig
 from sphereorient.cameras import ParameterCovariance, Port, PortCamera, centre_lab_mm, in_air
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT

@@ -1,5 +1,6 @@
-"""Check and repair cameras that moved after their calibration, with the tracked sphere."""
+"""Check and repair cameras that moved after their calibration, with the tracked sphere; the results in words."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +32,7 @@ HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit 
 FRAMES_MIN = 20
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
 ROUNDS = 4
+CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,3 +206,41 @@ def _with_spread(camera: Camera, known: ParameterCovariance, spread: Tensor) -> 
             k = known.names.index(part)
             matrix[k], matrix[:, k], matrix[k, k] = 0.0, 0.0, sigma**2
     return cast(Camera, replace(cast(Any, camera), covariance=replace(known, matrix=matrix)))
+
+
+def repair_lines(result: Repaired) -> list[str]:
+    """Return the changes of a self-calibration."""
+    gaps = f"{result.gap_before_mm:.4f} mm rms, now {result.gap_after_mm:.4f} mm ({result.frames} frames)"
+    lines = [f"distance between the lines of sight to the sphere: {gaps}"]
+    for name, change in result.moved.items():
+        turn, move = math.degrees(float(change[:3].norm())), float(change[3:].norm())
+        lines.append(f"{name}: rotated by {turn:.3f} degrees, T changed by {move:.2f} mm")
+        for part, value, sigma in zip(MOVED, change.tolist(), result.sigma[name].tolist(), strict=True):
+            lines.append(f"  {part}: {value:+.3g} (sigma {sigma:.2g})")
+    return [*lines, f"not determined by the sphere, kept: {', '.join(result.held)}"]
+
+
+def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
+    """Return how well each pair of cameras fits together."""
+    each = ((check, *check.percentile(50), *check.percentile(95)) for check in checks)
+    return [
+        f"{' and '.join(check.names)}: lines of sight miss each other by {gap:.4f} mm (median), {gap95:.4f} mm (95 %); "
+        f"pictures by {miss:.3f} px, {miss95:.3f} px; {len(check.gap_mm)} frames"
+        for check, gap, miss, gap95, miss95 in each
+    ]
+
+
+def contradiction_lines(track: Trajectory) -> list[str]:
+    """Return advice where the cameras disagree on the sphere's position for most of a movie; else an empty list."""
+    reasons = [camera.reason for camera in track.cameras.values()]
+    seen = sum(all(why in OBSERVED for why in frame) for frame in zip(*reasons, strict=True))
+    contrary = sum(Reason.CONTRADICTS in frame for frame in zip(*reasons, strict=True))
+    if len(reasons) < 2 or contrary <= CONTRARY_SHARE * seen:
+        return []
+    return [
+        f"The cameras contradict each other in {contrary} of the {seen} frames in which both see the sphere: one has "
+        "moved since its calibration, cameras.yaml is of another set-up, or a movie has lost or doubled frames.",
+        "Find out: sphereorient check EXPERIMENT reports movies that are out of step. If they are not, repair the "
+        "cameras: sphereorient calibrate CAMERAS.yaml --refine-with TRACK.h5 --out REPAIRED.yaml, name REPAIRED.yaml "
+        "in experiment.yaml, and track again. If that does not help, take new pictures of the plate.",
+    ]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sphereorient.mapping import LearntMap
     from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
-    from sphereorient.tools.wear.series import WearSeries
+    from sphereorient.tools.wear import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
 PAINT_MIN = 0.7  # correlation of held-out pictures below which a map is doubted
@@ -204,7 +204,7 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
 
 def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.tools.wear.series import wear_figure, wear_series
+    from sphereorient.tools.wear import wear_figure, wear_series
 
     known = [_known_map(path) for path in maps]
     found = wear_series(known, turned)

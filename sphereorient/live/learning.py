@@ -23,8 +23,8 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.online import OnlineTracker
 from sphereorient.follow.poses import Poses, supported
+from sphereorient.live.live import OnlineTracker
 from sphereorient.locate import Frame
 from sphereorient.mapping.disks import Crop, Crops, cut_out
 from sphereorient.mapping.grid import ROUGH_SIDE, map_table

@@ -14,10 +14,9 @@ from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import silent
 from sphereorient.files.whole_file import writing
-from sphereorient.follow.online import OnlineTracker
 from sphereorient.live.feed import Feed, Tell
 from sphereorient.live.lines import FicTracLines, JsonLines, Told
-from sphereorient.live.live import LiveTracker, measured
+from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.monitor import Monitor
 from sphereorient.live.outputs import Output
 from sphereorient.live.page import LivePage

@@ -15,8 +15,8 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.threads import Progress
 from sphereorient.locate import LocateSettings, screened_frames
 from sphereorient.locate.disks import find_disks
-from sphereorient.locate.matching import Match, assigned, match_disks, places_of
 from sphereorient.locate.outline import Outline
+from sphereorient.locate.position import Match, assigned, match_disks, places_of
 from sphereorient.locate.scene import CameraScene, find_scenes
 from sphereorient.mapping.disks import Crop, Crops, cut_crop
 from sphereorient.mapping.settings import MapSettings

@@ -12,6 +12,7 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Among, Following
+from sphereorient.follow.appearance.light import estimate_blur_px
 from sphereorient.follow.follower import frames_at, frames_showing, sample_frames
 from sphereorient.follow.initialise import UNPROVEN, Initialiser
 from sphereorient.follow.poses import Poses
@@ -23,7 +24,6 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.proposers import BlurMatchedSearch, finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView
-from sphereorient.pose.blur import estimate_blur_px
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, defocus_radii
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.neighbours import spoilt

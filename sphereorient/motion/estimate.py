@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from sphereorient.motion.kalman import Bools, Floats, SmoothedStates, run_filter, smooth
-from sphereorient.motion.matern import Prior, prior_of_band
+from sphereorient.motion.kalman import Bools, Floats, Prior, SmoothedStates, prior_of_band, run_filter, smooth
 from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack, mahalanobis2
 from sphereorient.motion.settings import SmoothSettings
 

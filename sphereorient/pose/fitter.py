@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras import R_lab_view, sphere_disk_px
-from sphereorient.pose.bodies import body_of
 from sphereorient.pose.camera_view import (
     SIZES,
     CameraView,
@@ -20,6 +19,8 @@ from sphereorient.pose.camera_view import (
     size_steps,
     widest_px,
 )
+from sphereorient.pose.compiled import body_of
+from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
@@ -27,7 +28,6 @@ from sphereorient.pose.occluders import MOST_HIDDEN
 from sphereorient.pose.pixels import Pixels, Stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
 from sphereorient.pose.residuals import KNOWN
-from sphereorient.pose.settle import NEAR_RAD
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import TextureTable
 

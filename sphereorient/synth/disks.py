@@ -12,11 +12,11 @@ from sphereorient import so3
 from sphereorient.cameras import Rays
 from sphereorient.sphere import reduced_texture, see_sphere
 from sphereorient.sphere.renderer import lambert
+from sphereorient.sphere.texture import random_directions
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth.degrade import OPERATIONS, Disk, blurred, centre_error, degrade, radius_error
 from sphereorient.synth.scene import LIT
 from sphereorient.synth.severities import DEGRADATIONS, check_values
-from sphereorient.synth.textures import random_directions
 
 MARGIN = 0.2  # picture beyond the limb, radii
 BLUR_INSTANTS = 8  # sampled orientations per exposure

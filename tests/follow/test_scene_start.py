@@ -18,7 +18,7 @@ from sphereorient.cameras import sphere_disk_px
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import Ahead, SceneStart, look_of
 from sphereorient.locate import CameraScene, Frame, Match, places_of
-from sphereorient.locate.matching import assigned
+from sphereorient.locate.position import assigned
 from sphereorient.pose import CameraView
 from sphereorient.pose.poses import blank_parts
 from sphereorient.trajectory import Reason

@@ -22,7 +22,7 @@ from sphereorient.live.sources import movie_frames
 from sphereorient.methods.method import Learnt, save_learnt
 from sphereorient.methods.settings import Settings
 from sphereorient.report.texture_map import write_texture
-from sphereorient.synth.textures import blobs
+from sphereorient.sphere.texture import blobs
 from sphereorient.trajectory import Reason
 
 

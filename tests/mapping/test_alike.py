@@ -12,9 +12,8 @@ from sphereorient.files.threads import silent
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.alike import shared_maps
 from sphereorient.mapping.compare import turned_map
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import map_directions, random_texture
 from sphereorient.synth import SynthSettings
-from sphereorient.synth.textures import random_texture
 
 pytestmark = pytest.mark.slow  # 15 s
 ROWS, SIGMA = 64, 0.06

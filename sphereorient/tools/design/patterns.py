@@ -12,8 +12,7 @@ from torch import Tensor
 from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.sphere import sample_texture
-from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.textures import random_directions
+from sphereorient.sphere.texture import map_directions, random_directions
 
 POINTS = 40_000  # at which a map is sampled: 1 degree apart
 CIRCLES, AROUND = 400, 1440  # great circles on which borders are counted, and points of each
