@@ -18,13 +18,12 @@ from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.chunk import Ahead, Chunk, Expected
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
-from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
 from sphereorient.pose.fitter import DisksPx, Fitter, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from sphereorient.cameras import Camera, sphere_disk_px
 from sphereorient.errors import Reason
 from sphereorient.follow.chunk import Ahead
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.locate import Frame, Match, assigned, find_disks, match_disks, places_of
 from sphereorient.locate.outline import Outline
+from sphereorient.pose.poses import Poses, no_pose
 
 Floats = NDArray[np.float64]
 Kind = tuple[float, ...]  # the same for balls that are alike

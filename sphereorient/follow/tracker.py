@@ -13,10 +13,10 @@ from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
-from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.poses import Poses, no_pose, supported
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 

@@ -13,11 +13,11 @@ from sphereorient.errors import Reason
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import Chunk
-from sphereorient.follow.poses import Poses, supported
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
 from sphereorient.methods.results import fit_flags, missed_by
 from sphereorient.pose import CameraView
+from sphereorient.pose.poses import Poses, supported
 
 Floats = NDArray[np.float64]
 

@@ -17,9 +17,8 @@ from sphereorient.files.whole_file import writing
 from sphereorient.live.feed import Feed, Tell
 from sphereorient.live.lines import FicTracLines, JsonLines, Told
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
-from sphereorient.live.monitor import Monitor
 from sphereorient.live.outputs import Output
-from sphereorient.live.page import LivePage
+from sphereorient.live.page import LivePage, Monitor
 from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread

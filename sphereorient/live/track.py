@@ -11,11 +11,11 @@ from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import input_files
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
-from sphereorient.follow.poses import Poses, no_pose, pose_table
 from sphereorient.live.live import LiveTracker, Measured
 from sphereorient.methods.results import measured_track
 from sphereorient.methods.settings import Settings, settings_yaml
 from sphereorient.pose.lasting import with_lasting_errors
+from sphereorient.pose.poses import Poses, no_pose, pose_table
 from sphereorient.trajectory import Trajectory
 
 MOST_MISSING = 100_000  # frames between two that are written as missing

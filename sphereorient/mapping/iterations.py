@@ -22,12 +22,12 @@ from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics, widest_px
 from sphereorient.pose.fitter import Fitter, first_fitter
-from sphereorient.pose.lights.common import noise_curves
 from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
 from sphereorient.pose.lights.kinds import lit_in_the_lab
 from sphereorient.pose.model import no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart
+from sphereorient.pose.residuals import noise_curves
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
 

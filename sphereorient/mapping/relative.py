@@ -9,13 +9,12 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import Reason
-from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.locate import Frame
 from sphereorient.mapping.chain import EVERY, ITERATIONS, OVERLAP_MIN, SCALE_RAD, SEARCH_EVERY, SEARCH_STEP_DEG, SMALLER
 from sphereorient.mapping.disks import Crop, Crops, Disks, disks_of, reduced
 from sphereorient.mapping.pairs import RelativeRotations, refine_pairs, search_pairs
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.poses import blank_parts
+from sphereorient.pose.poses import Poses, blank_parts, no_pose
 
 NEAREST = 3  # keyframes that a picture is compared with, beside the one before
 KEYFRAMES = 200  # at most: a ball has shown its sides by then

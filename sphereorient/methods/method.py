@@ -19,7 +19,6 @@ from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, wh
 from sphereorient.files.threads import Progress
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
-from sphereorient.follow.poses import Poses
 from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
@@ -28,6 +27,7 @@ from sphereorient.pose import CameraView, Fitter, Optics
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
+from sphereorient.pose.poses import Poses
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 

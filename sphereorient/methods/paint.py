@@ -15,7 +15,6 @@ from sphereorient.follow.appearance import Among, Following
 from sphereorient.follow.appearance.light import estimate_blur_px
 from sphereorient.follow.follower import frames_at, frames_showing, sample_frames
 from sphereorient.follow.initialise import UNPROVEN, Initialiser
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import among_found
@@ -27,6 +26,7 @@ from sphereorient.pose import CameraView
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, defocus_radii
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.neighbours import spoilt
+from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
 MOSTLY_SEEN = 0.5  # share of a disk that others must leave to each camera, of the frames that light is learnt from

@@ -17,12 +17,12 @@ from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
-from sphereorient.follow.poses import PoseTable, exchanged, pose_tables
 from sphereorient.follow.tracker import Tracker
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
 from sphereorient.methods.paint import alike, following, open_paints, studies_of
 from sphereorient.methods.proposers import BlurMatchedSearch
+from sphereorient.pose.poses import PoseTable, exchanged, pose_tables
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

@@ -14,11 +14,11 @@ from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
 from sphereorient.follow.appearance import LOOK_ALIKE
-from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
 from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.poses import PoseTable
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance

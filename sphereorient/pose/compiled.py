@@ -18,11 +18,10 @@ from torch import Tensor
 
 from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
-from sphereorient.pose import fit, occluders
+from sphereorient.pose import fit
 from sphereorient.pose.camera_view import CameraView, FrameDisks
-from sphereorient.pose.fit import FIRST_EVERY, MORE, NEAR_RAD
+from sphereorient.pose.fit import COVERED, FIRST_EVERY, LEAST_OF_WINDOW, MARGIN_PX, MORE, MOST_EACH, NEAR_RAD, WINDOW_PX
 from sphereorient.pose.model import UNSEEN, SphereModel
-from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, pose_arrays
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY
@@ -54,7 +53,7 @@ def refine(
 
 
 def kept(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
-    """Return the places that count, as `occluders.kept`."""
+    """Return the places that count, as `fit.kept`."""
     return _refined(pixels, begin, model, 0, most)[1]
 
 
@@ -220,14 +219,14 @@ def _edge_table() -> Tensor:
 
 
 class Body(NamedTuple):
-    """The functions of a fit; as those of `fit` and `occluders`."""
+    """The functions of a fit; as those of `fit`."""
 
     refine: Callable[[Pixels, PoseStart, SphereModel, int, float], FittedPoses]
     kept: Callable[[Pixels, PoseStart, SphereModel, float], Tensor]
     settle: Callable[[FrameDisks, PoseStart, SphereModel, int, float, bool], tuple[FittedPoses, Tensor]]
 
 
-IN_TORCH = Body(fit.refine, occluders.kept, fit.settle)
+IN_TORCH = Body(fit.refine, fit.kept, fit.settle)
 COMPILED = Body(refine, kept, settle)
 
 

@@ -20,11 +20,10 @@ from sphereorient.pose.camera_view import (
     widest_px,
 )
 from sphereorient.pose.compiled import body_of
-from sphereorient.pose.fit import NEAR_RAD
+from sphereorient.pose.fit import MOST_HIDDEN, NEAR_RAD
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
-from sphereorient.pose.occluders import MOST_HIDDEN
 from sphereorient.pose.pixels import Pixels, Stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
 from sphereorient.pose.residuals import KNOWN

@@ -18,7 +18,6 @@ from sphereorient.experiment.recording import Recording, load_map
 from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
@@ -26,6 +25,7 @@ from sphereorient.mapping.compare import compare_maps
 from sphereorient.methods.method import Job
 from sphereorient.methods.paint import open_paints
 from sphereorient.methods.settings import Settings
+from sphereorient.pose.poses import Poses
 from sphereorient.preflight import texture_map
 from sphereorient.preflight.cameras import BAD, OUTLINE_PX, off_size
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning

@@ -17,7 +17,7 @@ from overlay_examples import true_track
 from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.live import Measured, measured
 from sphereorient.live.loop import open_live
-from sphereorient.live.monitor import LOST_S, Monitor
+from sphereorient.live.page import LOST_S, Monitor
 from sphereorient.live.sources import movie_frames
 from sphereorient.methods.method import Learnt, save_learnt
 from sphereorient.methods.settings import Settings

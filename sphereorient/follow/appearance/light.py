@@ -16,11 +16,11 @@ from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.record import Studied, enough_of, soft
 from sphereorient.locate.outline import Outline
 from sphereorient.pose.camera_view import FINEST_PX, Optics, level_of, widest_px
+from sphereorient.pose.fit import USUALLY_HIDDEN
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import limb_wider_px
 from sphereorient.pose.lights import kinds
 from sphereorient.pose.lights.kinds import Rivals
-from sphereorient.pose.occluders import USUALLY_HIDDEN
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.sphere.texture_table import TextureTable

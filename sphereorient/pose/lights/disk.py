@@ -6,11 +6,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sphereorient.pose.lights.common import learn_stray, noise_curves
 from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_stray, polynomials, scene_beside
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
+from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals, learn_stray, noise_curves
 from sphereorient.so3 import inverse_damped
 
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk

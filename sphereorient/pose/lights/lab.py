@@ -11,7 +11,6 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
-from sphereorient.pose.lights.common import learn_stray, noise_curves
 from sphereorient.pose.model import (
     LATER,
     Light,
@@ -24,7 +23,7 @@ from sphereorient.pose.model import (
 )
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import by_pose, residuals
+from sphereorient.pose.residuals import by_pose, learn_stray, noise_curves, residuals
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 
