@@ -14,8 +14,11 @@ from sphereorient.so3 import nearest_rotation
 FEWEST_POINTS = 3  # points that determine a rotation
 M_PER_MM = 1e-3
 RATE_UNITS = {"velocity": "m_s", "acceleration": "m_s2"}
+RATE_UNITS |= {"omega_lab": "rad_s", "omega_body": "rad_s", "alpha_lab": "rad_s2", "alpha_body": "rad_s2"}
 POSES = {"position_smooth": "position_lab_mm", "position_smooth_cov": "position_cov_mm2"}
+POSES |= {"orientation_smooth": "R_lab_body", "orientation_smooth_cov": "orientation_cov_rad2"}
 FIELDS = {name: f"{name}_{unit}" for name, unit in RATE_UNITS.items()}
+FIELDS |= {f"{name}_sigma": f"{name}_sigma_{unit}" for name, unit in RATE_UNITS.items()}  # of `Motion`, by dataset
 
 
 def omega_from_orientations(
@@ -131,11 +134,6 @@ def omega_from_markers(
     weights = torch.where(common[..., None], both, True).to(points.dtype)
     before, after = (torch.stack([points.roll(side * m, -3) for m in separations], -3) for side in (1, -1))
     return mean_over_separations(kabsch(before, after, weights), usable & common, dt_s, separations, min_separations)
-
-
-RATE_UNITS |= {"omega_lab": "rad_s", "omega_body": "rad_s", "alpha_lab": "rad_s2", "alpha_body": "rad_s2"}
-POSES |= {"orientation_smooth": "R_lab_body", "orientation_smooth_cov": "orientation_cov_rad2"}
-FIELDS |= {f"{name}_sigma": f"{name}_sigma_{unit}" for name, unit in RATE_UNITS.items()}  # of `Motion`, by dataset
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
