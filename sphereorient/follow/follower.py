@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.errors import Reason
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.recording import Recording, spread_frames
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.ball import OWN, BallTracker

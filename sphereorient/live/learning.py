@@ -25,10 +25,10 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.live.live import OnlineTracker
 from sphereorient.locate import Frame
+from sphereorient.mapping.chain import RelativeTracker
 from sphereorient.mapping.disks import Crop, Crops, cut_out
 from sphereorient.mapping.grid import ROUGH_SIDE, map_table
 from sphereorient.mapping.growing import GrowingMap, LiveMap
-from sphereorient.mapping.relative import RelativeTracker
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, widest_px

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream
 from sphereorient.live.feed import Arrival, FrameBytes
 
 MAGIC = b"SPHEREO1"

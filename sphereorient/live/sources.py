@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 
 from sphereorient.errors import MovieError, SettingsError, error_words, refusal
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.picture import luma
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
 from sphereorient.live.shared import shared_frames

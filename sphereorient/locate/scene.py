@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera, nearest_point
 from sphereorient.errors import ExperimentError, SettingsError, refusal
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream, given_scene
+from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.locate.background import LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline

@@ -17,8 +17,7 @@ from torch.nn import functional as F
 from sphereorient import locate
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, Reason, refusal
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream, given_scene
+from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.files.threads import Progress
 from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of
 from sphereorient.locate.outline import Outline

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Among, Following
 from sphereorient.follow.appearance.light import estimate_blur_px

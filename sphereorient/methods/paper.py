@@ -14,8 +14,7 @@ from sphereorient.calibration.comparison import Seen
 from sphereorient.calibration.contradictions import majority
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import Reason
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import Follower
 from sphereorient.locate import Sightings

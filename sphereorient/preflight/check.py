@@ -8,8 +8,7 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import open_recording
-from sphereorient.experiment.stream import given_scene
+from sphereorient.experiment.recording import given_scene, open_recording
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.files.threads import Progress, silent
 from sphereorient.locate import expected_diameter_px

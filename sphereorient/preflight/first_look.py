@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sphereorient.cameras import PinholeCamera
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream
 from sphereorient.files.threads import Progress, side_by_side, silent
 from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import DraftKey
