@@ -126,3 +126,22 @@ def with_systematic_errors(
             own = {name: cameras[name] for name in some}
             place[rows], turn[rows] = systematic_errors(own, covariance, position[rows], radius_mm)
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
+
+
+def with_lasting_errors(track: Trajectory, covariance: Tensor, alone: Tensor) -> Trajectory:
+    """Add the errors that all frames share, which no path averages away, to the covariances of the poses.
+    Covariances of delta (rad, lab) and position (mm): (6, 6) by all cameras together, (C, 6, 6) by each alone.
+    """
+    use = torch.from_numpy(track.believed)
+    # Those of each camera are its own: the fewer count, the less of them is averaged away.
+    together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * covariance
+    single = (use.to(torch.float64) @ alone.flatten(1)).reshape(-1, 6, 6)
+    whole = torch.where((use.sum(1) == 1)[:, None, None], single, together).numpy()
+    turn, place = whole[:, :3, :3], whole[:, 3:, 3:]
+    return replace(
+        track,
+        position_cov=track.position_cov + place,
+        position_smooth_cov=track.position_smooth_cov + place,
+        orientation_cov=track.orientation_cov + turn,
+        orientation_smooth_cov=track.orientation_smooth_cov + turn,
+    )

@@ -182,7 +182,6 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
     from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.so3 import angle
 
     after, before = (_known_map(path) for path in maps)
     comparison = compare_maps(after, before, turned=turned)
@@ -198,7 +197,9 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
         typer.echo(json.dumps(numbers))
         return
     _print_moved(comparison, f"{maps[0]} against {maps[1]}")
-    typer.echo(f"body frames: {math.degrees(float(angle(R))):.2f}° apart; correlation {comparison.correlation:.3f}")
+    typer.echo(
+        f"body frames: {math.degrees(comparison.angle_rad):.2f}° apart; correlation {comparison.correlation:.3f}"
+    )
     typer.echo(f"texture changed by more than {100 * CHANGED:g} % of black to white: {100 * changed:.1f} % of the map")
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from sphereorient import so3
@@ -20,10 +20,12 @@ from sphereorient.learn.network import Correlator, find_modes, first_right, smoo
 from sphereorient.learn.pictures import VALIDATION_SEED, TrainingBatch, draw_values, film, generator_of, make_textures
 from sphereorient.learn.settings import PictureSettings
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
-from sphereorient.statistics.bootstrap import Floats, Rows
 from sphereorient.synth.severities import severity
 
 Z95 = 1.959964  # normal quantile of a two-sided interval of 95 %
+Floats = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
 WITHIN_DEG = 10.0  # of the truth counts as right: the pose fit converges from there
 CANDIDATES = 8
 TEMPERATURES = tuple(2 ** (k / 2) for k in range(-4, 5))  # tried first: 1/4 .. 4
@@ -44,7 +46,7 @@ class Reliability:
     share: Floats  # (B,), of the outcomes that are true
     low: Floats  # (B,), of the 95 % interval of the share
     high: Floats  # (B,)
-    count: Rows  # (B,), outcomes in the bin
+    count: Counts  # (B,), outcomes in the bin
     error: float  # expected calibration error: mean |share - probability| over outcomes; NaN without outcomes
     chance: float  # the error expected by scatter alone if the probabilities are perfect
 
@@ -81,7 +83,7 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     return Reliability(probability=mean, share=share, low=low, high=high, count=count, error=error, chance=chance)
 
 
-def wilson(share: Floats, count: Rows) -> tuple[Floats, Floats]:
+def wilson(share: Floats, count: Counts) -> tuple[Floats, Floats]:
     """Return the ends of the 95 % interval of shares (B,) of `count` outcomes each (Wilson 1927)."""
     middle = (share + Z95**2 / (2 * count)) / (1 + Z95**2 / count)
     half = Z95 / (1 + Z95**2 / count) * np.sqrt(share * (1 - share) / count + Z95**2 / (4 * count**2))

@@ -50,6 +50,11 @@ class MapComparison:
     moved_rad: Tensor  # (D, 2) float64, displacement to the east and north in the other map; NaN if unknown
 
     @property
+    def angle_rad(self) -> float:
+        """Angle between the body frames, rad."""
+        return float(so3.angle(self.R_other_reference))
+
+    @property
     def length_rad(self) -> Tensor:
         """Length of the measured displacements, rad, (n,)."""
         length: Tensor = self.moved_rad[torch.isfinite(self.moved_rad).all(1)].norm(dim=-1)

@@ -14,5 +14,5 @@ from sphereorient.motion.measure import (
 )
 from sphereorient.motion.path import rotvec_between
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
-from sphereorient.motion.smooth import MeasuredPoses, Smoothed, lasting_share, off_middle, smooth_motion
+from sphereorient.motion.smooth import MeasuredPoses, Smoothed, in_middle, lasting_share, off_middle, smooth_motion
 from sphereorient.motion.stencil import gaussian_derivative, gaussian_kernel

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.errors import Reason
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.pose.pixels import Pixels
@@ -160,6 +161,23 @@ class PoseTable(FittedPoses):
             part = whole[frame, choice.clamp_min(0)]
             chosen[name] = torch.where(none.reshape(-1, *[1] * (part.ndim - 1)), torch.nan, part)
         return chosen
+
+    def margin(self, choice: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log-likelihood margin and angle to the next distinct orientation, (N,) each; NaN without one."""
+        frame, place = torch.arange(len(self)), choice.clamp_min(0)
+        others = self.mask.clone()
+        others[frame, place] = False
+        others &= (choice >= 0)[:, None]
+        nll = torch.where(others, self.nll, torch.inf)
+        best, which = nll.min(1)
+        there = torch.isfinite(best)
+        angle = so3.geodesic_distance(self.R_lab_body[frame, which], self.R_lab_body[frame, place])
+        return torch.where(there, best - self.nll[frame, place], torch.nan), torch.where(there, angle, torch.nan)
+
+
+def turned_alone(picked: Mapping[str, Tensor], camera: int) -> Tensor:
+    """Return R_lab_body (N, 3, 3) of poses, as `PoseTable.rows`, by one camera alone."""
+    return so3.exp(picked["own_turn"][:, camera]) @ picked["R_lab_body"]
 
 
 def pose_tables(

@@ -10,11 +10,12 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from sphereorient.pose.model import SphereModel, SphereView, no_stray, polynomials, scene_beside, stray_basis
+from sphereorient.pose.model import SphereModel, SphereView, no_stray, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.view import sphere_view
 from sphereorient.so3 import solve_damped
+from sphereorient.sphere.view import polynomials
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 KNOWN = 0.3  # least share of a disk that shows known paint
