@@ -182,10 +182,8 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
             name: measure(tracks[name], truth_path) | dict(zip(("given", "exchanges"), others[name], strict=True))
             for name in balls
         }
-    hidden = dict.fromkeys(balls, np.zeros(1))
-    if len(balls) > 1:
-        radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)
-        hidden = hidden_shares(truth_path, load_experiment(experiment).cameras, radii_mm)
+    radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)
+    hidden = hidden_shares(truth_path, load_experiment(experiment).cameras, radii_mm)
     return [
         SceneResult(
             scene=scene.name,

@@ -6,7 +6,6 @@ from sphereorient.locate.position import Match, Positions, assigned, find_positi
 from sphereorient.locate.scene import (
     CameraScene,
     expected_diameter_px,
-    find_scene,
     find_scenes,
     known_diameter_px,
     learn_background,

@@ -18,7 +18,7 @@ from sphereorient.locate.disks import find_disks
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.position import Match, assigned, match_disks, places_of
 from sphereorient.locate.scene import CameraScene, find_scenes
-from sphereorient.mapping.disks import Crop, Crops, cut_crop
+from sphereorient.mapping.disks import Crop, Crops, cut_crop, take_crops
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import CameraView
 
@@ -40,15 +40,19 @@ class _Instant:
     position_lab_mm: Floats  # (M, 3), of the matches
 
 
-def take_crops_of_all(
+def crops_of_balls(
     recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress
 ) -> dict[str, Crops]:
-    """Crop each of several moving spheres in every frame, by name. Names of spheres of one size are given by chance,
-    and kept: a sphere is the one that is where it is expected. Only disks that no other one touches are used.
+    """Crop each sphere in every frame, by name: an only one as `take_crops`, or several moving ones. Names of spheres of
+    one size are given by chance, and kept: a sphere is the one that is where it is expected. Only disks that no other
+    one touches are used.
     Raises ExperimentError (a sphere without a diameter, or one that is said to stay in its place), PaintError (no frame
     shows as many spheres as are named, each by itself).
     """
     names, streams = recording.experiment.names, recording.streams
+    first, *others = names
+    if not others:
+        return {first: take_crops(recording, settings, locating, progress)}
     scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]
     sizes_px = [[scene[name].diameter_px for name in names] for scene in scenes]
     radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}

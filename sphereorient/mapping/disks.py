@@ -101,7 +101,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         if experiment.fixed:  # what changes in the pictures is the ball
             outline, scene = _fixed_scene(recording, stream, settings, locating)
         else:
-            scene = locate.find_scene(recording, stream, settings.background_frames, locating)
+            (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
         found: list[Found] = []
         row: list[Crop | None] = []
         for k, shot in enumerate(locate.screened_frames(stream, scene.background)):
