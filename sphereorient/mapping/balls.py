@@ -43,9 +43,9 @@ class _Instant:
 def crops_of_balls(
     recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress
 ) -> dict[str, Crops]:
-    """Crop each sphere in every frame, by name: an only one as `take_crops`, or several moving ones. Names of spheres of
-    one size are given by chance, and kept: a sphere is the one that is where it is expected. Only disks that no other
-    one touches are used.
+    """Crop each sphere in every frame, by name: an only one as `take_crops`, or several moving ones. Names of spheres
+    of one size are given by chance, and kept: a sphere is the one that is where it is expected. Only disks that no
+    other one touches are used.
     Raises ExperimentError (a sphere without a diameter, or one that is said to stay in its place), PaintError (no frame
     shows as many spheres as are named, each by itself).
     """
