@@ -16,7 +16,6 @@ from sphereorient.errors import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
 LINKS_MIN = 8  # fewer do not determine an acceleration
-ROUNDS_MAX = 4
 ROUND_ENOUGH = 0.3  # a scale that changes by less, as a logarithm, changes no choice
 START_DEG = (0.1, 0.5, 2.0)  # changes of the rotation from frame to frame, one of which is near enough to begin with
 CHANGE_MAX_DEG = 10.0
@@ -124,7 +123,7 @@ def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) 
         return BeamSearch(rows, cost, gap).run(), cost
     cost = _start(rows, cost, gap)
     histories = BeamSearch(rows, cost, gap).run()
-    for _ in range(ROUNDS_MAX):
+    for _ in range(4):  # at most
         scale = _acceleration(rows, [(rows, histories)], cost)
         if abs(math.log(scale / cost.acceleration_rad_s2)) < ROUND_ENOUGH:
             break

@@ -10,8 +10,6 @@ from sphereorient import so3
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import Flag
 
-DEVIATIONS_PER_MAD = 1.4826  # of a normal distribution
-
 
 def links(R_lab_body: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
     """Return xi (rad/s), the angle over the time, and the angle (rad) of the link that enters each frame, (N,) each.
@@ -41,7 +39,7 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """
     windows = moving(xi, settings.spike_window_frames)
     usual = windows.nanmedian(-1, keepdim=True).values
-    deviation = DEVIATIONS_PER_MAD * (windows - usual).abs().nanmedian(-1).values
+    deviation = 1.4826 * (windows - usual).abs().nanmedian(-1).values  # of a normal distribution
     outstanding = xi > usual[:, 0] + settings.spike_factor * deviation
     return outstanding & (turn > math.radians(settings.spike_min_deg))
 

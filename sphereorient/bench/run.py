@@ -41,7 +41,6 @@ Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; c
 Progress = Callable[[int, int], None]
 PLAN, RESULTS, KEPT, CACHE = "plan.json", "results.json", "scenes", "cache"
 DIGITS = 5
-MOSTLY = 0.5  # share of a disk from which it counts as hidden
 Floats = NDArray[np.float64]
 TRACKERS: dict[str, Tracker] = {
     "precise": partial(track_movies, method="precise"),
@@ -194,7 +193,7 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
             method=method,
             seconds=round(seconds / len(balls), 2),
             ball=name,
-            hidden=round(float((hidden[name] > MOSTLY).mean()), DIGITS),
+            hidden=round(float((hidden[name] > 0.5).mean()), DIGITS),
             **measured[name],
         )
         for name in balls

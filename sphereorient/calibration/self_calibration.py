@@ -31,7 +31,6 @@ SHARED = 12  # consecutive frames that share one error of the centre: they have 
 HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
 FRAMES_MIN = 20
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
-ROUNDS = 4
 CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
 
 
@@ -174,7 +173,7 @@ class _Pair:
     def solved(self) -> tuple[Tensor, Tensor]:
         """Return the motion (6,) and its sigmas from the scatter of frames at the solution."""
         at = torch.zeros(9, dtype=torch.float64)
-        for _ in range(ROUNDS):
+        for _ in range(4):  # scatter and inliers anew
             known = dict(zip(("spread", "kept"), self._scatter(at[:6]), strict=True))
             at = least_squares(partial(self._residuals, **known), partial(self._slopes, **known), at)
         slopes = self._slopes(at, *self._scatter(at[:6]))

@@ -14,8 +14,6 @@ from sphereorient.trajectory import Trajectory
 
 CAP_RINGS = (0.35, 0.75)  # of the radius: points of the visible cap
 PER_RING = 6
-LIMB_POINTS = 12
-GRAZING_ROUNDS = 4  # each reduces the error by the factor radius over distance
 DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position interpolates the smooth effect
 
 
@@ -71,7 +69,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
     towards = normalize(camera.rays(camera.project(positions)).direction_lab, dim=-1)
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(towards @ camera.R_cam_lab.mT)
     cap = torch.cat([_ring(share, PER_RING, k * torch.pi / PER_RING) for k, share in enumerate(CAP_RINGS)])
-    paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (cap, _ring(1.0, LIMB_POINTS)))
+    paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (cap, _ring(1.0, 12)))
     count = len(cap)
     arms = torch.cat([paint, _grazed(camera, positions, limb, radius_mm)], dim=1)
     points = positions[:, None] + arms
@@ -98,7 +96,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
 def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
     """Return arms (N, M, 3), lab, mm, to the tangent points of lines of sight; only these move with the limb."""
     outward = normalize(arms, dim=-1)
-    for _ in range(GRAZING_ROUNDS):
+    for _ in range(4):  # each reduces the error by the factor radius over distance
         along = camera.rays(camera.project(positions[:, None] + arms)).direction_lab
         arms = radius_mm * normalize(outward - (outward * along).sum(-1, keepdim=True) * along, dim=-1)
     return arms

@@ -12,8 +12,6 @@ from torch import Tensor
 from sphereorient.cameras.checks import camera_error, check_points, check_positive
 from sphereorient.cameras.model import CentralCamera, Key, middle_of_picture
 
-RADIAL_STEPS = 30  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
-PLANE_STEPS = 8  # of Newton, from the radial solution: what is left is as small as the tangential part
 RIM_STEPS = 33  # points per side of the picture where the distortion is tried; both corners are among them
 
 
@@ -157,7 +155,7 @@ def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
         radius = goal.norm(dim=-1, keepdim=True)
         safe = torch.where(radius > 0, radius, torch.ones_like(radius))
         xy = goal * (_radius_before(radius, kk, math.sqrt(fold2(k))) / safe)
-        for _ in range(PLANE_STEPS):
+        for _ in range(8):  # of Newton, from the radial solution: what is left is as small as the tangential part
             xy = _newton(xy, goal, kk, pp)
         missed = (_bent(xy, kk, pp)[0] - goal).norm(dim=-1, keepdim=True)
         close = missed <= 1e4 * torch.finfo(goal.dtype).eps * radius  # rounding, times what a near fold magnifies
@@ -220,7 +218,7 @@ def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
         half_is_beyond, is_below = value_and_slope(high / 2)[0] > 0, value_and_slope(high)[0] < 0
         high = torch.where(is_below, 2 * high, torch.where(half_is_beyond, high / 2, high)).clamp_max(fold)
     r = high
-    for _ in range(RADIAL_STEPS):
+    for _ in range(30):  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
         value, slope = value_and_slope(r)
         low, high = torch.where(value < 0, r, low), torch.where(value < 0, high, r)
         better = r - value / slope

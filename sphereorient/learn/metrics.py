@@ -16,9 +16,10 @@ from sphereorient import so3
 from sphereorient.errors import CheckpointError, ShapeError, refusal
 from sphereorient.files.threads import Progress
 from sphereorient.learn.checkpoint import Checkpoint, check_texture, correlator_of
-from sphereorient.learn.network import Correlator, find_modes, first_right, smoothed_target
+from sphereorient.learn.network import CANDIDATES, Correlator, find_modes, first_right, smoothed_target
 from sphereorient.learn.pictures import VALIDATION_SEED, TrainingBatch, draw_values, film, generator_of, make_textures
 from sphereorient.learn.settings import PictureSettings
+from sphereorient.search.candidates import BATCH
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 from sphereorient.synth.severities import severity
 
@@ -27,7 +28,6 @@ Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 WITHIN_DEG = 10.0  # of the truth counts as right: the pose fit converges from there
-CANDIDATES = 8
 TEMPERATURES = tuple(2 ** (k / 2) for k in range(-4, 5))  # tried first: 1/4 .. 4
 NEARER = tuple(2 ** (k / 8) for k in (-3, -2, -1, 1, 2, 3))  # then the best one times these
 BENCHMARK_SEED = 1 << 21  # of the first map; validation maps begin at half of it
@@ -35,7 +35,6 @@ MAPS = 24
 LEVELS = (3, 4, 5)
 MIXED = 999  # random stream of the mixed pictures; those of the degradations are below
 EXAMPLES = 7  # random stream of the examples
-BATCH = 32  # pictures at once in the measurement of speed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

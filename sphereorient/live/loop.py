@@ -24,7 +24,6 @@ from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
 
-SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
 MAP = "texture.png"  # beside the experiment, where that names none
 
 
@@ -105,7 +104,7 @@ def run_live(
     table, json_lines = FicTracLines(views[0].camera.R_cam_lab.numpy()), JsonLines(recording.experiment.fixed)
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
-    sys.setswitchinterval(SWITCH_S)
+    sys.setswitchinterval(0.0002)  # longest that a thread that computes holds up the one that reads
     feed = Feed(source.frames(recording), most=64, wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
     if page is not None:

@@ -32,7 +32,6 @@ KEPT = 1000  # latencies
 LOST_S = 0.5  # without a pose: then it is told
 CONFIRMED = 2  # poses in a row: one alone may be a chance match
 MOSTLY = 0.8  # of all frames without a pose: the ball was not explained before
-MOST_STEPS = 20_000  # of the path
 # Likely causes of a ball that is not found, by the reason that says most.
 CAUSES = {
     Reason.LOW_SCORE: "its outline is seen, but no orientation explains its paint: it is partly hidden, the light or "
@@ -52,7 +51,6 @@ NOT_EXPLAINED = (
 )
 PAGE = Path(__file__).with_name("page.html")
 WIDEST = 640  # px, of a picture that is sent
-STEPS = 1000  # of the path
 Json = dict[str, Any]
 
 
@@ -73,7 +71,7 @@ class Monitor:
         self.newest: Seen | None = None
         self.latency_ms: deque[float] = deque(maxlen=KEPT)
         self.told_s: deque[float] = deque(maxlen=KEPT)  # when a frame was measured, by the clock of time.perf_counter
-        self.path: deque[tuple[float, float]] = deque(maxlen=MOST_STEPS)
+        self.path: deque[tuple[float, float]] = deque(maxlen=20_000)
         self.running = Event()
         self.running.set()
         self._feed, self._tell = feed, tell
@@ -162,7 +160,7 @@ class LivePage:
         counts, edges = np.histogram(latency, 40, (0.0, max(float(np.quantile(latency, 0.99)) * 1.2, 1.0)))
         middle, slow = np.quantile(latency, (0.5, 0.99))
         steps = monitor.path.copy()
-        path = list(islice(steps, 0, None, max(1, len(steps) // STEPS)))
+        path = list(islice(steps, 0, None, max(1, len(steps) // 1000)))  # of the path
         return {
             "begun": True,
             "running": monitor.running.is_set(),

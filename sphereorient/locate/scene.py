@@ -23,7 +23,6 @@ CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in s
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
-WINDOW = 5  # median filter against single pixels, px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,7 +176,7 @@ def fixed_ball(
         scatter = np.where(shown, scatter, np.float32(0))
     full_scale = float(np.iinfo(pictures.dtype).max)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255
-    moved = (cv2.medianBlur(scatter, WINDOW) > CHANGES * usual).astype(np.uint8)
+    moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter against single pixels, px
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
     if count < 2:
         raise _none_fixed("nothing that changes")

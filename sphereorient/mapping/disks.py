@@ -19,6 +19,7 @@ from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.files.threads import Progress
+from sphereorient.follow.initialise import GAP_SHARE
 from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
@@ -31,7 +32,6 @@ from sphereorient.sphere.view import perspective_view
 
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
-GAP_SHARE = 0.3  # of the radius: a larger median distance between lines of sight means two different balls
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
 OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its median times this is the sigma of noise
 # Scatter of a fixed ball's outlines that is refused: px, of the radius, and of that of their size. Where outlines are

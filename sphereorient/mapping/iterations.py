@@ -48,7 +48,6 @@ BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
 BATCH = 24  # instants at once
 LONGEST_RAD = 0.05  # joint step
-MAP_STEPS = 10  # of conjugate gradients: what they leave, the next iteration finds
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
 BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
 NOISE_EVERY = 4  # pixels from which the noise is estimated
@@ -316,7 +315,8 @@ def extended(state: State, new: State, tie: float, unseen: TextureTable | None) 
 def _changed(state: State, normal: NormalMatrix, right: NDArray[np.float64], tie: float) -> State:
     """Return the state with the change of its map that solves normal equations (T, T), (T,)."""
     height = len(state.texture)
-    texture = state.texture + grid.solve_map(normal, right, height, tie, MAP_STEPS).float()
+    # Of conjugate gradients: what they leave, the next iteration finds.
+    texture = state.texture + grid.solve_map(normal, right, height, tie, 10).float()
     weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight)
 

@@ -15,7 +15,6 @@ FRAMES_A_MAP = 64
 OTHERS = "ask for frames that the movie has"
 MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
-LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value; no real picture exceeds it
 COLOUR_REMARK = "colour, made grey (0.299 R + 0.587 G + 0.114 B)"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
 

@@ -18,7 +18,7 @@ from sphereorient.experiment.recording import Recording, load_map
 from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.scene_start import SceneStart
+from sphereorient.follow.scene_start import EXPLAINED, SceneStart
 from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
 from sphereorient.mapping.compare import compare_maps
@@ -32,7 +32,6 @@ from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warn
 
 FRAMES = 8  # spread over the movies
 SEEN = 0.8  # share of the frames in which a ball should be found
-OWN = 0.35  # of the radius: a disk whose middle is that near to a ball is its own
 WHOLE = 0.7  # share of the rim of a disk that tells the size of a ball
 
 
@@ -167,7 +166,7 @@ def ball_sizes(
             for c, view in enumerate(ball.fitter.views)
             for disk in frame[c]
             if disk.coverage > WHOLE
-            and math.dist((disk.u_px, disk.v_px), _middle(ball, poses[name], c)) < OWN * disk.radius_px
+            and math.dist((disk.u_px, disk.v_px), _middle(ball, poses[name], c)) < EXPLAINED * disk.radius_px
         ]
         if seen:
             ratios[name] = median(seen)

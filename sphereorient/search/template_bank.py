@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import Reason
-from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
+from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.settings import OrientSettings
 from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import STEPS
@@ -18,7 +18,6 @@ from sphereorient.sphere.view import disk_offsets
 
 BINS = 32  # of the histograms; finer ones are empty in the small moving region
 # Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
-BATCH = 32
 LOOKED_UP = 4096  # templates of the fine grid at once
 SEMIFINALISTS = 8  # of the fine grid, the share 1 / 8 that matches every fourth pixel best is matched with all
 FINALISTS = 4  # best of the fine grid by the table; the renderer chooses among them

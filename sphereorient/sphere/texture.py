@@ -14,7 +14,6 @@ from sphereorient.files.whole_file import read_whole
 
 PICTURE_BYTES = 100_000_000
 MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
-OPAQUE = 128  # of 255: texels of less alpha are no paint
 SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
 OVERSHOOT = 2.0  # a map that was learnt may exceed white a little; grey levels are far above
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
@@ -78,7 +77,8 @@ def load_unseen(texture: Path) -> Tensor | None:
     with Image.open(texture) as picture:
         size = picture.height, picture.width
         alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else np.full(size, 255)
-    unseen, counts = torch.from_numpy(alpha < OPAQUE), read_seen(seen_path(texture))
+    # Of 255: texels of less alpha are no paint.
+    unseen, counts = torch.from_numpy(alpha < 128), read_seen(seen_path(texture))
     if counts is not None and counts.shape != unseen.shape:
         expected, got = (f"{shape[1]} x {shape[0]}" for shape in (size, counts.shape))
         do = f"take the one that was written with {texture.name}, or move it away"

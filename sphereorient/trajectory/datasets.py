@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import Reason, ShapeError, TrackError, refusal
+from sphereorient.files.whole_file import LARGEST_RATIO
 
 KEY = "column"
-LARGEST_RATIO = 1200  # compression ratio; a dataset that claims more is not in the file
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ from sphereorient.errors import PaintError, error_words, refusal
 from sphereorient.files.whole_file import TABLE_BYTES, read_text, read_whole
 from sphereorient.search import crop_disk
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.texture import PICTURE_BYTES
 from sphereorient.sphere.view import fitted_circle
 from sphereorient.tools.spin.dots import DotTable
 
 Photograph = NDArray[Any]
 
-PICTURE_BYTES = 100_000_000
 MOST_PIXELS = 50_000_000
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 MOST_PHOTOGRAPHS = 1000
