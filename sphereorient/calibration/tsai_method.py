@@ -20,11 +20,11 @@ from sphereorient.calibration.document import CalibrationDocument
 from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
 from sphereorient.calibration.targets import PlateView
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
+from sphereorient.cameras.brown import TsaiCamera
 from sphereorient.cameras.checks import camera_error, check_image_size, check_known, check_positive
 from sphereorient.cameras.io.cameras_yaml import MODELS
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
-from sphereorient.cameras.tsai import TsaiCamera
 from sphereorient.errors import CameraError
 
 FLAT = 3e-3  # relief over width below which the linear stage takes points as a plane

@@ -13,8 +13,7 @@ from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.provenance import provenance
 from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
-from sphereorient.mapping.alike import SharedMap, corrected, shared_maps
-from sphereorient.mapping.balls import crops_of_balls
+from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
 from sphereorient.mapping.compare import MapComparison
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track

@@ -11,7 +11,7 @@ from map_examples import shift_field, warped
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.mapping.alike import nearest_texels
+from sphereorient.mapping.balls import nearest_texels
 from sphereorient.mapping.compare import (
     compare_maps,
     compass,
