@@ -52,11 +52,9 @@ class OnlineTracker:
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
             self._chunk.forget()
         self._time_s[self._number] = time_s
-        tracker, ahead = self._tracker, self._tracker.ahead(self._chunk, self._number)
-        (followed,) = [None] if ahead is None else tracker.follow([ahead], [shots])
-        if followed is None:
-            return None
-        self._last = tracker.stated(followed)
+        ahead = self._tracker.ahead(self._chunk, self._number)
+        if ahead is not None:
+            (self._last,) = self._tracker.follow([ahead], [shots])
         return self._last
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
@@ -64,7 +62,7 @@ class OnlineTracker:
         followed = self.followed(time_s, shots)
         if followed is not None:
             return followed, False
-        poses = self._tracker.stated(self._tracker.searched(shots))
+        poses = self._tracker.searched(shots)
         self._chunk.forget()  # what was before says nothing of the motion from here
         self._last = poses
         return poses, True

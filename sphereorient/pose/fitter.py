@@ -233,8 +233,8 @@ class Fitter:
             known = disks_px.spoilt or self.spoilt(begin.position_lab_mm, disks_px, begin.moved, begin.among)
             hidden = known.hidden
         disks = FrameDisks.of(self.views, frames, disks_px.middle_px, stencil, hidden)
-        there = moved_to(self.device, begin)
-        fit, far = body_of(there).settle(disks, there, self.model(), self.instants, self.most_hidden, first)
+        model, there = self.model(), moved_to(self.device, begin)
+        fit, far = body_of(there).settle(disks, there, model, self.instants, self.most_hidden, first)
         fit = moved_to(CPU, fit)
         if rows := far.nonzero()[:, 0].tolist():
             on = begin.after(fit).of(torch.tensor(rows))
