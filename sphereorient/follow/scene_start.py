@@ -20,6 +20,7 @@ from sphereorient.pose.poses import Poses, no_pose
 
 Floats = NDArray[np.float64]
 Kind = tuple[float, ...]  # the same for balls that are alike
+SceneFound = Mapping[str, Poses]  # of each ball in one frame
 
 EXPLAINED = 0.35  # of the radius: a disk whose middle is that near to a known ball is its own
 PATCHES = 40.0  # of paint on a disk that say something of their own
