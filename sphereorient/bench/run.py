@@ -22,10 +22,10 @@ from sphereorient.bench.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneR
 from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.bench.score import (
     given_to_others,
-    hidden_shares,
     named_as_true,
     score_track,
     true_orientations,
+    true_positions,
 )
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.experiment import load_experiment
@@ -35,6 +35,7 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies, with_proposer
+from sphereorient.synth.scene import hidden_shares
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
 Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
@@ -182,7 +183,7 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
             for name in balls
         }
     radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)
-    hidden = hidden_shares(truth_path, load_experiment(experiment).cameras, radii_mm)
+    hidden = hidden_shares(true_positions(truth_path, balls), load_experiment(experiment).cameras, radii_mm)
     return [
         SceneResult(
             scene=scene.name,
