@@ -18,7 +18,7 @@ VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
 LINKS_MIN = 8  # fewer do not determine an acceleration
 ROUND_ENOUGH = 0.3  # a scale that changes by less, as a logarithm, changes no choice
 START_DEG = (0.1, 0.5, 2.0)  # changes of the rotation from frame to frame, one of which is near enough to begin with
-CHANGE_MAX_DEG = 10.0
+CHANGE_MAX_DEG = 10.0  # of the rotation from frame to frame: the largest acceleration that is tried
 SAMPLES, SAMPLE_FRAMES = 3, 100  # parts of the movie from which the start is chosen
 FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration is not seen in one frame interval
 

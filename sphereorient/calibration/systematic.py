@@ -13,7 +13,7 @@ from sphereorient.cameras.parameters import with_parameters
 from sphereorient.trajectory import Trajectory
 
 CAP_RINGS = (0.35, 0.75)  # of the radius: points of the visible cap
-PER_RING = 6
+PER_RING = 6  # points of each of these
 DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position interpolates the smooth effect
 
 

@@ -17,7 +17,15 @@ from sphereorient.errors import CheckpointError, ShapeError, refusal
 from sphereorient.files.threads import Progress
 from sphereorient.learn.checkpoint import Checkpoint, check_texture, correlator_of
 from sphereorient.learn.network import CANDIDATES, Correlator, find_modes, first_right, smoothed_target
-from sphereorient.learn.pictures import VALIDATION_SEED, TrainingBatch, draw_values, film, generator_of, make_textures
+from sphereorient.learn.pictures import (
+    MAPS,
+    VALIDATION_SEED,
+    TrainingBatch,
+    draw_values,
+    film,
+    generator_of,
+    make_textures,
+)
 from sphereorient.learn.settings import PictureSettings
 from sphereorient.search.candidates import BATCH
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
@@ -31,7 +39,6 @@ WITHIN_DEG = 10.0  # of the truth counts as right: the pose fit converges from t
 TEMPERATURES = tuple(2 ** (k / 2) for k in range(-4, 5))  # tried first: 1/4 .. 4
 NEARER = tuple(2 ** (k / 8) for k in (-3, -2, -1, 1, 2, 3))  # then the best one times these
 BENCHMARK_SEED = 1 << 21  # of the first map; validation maps begin at half of it
-MAPS = 24
 LEVELS = (3, 4, 5)
 MIXED = 999  # random stream of the mixed pictures; those of the degradations are below
 EXAMPLES = 7  # random stream of the examples

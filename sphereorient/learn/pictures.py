@@ -17,6 +17,7 @@ from sphereorient.synth.degrade_scene import misdrawn, worn
 from sphereorient.synth.disks import film_disks
 from sphereorient.synth.severities import DEGRADATIONS, LEVELS
 
+MAPS = 24  # that no training sees, of a validation or a benchmark
 VALIDATION_SEED = 1 << 20  # of the first validation map; training maps begin at 0
 BLUR_BATCH = 64  # maps blurred at once
 

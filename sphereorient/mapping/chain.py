@@ -18,7 +18,7 @@ from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs,
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.poses import Poses, blank_parts, no_pose
 
-SEARCH_STEP_DEG = 8.0
+SEARCH_STEP_DEG = 8.0  # of the grid of relative rotations
 SEARCH_EVERY = 2  # pixels of the small disks
 SMALLER = 2  # factor by which disks are reduced for a search
 ITERATIONS = 6  # of a pair's refinement

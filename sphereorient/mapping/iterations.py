@@ -43,7 +43,7 @@ LAB_ITERATIONS, LAB_FRAMES = 3, 32  # in which one light in the lab is estimated
 # Share of the paint's expected smoothness while poses are sought: a smoother map shifts the position of a ball in one
 # place (0.041 degrees with all of it, 0.016 with this), a rougher one lets poses follow noise.
 LOOSE = 0.1
-BLUR_FRAMES = 32
+BLUR_FRAMES = 32  # instants from which the blur is estimated, evenly spread
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
 BATCH = 24  # instants at once

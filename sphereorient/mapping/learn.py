@@ -38,7 +38,7 @@ RECOVERY_AFTER = (3, 6)  # iterations after which instants that do not fit are s
 GOOD_SHARE = 0.85  # of the median score, from which on an instant fits
 POSITION_ITERATIONS = 4  # that find the position of a ball that stays in its place
 FEW_PIXELS = 250_000  # of photographs together
-PIXELS_A_TEXEL = 3.0
+PIXELS_A_TEXEL = 3.0  # of few photographs: pixels that determine a texel
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5

@@ -16,12 +16,12 @@ from sphereorient.mapping.disks import Disks, disk_places
 from sphereorient.so3 import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement
-RIDGE = 1e-3
+RIDGE = 1e-3  # of the trace: a pair without slopes does not turn
 BATCH = 64  # pairs compared at once
 LOOKS = 1 << 21  # look-ups at once, at most, in a search
 SCALE = 0.7  # residual, in deviations of a normalised picture, that counts half
 OVERLAP_MIN = 0.2  # share of a disk visible in both pictures, below which a correlation is half believed
-ARRIVED_RAD = 1e-6
+ARRIVED_RAD = 1e-6  # largest step of the graph that ends it
 Sampled = tuple[Tensor, Tensor, Tensor]
 
 

@@ -25,7 +25,7 @@ LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
 LAGS = 3  # frames after which an error that remains is one that lasts
 CLIP = 4.0  # sigmas: a wrong frame is no lasting error
 AS_MANY = 20  # pairs of frames that outweigh the share that is assumed
-MOST_LASTING = 0.9
+MOST_LASTING = 0.9  # share of the variance that may last: some noise is left
 ON_PATH = 4.0  # sigmas (of three axes) within which a measured position agrees with the smoothed path
 
 

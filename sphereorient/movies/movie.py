@@ -11,7 +11,7 @@ from sphereorient.errors import MovieError, refusal
 from sphereorient.files.picture import OnDemand
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
-FRAMES_A_MAP = 64
+FRAMES_A_MAP = 64  # after which a file is mapped anew: read pages count as memory meanwhile
 OTHERS = "ask for frames that the movie has"
 MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers

@@ -23,7 +23,7 @@ from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
 Bools = NDArray[np.bool_]
-MOST_SHAPES = 200
+MOST_SHAPES = 200  # of a mask: far more than anyone draws
 FAR_PX = 1e5
 
 

@@ -12,7 +12,7 @@ from sphereorient.errors import ShapeError, TextureError, check_tail, refusal, t
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
-PICTURE_BYTES = 100_000_000
+PICTURE_BYTES = 100_000_000  # of a picture file, which is read whole
 MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
 SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
 OVERSHOOT = 2.0  # a map that was learnt may exceed white a little; grey levels are far above

@@ -17,7 +17,7 @@ NODES = 120  # values of a at which the likelihood is tabulated
 STEP = 1e-3  # of ln|x|, of its derivative
 FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
-TINY = 1e-300
+TINY = 1e-300  # keeps the logarithm of 0 finite
 REACH, BINS = 10.0, 61  # of the PDF to either side, standard deviations; odd: one bin is about 0
 
 

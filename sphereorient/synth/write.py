@@ -29,7 +29,7 @@ from sphereorient.synth.scene import Exposure, digitise, exposures, make_scene, 
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import degradation, severity
 
-PIXEL_PITCH_MM = 0.02
+PIXEL_PITCH_MM = 0.02  # of usual high-speed cameras
 DRAWS = 500  # motions tried for each ball
 NEXT_SEED = 1_000_003  # from one ball or draw to the next: no two scenes share one
 

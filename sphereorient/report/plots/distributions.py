@@ -21,7 +21,7 @@ from sphereorient.statistics.summary import Distributions
 Floats = NDArray[np.float64]
 
 FOUR = (*look.COMPONENTS, look.ALL)
-CURVE_POINTS = 401
+CURVE_POINTS = 401  # of a smooth curve
 SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or lags of the first zero
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
 
