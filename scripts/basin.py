@@ -17,7 +17,8 @@ import h5py
 import torch
 
 from sphereorient import so3
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import screened_frames

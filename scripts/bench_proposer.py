@@ -32,6 +32,7 @@ from sphereorient import so3
 from sphereorient.cli.app import progress_bar
 from sphereorient.files.whole_file import writing
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
+from sphereorient.learn.metrics import Z95, reliability, wilson
 from sphereorient.learn.network import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.report.plots.style import write_figure
 from sphereorient.search import (
@@ -43,13 +44,11 @@ from sphereorient.search import (
     ProposeSettings,
 )
 from sphereorient.search.candidates import resized
-from sphereorient.sphere.texture import map_directions
-from sphereorient.statistics.reliability import Z95, reliability, wilson
+from sphereorient.sphere.texture import map_directions, random_directions
 from sphereorient.synth import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings, film_disks
 from sphereorient.synth.severities import severity
-from sphereorient.synth.textures import random_directions
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 BEGIN, END = "<!-- table: scripts/bench_proposer.py -->", "<!-- end of the table -->"

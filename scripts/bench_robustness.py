@@ -22,8 +22,8 @@ from sphereorient.bench.results import WRONG_DEG, ResultSummary, save_results, s
 from sphereorient.bench.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.cli.app import progress_bar
 from sphereorient.files.whole_file import writing
+from sphereorient.learn.metrics import reliability
 from sphereorient.report.plots.style import write_figure
-from sphereorient.statistics.reliability import reliability
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 BEGIN, END = "<!-- table: scripts/bench_robustness.py -->", "<!-- end of the table -->"

@@ -24,7 +24,7 @@ from torch import Tensor
 from sphereorient import locate, so3
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.recording import open_recording
-from sphereorient.locate import find_scene, screened_frames
+from sphereorient.locate import find_scenes, screened_frames
 from sphereorient.methods.settings import Settings
 from sphereorient.search import GreySearch, GreySearchSettings, crop_disk
 from sphereorient.sphere import orthographic_view
@@ -102,7 +102,7 @@ def on_experiment(folder: Path) -> None:
         with h5py.File(folder / "truth.h5") as truth:
             R_lab_body = torch.from_numpy(truth["orientation"][:])
         for stream in recording.streams:
-            scene = find_scene(recording, stream, whole.locate.background_frames, whole.locate)
+            (scene,) = find_scenes(recording, stream, whole.locate.background_frames, whole.locate).values()
             background, diameter_px = scene.background, scene.diameter_px
             disks, R_view_body = [], []
             for k, shot in zip(recording.frames, screened_frames(stream, background), strict=True):

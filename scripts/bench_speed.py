@@ -32,9 +32,10 @@ import yaml
 
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.cache import WITHOUT as WITHOUT_CACHE
 from sphereorient.files.compiled import WITHOUT
+from sphereorient.files.threads import silent
 from sphereorient.follow import Appearance, Tracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.ball import BallTracker
@@ -46,7 +47,7 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.paint import open_views
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import kalman
-from sphereorient.motion.matern import Prior
+from sphereorient.motion.kalman import Prior
 from sphereorient.motion.path import RotationTrack, rotation_of
 from sphereorient.movies import write_ffv1
 from sphereorient.pose import CameraView, base_table, compiled

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera
-from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.recording import open_recording, spread_frames
+from sphereorient.files.threads import silent
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Background, Frame

@@ -16,7 +16,7 @@ import numpy as np
 
 from sphereorient import locate
 from sphereorient.experiment import load_experiment, open_movies
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.recording import spread_frames
 from sphereorient.locate import Background, LocateSettings
 from sphereorient.movies import Movie
 

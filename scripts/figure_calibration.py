@@ -22,7 +22,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration import DotPlate, calibrate_cameras
-from sphereorient.calibration.table import summary
+from sphereorient.calibration.calibrated import summary
 from sphereorient.cameras import Port, PortCamera, TsaiCamera, triangulate
 from sphereorient.files.whole_file import writing
 from sphereorient.report import calibration_figure

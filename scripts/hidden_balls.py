@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from sphereorient import so3
-from sphereorient.bench.score import hidden_shares
 from sphereorient.experiment import load_experiment
+from sphereorient.synth.scene import hidden_shares
 from sphereorient.trajectory import Flag, Tracks
 
 DOUBT = Flag.IDENTITY | Flag.CONTRADICTION | Flag.ONE_CAMERA | Flag.POSITION_INTERPOLATED
@@ -36,7 +36,7 @@ def main() -> None:
         truth = {
             name: {key: file[f"spheres/{name}/{key}"][()] for key in ("position", "orientation")} for name in radii
         }
-    shares = hidden_shares(given.truth, experiment.cameras, radii)
+    shares = hidden_shares({name: parts["position"] for name, parts in truth.items()}, experiment.cameras, radii)
     print("ball  hidden frames  valid, no flag  error (95 %)")
     for name, track in tracks.items():
         # Balls that look alike may have each other's names: the truth that lies nearest is meant.

@@ -25,7 +25,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.assemble import PathLayer, PathSettings
 from sphereorient.assemble.second_order_cost import PARAMETERS
-from sphereorient.statistics.reliability import reliability
+from sphereorient.learn.metrics import reliability
 from sphereorient.synth.motion import random_motion
 
 RATE_HZ = 600.0

@@ -21,7 +21,8 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.bench.scenes import CLEAN, BenchmarkScene, write_scene
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.recording import Recording, open_recording, silent
+from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.files.threads import silent
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.follower import sample_frames
 from sphereorient.methods.method import Job

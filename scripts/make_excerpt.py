@@ -20,7 +20,7 @@ import numpy as np
 
 from sphereorient import locate
 from sphereorient.experiment import load_experiment, open_movies
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.recording import spread_frames
 from sphereorient.files.whole_file import writing
 from sphereorient.locate import LocateSettings
 from sphereorient.movies import write_ffv1

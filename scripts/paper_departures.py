@@ -32,7 +32,7 @@ from sphereorient.methods.settings import load_settings
 from sphereorient.motion import measure
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies
-from sphereorient.search import extraction, template_bank
+from sphereorient.search import template_bank
 from sphereorient.trajectory import Trajectory
 
 STAGES = ("locate_sphere", "propose_orientations")
@@ -51,12 +51,12 @@ def plain_mean(pictures: np.ndarray, *rest: Any, learn: Callable[..., Any] = sce
 
 def majority(disks: Tensor, inside: Tensor, settings: Any) -> Tensor:
     """Paint by two of Otsu's three votes instead of all three."""
-    grey = extraction.stretch_contrast(disks, inside, settings.black_share, settings.white_share)
-    one_hot = extraction._one_hot(grey, inside)
-    threshold, _ = extraction.otsu(one_hot.sum((-2, -1)))
+    grey = template_bank.stretch_contrast(disks, inside, settings.black_share, settings.white_share)
+    one_hot = template_bank._one_hot(grey, inside)
+    threshold, _ = template_bank.otsu(one_hot.sum((-2, -1)))
     votes = [grey > threshold[:, None, None]]
     for share in settings.regions:
-        votes.append(grey > extraction._moving_threshold(one_hot, threshold, share, settings.region_contrast_min))
+        votes.append(grey > template_bank._moving_threshold(one_hot, threshold, share, settings.region_contrast_min))
     return torch.where(sum(vote.int() for vote in votes) >= 2, 1.0, -1.0) * inside
 
 

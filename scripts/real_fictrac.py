@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.mapping import LearntMap, fit_map, take_crops
 from sphereorient.mapping.chain import find_chain
 from sphereorient.mapping.disks import disks_of

@@ -21,7 +21,7 @@ from sphereorient.bench.results import WRONG_DEG
 from sphereorient.bench.run import CACHE, KEPT, kept_results, limit_threads, run_scene, trackers_of
 from sphereorient.bench.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.cli.app import progress_bar
-from sphereorient.statistics.reliability import reliability
+from sphereorient.learn.metrics import reliability
 from sphereorient.synth.severities import LEVELS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -1,9 +1,9 @@
-"""All errors that sphereorient raises on purpose, and why a picture gives no orientation, which is no error.
+"""All errors that sphereorient raises on purpose, and what a track says of its frames (no errors): reasons and flags.
 
 Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
 """
 
-from enum import StrEnum
+from enum import IntFlag, StrEnum
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -76,6 +76,22 @@ class Reason(StrEnum):
     HIDDEN = "hidden"  # another sphere covers it
     UNDECODABLE = "undecodable"
     MISSING = "missing"
+
+
+class Flag(IntFlag):
+    """What is special about a frame: bits of the dataset `flags`."""
+
+    POSITION_INTERPOLATED = 1
+    POSITION_OUTLIER_REPLACED = 2
+    ONE_CAMERA = 4
+    REPAIRED_FROM_OTHER_CAMERA = 8
+    AMBIGUOUS = 16
+    DOUBTFUL_FIT = 32
+    RECOVERED = 64
+    SPIKE = 128
+    EXTRAPOLATED = 256
+    CONTRADICTION = 512
+    IDENTITY = 1024  # of several spheres: it may be another one, see the dataset `identity`
 
 
 def refusal(name: str, *, expected: str, got: str, do: str) -> str:

@@ -13,7 +13,7 @@ from sphereorient import PathLayer, PoseFitter, SphereRenderer, TemplateBank, so
 from sphereorient.cameras import PinholeCamera
 from sphereorient.errors import SphereOrientError
 from sphereorient.search import OrientSettings
-from sphereorient.synth.textures import random_texture
+from sphereorient.sphere.texture import random_texture
 
 TEXTURE = random_texture("patches", seed=3, height=32)
 CAMERA = PinholeCamera(

@@ -12,7 +12,7 @@ import torch
 
 from sphereorient import PathLayer, PoseFitter, SphereRenderer, TemplateBank, so3
 from sphereorient.cameras import PinholeCamera
-from sphereorient.synth.textures import random_texture
+from sphereorient.synth import random_texture
 
 texture = random_texture("patches", seed=3)
 turn = torch.tensor([0.4, -0.9, 0.2], dtype=torch.float64)

@@ -18,9 +18,9 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 NOT_YET, LOST = -1, -2  # in place of the frame of the last orientation
-SMALL = 1e-12
+SMALL = 1e-12  # rad; keeps quotients of rotations by nothing finite
 BEAM_NATS = 30.0  # more than a break and a new beginning cost
-STATES_MAX = 256
+STATES_MAX = 256  # histories kept of each frame, at most: bounds time and memory
 STUCK_FRAMES = 3  # a stuck candidate may be absent for this many frames, less one
 PIN_NATS = 6.0  # least gain of following the motion in every frame of a run without search
 PIN_ALONE_NATS = 12.0  # by which every other candidate of such a frame costs more

@@ -12,14 +12,13 @@ from sphereorient.assemble.beam import BeamSearch, CandidateRows, Histories, Int
 from sphereorient.assemble.second_order_cost import Floats, SecondOrderCost
 from sphereorient.assemble.segments import flags_where, number_segments
 from sphereorient.assemble.settings import PathSettings
-from sphereorient.trajectory import Flag
+from sphereorient.errors import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
 LINKS_MIN = 8  # fewer do not determine an acceleration
-ROUNDS_MAX = 4
 ROUND_ENOUGH = 0.3  # a scale that changes by less, as a logarithm, changes no choice
 START_DEG = (0.1, 0.5, 2.0)  # changes of the rotation from frame to frame, one of which is near enough to begin with
-CHANGE_MAX_DEG = 10.0
+CHANGE_MAX_DEG = 10.0  # of the rotation from frame to frame: the largest acceleration that is tried
 SAMPLES, SAMPLE_FRAMES = 3, 100  # parts of the movie from which the start is chosen
 FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration is not seen in one frame interval
 
@@ -124,7 +123,7 @@ def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) 
         return BeamSearch(rows, cost, gap).run(), cost
     cost = _start(rows, cost, gap)
     histories = BeamSearch(rows, cost, gap).run()
-    for _ in range(ROUNDS_MAX):
+    for _ in range(4):  # at most
         scale = _acceleration(rows, [(rows, histories)], cost)
         if abs(math.log(scale / cost.acceleration_rad_s2)) < ROUND_ENOUGH:
             break

@@ -8,9 +8,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble.settings import AssembleSettings
-from sphereorient.trajectory import Flag
-
-DEVIATIONS_PER_MAD = 1.4826  # of a normal distribution
+from sphereorient.errors import Flag
 
 
 def links(R_lab_body: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,7 +39,7 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """
     windows = moving(xi, settings.spike_window_frames)
     usual = windows.nanmedian(-1, keepdim=True).values
-    deviation = DEVIATIONS_PER_MAD * (windows - usual).abs().nanmedian(-1).values
+    deviation = 1.4826 * (windows - usual).abs().nanmedian(-1).values  # of a normal distribution
     outstanding = xi > usual[:, 0] + settings.spike_factor * deviation
     return outstanding & (turn > math.radians(settings.spike_min_deg))
 

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from sphereorient import so3
 from sphereorient.bench.score import orientations_at
 from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.page_server import HOST
+from sphereorient.files.threads import Progress, silent
 from sphereorient.live.shared import SharedFrames
 from sphereorient.live.sources import movie_frames
 from sphereorient.report.frame_warnings import distance_deg
@@ -29,7 +30,6 @@ from sphereorient.trajectory.walk import FICTRAC
 BEGIN_S = 120.0  # until the tracker's first line
 QUIET_S = 2.0  # without a line: the end
 FIRST = 50  # lines that do not count: caches fill
-TENTHS = 10
 EVERY = 1000  # lines from one look at the memory to the next
 # Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
 NEIGHBOUR = """
@@ -97,7 +97,7 @@ class Delays:
         words = [f"{came} lines of {self.written} frames, {self.written - came} dropped, {self.lost} without a pose"]
         words.append(f"delay: {middle} ms (median), {slow} ms (99 %), {slowest} ms (99.9 %)")
         if np.isfinite(self.error_deg).any():
-            first, *_, last = (float(np.nanmedian(part)) for part in np.array_split(self.error_deg, TENTHS))
+            first, *_, last = (float(np.nanmedian(part)) for part in np.array_split(self.error_deg, 10))
             worst = float(np.nanmax(self.error_deg))
             said = f"{first:.3f}° in the first tenth (median), {last:.3f}° in the last, {worst:.3f}° at most"
             words.append(f"error of the rotation since the first frame: {said}")

@@ -13,7 +13,7 @@ from sphereorient.errors import BenchError, refusal
 from sphereorient.files.whole_file import write_text
 
 SCHEMA = "sphereorient-robustness/1"
-WRONG_DEG = 10.0
+WRONG_DEG = 10.0  # an error beyond is another orientation: the fit does not converge from there
 FIRST = (1, 3, 10)  # numbers of candidates for the recall
 SIGMAS = 3.0  # a smaller difference, in its own standard deviations, is no change
 LEAST_RATIO = 1.1  # of the median errors; less is no change

@@ -22,10 +22,10 @@ from sphereorient.bench.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneR
 from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.bench.score import (
     given_to_others,
-    hidden_shares,
     named_as_true,
     score_track,
     true_orientations,
+    true_positions,
 )
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.experiment import load_experiment
@@ -35,13 +35,13 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies, with_proposer
+from sphereorient.synth.scene import hidden_shares
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 
 Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]
 PLAN, RESULTS, KEPT, CACHE = "plan.json", "results.json", "scenes", "cache"
 DIGITS = 5
-MOSTLY = 0.5  # share of a disk from which it counts as hidden
 Floats = NDArray[np.float64]
 TRACKERS: dict[str, Tracker] = {
     "precise": partial(track_movies, method="precise"),
@@ -182,10 +182,8 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
             name: measure(tracks[name], truth_path) | dict(zip(("given", "exchanges"), others[name], strict=True))
             for name in balls
         }
-    hidden = dict.fromkeys(balls, np.zeros(1))
-    if len(balls) > 1:
-        radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)
-        hidden = hidden_shares(truth_path, load_experiment(experiment).cameras, radii_mm)
+    radii_mm = dict.fromkeys(balls, scene.base.diameter_mm / 2)
+    hidden = hidden_shares(true_positions(truth_path, balls), load_experiment(experiment).cameras, radii_mm)
     return [
         SceneResult(
             scene=scene.name,
@@ -196,7 +194,7 @@ def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: T
             method=method,
             seconds=round(seconds / len(balls), 2),
             ball=name,
-            hidden=round(float((hidden[name] > MOSTLY).mean()), DIGITS),
+            hidden=round(float((hidden[name] > 0.5).mean()), DIGITS),
             **measured[name],
         )
         for name in balls

@@ -17,10 +17,7 @@ from sphereorient.synth.write import CleanMovie, clean_movie
 
 CLEAN, TOGETHER = "clean", "together"
 SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of an only ball's volume: small, for speed
-VELOCITY_S = 0.12  # correlation time of the velocity
-MM3_PER_LITRE = 1e6
 OF_MOVIES = {"frames", "cameras", "balls", "paints", "volume_mm", "velocity_time"}  # settings that `synth` has too
-MIXED_SEED = 20110  # of the random combinations
 
 
 class BenchSettings(BaseModel, frozen=True, extra="forbid"):
@@ -38,12 +35,12 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
     balls: int = Field(1, ge=1, le=8, description="of each scene")
     paints: int = Field(8, ge=1, le=8, description="of several balls; fewer than balls: some look alike")
     volume_mm: float = Field(VOLUME_MM, gt=0, le=45, description="balls stay within about this distance of the origin")
-    velocity_time: float = Field(VELOCITY_S, gt=0, description="correlation time of the velocity, s; shorter: faster")
+    velocity_time: float = Field(0.12, gt=0, description="correlation time of the velocity, s; shorter: faster")
 
     @property
     def per_litre(self) -> float:
         """Number density of the balls in the sphere of radius `volume_mm`."""
-        return self.balls / (4 / 3 * math.pi * self.volume_mm**3) * MM3_PER_LITRE
+        return self.balls / (4 / 3 * math.pi * self.volume_mm**3) * 1e6
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -104,7 +101,7 @@ def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int
     count = min(settings.at_once, len(settings.degradations))
     for level in settings.levels:
         for number in range(settings.together if count > 1 else 0):
-            rng = np.random.default_rng([MIXED_SEED, seed, level, number])
+            rng = np.random.default_rng([20110, seed, level, number])  # of the random combinations
             drawn = sorted(rng.choice(len(settings.degradations), count, replace=False).tolist())
             yield TOGETHER, level, number, {settings.degradations[k]: level for k in drawn}
 

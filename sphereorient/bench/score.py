@@ -1,6 +1,6 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, centre_lab_mm, sphere_disk_px
 from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.trajectory import Tracks, Trajectory
@@ -25,7 +24,6 @@ ALIGNMENTS = ("none", "body", "both")
 AXES = 3
 ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
 FICTRAC_COLUMNS = 23  # at least; newer versions have more
-POINTS = 41  # across a disk, of which some are hidden
 DO = "pass the truth.h5 of this synthetic experiment"
 
 
@@ -136,27 +134,9 @@ def _distances(tracks: Tracks, truth_path: str | Path) -> dict[str, Floats]:
     return found
 
 
-def hidden_shares(
-    truth_path: str | Path, cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
-) -> dict[str, Floats]:
-    """Return for each sphere of a truth the share of its disk that nearer ones cover, (C, N), all as circles."""
-    truths = {name: _read_truth(truth_path, "position", sphere=name)["position"] for name in radii_mm}
-    places = {name: torch.from_numpy(X) for name, X in truths.items()}
-    across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
-    grid = torch.cartesian_prod(across, across)
-    grid = grid[grid.square().sum(1) < 1]
-    shares: dict[str, list[Floats]] = {name: [] for name in radii_mm}
-    for camera in cameras.values():
-        disks = {name: sphere_disk_px(camera, X, radii_mm[name]) for name, X in places.items()}
-        far_mm = {name: (X - centre_lab_mm(camera)).norm(dim=-1) for name, X in places.items()}
-        for name, (middle, radius) in disks.items():
-            at = middle[:, None] + radius[:, None, None] * grid
-            covered = torch.zeros(at.shape[:2], dtype=torch.bool)
-            for other, (there, size) in disks.items():
-                inside = (at - there[:, None]).norm(dim=-1) < size[:, None]
-                covered |= inside & (far_mm[other] < far_mm[name])[:, None]
-            shares[name].append(covered.double().mean(1).numpy())
-    return {name: np.stack(each) for name, each in shares.items()}
+def true_positions(truth_path: str | Path, names: Iterable[str]) -> dict[str, Floats]:
+    """Return the positions (N, 3), lab, mm, of the spheres of a truth."""
+    return {name: _read_truth(truth_path, "position", sphere=name)["position"] for name in names}
 
 
 def mahalanobis(error: Floats, covariance: Floats) -> Floats:

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from sphereorient.calibration import targets
 from sphereorient.calibration.dots import Dots, as_grey, find_dots
 from sphereorient.calibration.lattice import index_dots
+from sphereorient.calibration.solve import SIGMA_PX
 from sphereorient.calibration.targets import (
     CalibrationTarget,
     Floats,
@@ -19,7 +20,6 @@ from sphereorient.calibration.targets import (
 )
 from sphereorient.errors import refusal
 
-CORNER_SIGMA_PX = 0.05  # of a corner; tests measure 0.03 to 0.07 on drawn boards
 LEAST_CORNERS = 6  # of a ChArUco board: fewer hardly determine a homography
 WINDOW = 0.3  # half a window of the sub-pixel step, in distances to the nearest corner: it holds no other corner
 SHARP = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -53,7 +53,7 @@ def _chessboard(picture: NDArray[np.generic], board: targets.Chessboard, name: s
     index = _seen_from_front(_row_by_row(board.columns, board.rows), uv_px)
     turns = _turns(board.extent)
     dark = [_lower_left_is_dark(grey, quarter_turned(index, int(p[0])) + p[1:], uv_px) for p in turns]
-    view = seen(board, index, uv_px, np.full(len(uv_px), CORNER_SIGMA_PX))
+    view = seen(board, index, uv_px, np.full(len(uv_px), SIGMA_PX))
     return _placed_one_of(turns[dark] if any(dark) else turns, view, board, name)
 
 
@@ -72,7 +72,7 @@ def _charuco(picture: NDArray[np.generic], board: targets.CharucoBoard, name: st
     # OpenCV 4 leaves these half a pixel off. The markers stay outside of the windows.
     clear = min(WINDOW, (1 - board.marker_mm / board.pitch_mm) / 2)
     uv_px = _refined(grey, np.asarray(corners).reshape(-1, 2).astype(np.float64), clear)
-    return seen(board, index, uv_px, np.full(count, CORNER_SIGMA_PX))
+    return seen(board, index, uv_px, np.full(count, SIGMA_PX))
 
 
 def _circles(picture: NDArray[np.generic], grid: targets.CircleGrid, name: str) -> PlateView:

@@ -1,17 +1,21 @@
-"""The result of a calibration, and what contradicts it."""
+"""The result of a calibration, as lines and tables too, and what contradicts it."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from rich.table import Column, Table
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sphereorient.calibration.document import Picture
 from sphereorient.calibration.targets import PlateView
-from sphereorient.cameras import Camera, ParameterCovariance, in_air
+from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, in_air
+from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
 
 NEIGHBOURS = 4  # of a point on the plate
 SHARED = 0.1  # share of the residuals' variance common to neighbours from which it is structure, beside 4 sigma
@@ -118,3 +122,47 @@ def _lens_words(camera: Camera) -> list[str]:
     field = math.degrees(2 * math.atan(longer / 2 / float(lens.focal_px[1])))
     words = [f"the lens's centre lies {off:.0f} px off the picture's"] if off - 3 * unsure > OFF_CENTRE * longer else []
     return words if FIELD_DEG[0] < field < FIELD_DEG[1] else [*words, f"its field of view is {field:.3g} degrees"]
+
+
+def parameters_table(result: Calibrated) -> Table:
+    """Return the parameters of all cameras with their standard deviations."""
+    numbers = (Column(name, justify="right") for name in result.cameras)
+    table = Table("parameter", *numbers, title="parameters (sigma)")
+    values = [_values(camera) for camera in result.cameras.values()]
+    sigmas = [camera.covariance.sigmas if camera.covariance else {} for camera in result.cameras.values()]
+    for name in dict.fromkeys(name for known in values for name in known):
+        of_name = [(known.get(name), sigma.get(name, math.nan)) for known, sigma in zip(values, sigmas, strict=True)]
+        table.add_row(name, *("" if value is None else f"{value:.7g} ({sigma:.2g})" for value, sigma in of_name))
+    return table
+
+
+def _values(camera: Camera) -> dict[str, float]:
+    """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
+    known = () if camera.covariance is None else camera.covariance.names
+    lens = in_air(camera)
+    fields = lens.parameter_fields().items()
+    found: dict[str, Tensor] = {name: getattr(lens, field)[... if k is None else k] for name, (field, k) in fields}
+    found |= dict(zip(TRANSLATION, camera.T_cam_lab_mm, strict=True))
+    if isinstance(camera, PortCamera):
+        found |= {name: getattr(camera.port, field) for name, field in PORT_NUMBERS.items()}
+    return {name: float(value) for name, value in found.items() if name in known or name in TRANSLATION}
+
+
+def pictures_table(result: Calibrated) -> Table:
+    """Return one row for each picture: points, outliers and rms, or why it was not used."""
+    numbers = (Column(name, justify="right") for name in ("points", "outliers", "rms px"))
+    table = Table("pose", "camera", "picture", *numbers, "not used because", title="pictures")
+    for one in sorted(result.pictures, key=lambda one: (one.pose, one.picture.camera)):
+        found = ("", "") if one.reason else (f"{one.lost}", f"{one.rms_px:.3f}")
+        where = str(one.pose), one.picture.camera, one.picture.path.name
+        table.add_row(*where, str(len(one.view)), *found, one.reason)
+    return table
+
+
+def summary(result: Calibrated) -> list[str]:
+    """Return the rms of each camera, the angles between the cameras' axes, and the verdict, one line each."""
+    lines = [f"{name}: rms {result.rms_px(name):.3f} px" for name in result.cameras]
+    for (one, a), (other, b) in combinations(result.cameras.items(), 2):
+        cosine = float(torch.dot(a.R_cam_lab[2], b.R_cam_lab[2]).clamp(-1, 1))
+        lines.append(f"{one} and {other}: axes at {math.degrees(math.acos(cosine)):.2f} degrees")
+    return [*lines, *(f"doubtful: {line}" for line in result.verdict)]

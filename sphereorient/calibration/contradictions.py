@@ -10,11 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.causes import Cause, likely_causes
-from sphereorient.calibration.comparison import Comparison, Gaps, Limits, Seen, limits_of, misfit, typical
+from sphereorient.calibration.comparison import (
+    Cause,
+    Comparison,
+    Gaps,
+    Limits,
+    Seen,
+    likely_causes,
+    limits_of,
+    misfit,
+    typical,
+)
 from sphereorient.cameras import Camera, centre_lab_mm
+from sphereorient.errors import Flag, Reason
 from sphereorient.so3 import hat, log, solve_damped
-from sphereorient.trajectory import Flag, Reason, Trajectory
+from sphereorient.trajectory import Trajectory
 
 FEWEST = 3  # frames from which cameras are judged
 EXPLAINS = 0.3  # a cause leaves at most this share of the misfit

@@ -15,8 +15,8 @@ from sphereorient.calibration.lattice import LEAST_DOTS, find_lattice
 from sphereorient.calibration.plates import Progress, read_plate_picture
 from sphereorient.calibration.targets import Ints
 from sphereorient.cameras.checks import camera_error
-from sphereorient.files.draft import DraftKey
 from sphereorient.files.threads import side_by_side
+from sphereorient.files.yaml_file import DraftKey
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 NUMBERED = re.compile(r"^(?P<camera>.*?)[-_ ]*(?P<pose>\d+)$")

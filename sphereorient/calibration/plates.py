@@ -15,8 +15,9 @@ from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
 from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubts
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
-from sphereorient.calibration.guess import guess_from_points, guess_rig
+from sphereorient.calibration.solve import SIGMA_PX
 from sphereorient.calibration.targets import PlateView, placed
+from sphereorient.calibration.tsai_method import guess_from_points, guess_rig
 from sphereorient.cameras import ParameterCovariance, Port, PortCamera, centre_lab_mm, in_air
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
@@ -27,7 +28,6 @@ from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
 Progress = Callable[[str, int, int], None]
-SIGMA_PX = 0.05  # of points in tables; only ratios matter, because the residuals give the scale
 WALL = 0.3  # of the way from the plates to the camera: where the search for a wall starts
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
 # Sigmas from which a parameter counts as undetermined, by the begin of its name: shares of focal length, distance and

@@ -1,5 +1,6 @@
-"""Check and repair cameras that moved after their calibration, with the tracked sphere."""
+"""Check and repair cameras that moved after their calibration, with the tracked sphere; the results in words."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,8 +19,8 @@ from sphereorient.calibration.solve import inverse_information, least_squares, s
 from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, Rays, load_cameras
 from sphereorient.cameras.checks import camera_error, check_known
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
-from sphereorient.errors import TrackError
-from sphereorient.trajectory import Reason, Tracks, Trajectory
+from sphereorient.errors import Reason, TrackError
+from sphereorient.trajectory import Tracks, Trajectory
 
 OBSERVED = (str(Reason.OK), str(Reason.CONTRADICTS))
 PARTS = ("centre_px", "orientation")  # of a camera in a track
@@ -28,9 +29,9 @@ PRIOR = torch.tensor([0.1] * 3 + [2.0] * 3, dtype=torch.float64)  # sigma of a c
 BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alone: a dark rim shifts its centre
 SHARED = 12  # consecutive frames that share one error of the centre: they have the same light
 HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
-FRAMES_MIN = 20
+FRAMES_MIN = 20  # fewer do not tell displacements from the scatter of frames
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
-ROUNDS = 4
+CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -172,7 +173,7 @@ class _Pair:
     def solved(self) -> tuple[Tensor, Tensor]:
         """Return the motion (6,) and its sigmas from the scatter of frames at the solution."""
         at = torch.zeros(9, dtype=torch.float64)
-        for _ in range(ROUNDS):
+        for _ in range(4):  # scatter and inliers anew
             known = dict(zip(("spread", "kept"), self._scatter(at[:6]), strict=True))
             at = least_squares(partial(self._residuals, **known), partial(self._slopes, **known), at)
         slopes = self._slopes(at, *self._scatter(at[:6]))
@@ -204,3 +205,41 @@ def _with_spread(camera: Camera, known: ParameterCovariance, spread: Tensor) -> 
             k = known.names.index(part)
             matrix[k], matrix[:, k], matrix[k, k] = 0.0, 0.0, sigma**2
     return cast(Camera, replace(cast(Any, camera), covariance=replace(known, matrix=matrix)))
+
+
+def repair_lines(result: Repaired) -> list[str]:
+    """Return the changes of a self-calibration."""
+    gaps = f"{result.gap_before_mm:.4f} mm rms, now {result.gap_after_mm:.4f} mm ({result.frames} frames)"
+    lines = [f"distance between the lines of sight to the sphere: {gaps}"]
+    for name, change in result.moved.items():
+        turn, move = math.degrees(float(change[:3].norm())), float(change[3:].norm())
+        lines.append(f"{name}: rotated by {turn:.3f} degrees, T changed by {move:.2f} mm")
+        for part, value, sigma in zip(MOVED, change.tolist(), result.sigma[name].tolist(), strict=True):
+            lines.append(f"  {part}: {value:+.3g} (sigma {sigma:.2g})")
+    return [*lines, f"not determined by the sphere, kept: {', '.join(result.held)}"]
+
+
+def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
+    """Return how well each pair of cameras fits together."""
+    each = ((check, *check.percentile(50), *check.percentile(95)) for check in checks)
+    return [
+        f"{' and '.join(check.names)}: lines of sight miss each other by {gap:.4f} mm (median), {gap95:.4f} mm (95 %); "
+        f"pictures by {miss:.3f} px, {miss95:.3f} px; {len(check.gap_mm)} frames"
+        for check, gap, miss, gap95, miss95 in each
+    ]
+
+
+def contradiction_lines(track: Trajectory) -> list[str]:
+    """Return advice where the cameras disagree on the sphere's position for most of a movie; else an empty list."""
+    reasons = [camera.reason for camera in track.cameras.values()]
+    seen = sum(all(why in OBSERVED for why in frame) for frame in zip(*reasons, strict=True))
+    contrary = sum(Reason.CONTRADICTS in frame for frame in zip(*reasons, strict=True))
+    if len(reasons) < 2 or contrary <= CONTRARY_SHARE * seen:
+        return []
+    return [
+        f"The cameras contradict each other in {contrary} of the {seen} frames in which both see the sphere: one has "
+        "moved since its calibration, cameras.yaml is of another set-up, or a movie has lost or doubled frames.",
+        "Find out: sphereorient check EXPERIMENT reports movies that are out of step. If they are not, repair the "
+        "cameras: sphereorient calibrate CAMERAS.yaml --refine-with TRACK.h5 --out REPAIRED.yaml, name REPAIRED.yaml "
+        "in experiment.yaml, and track again. If that does not help, take new pictures of the plate.",
+    ]

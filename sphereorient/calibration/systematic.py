@@ -13,9 +13,7 @@ from sphereorient.cameras.parameters import with_parameters
 from sphereorient.trajectory import Trajectory
 
 CAP_RINGS = (0.35, 0.75)  # of the radius: points of the visible cap
-PER_RING = 6
-LIMB_POINTS = 12
-GRAZING_ROUNDS = 4  # each reduces the error by the factor radius over distance
+PER_RING = 6  # points of each of these
 DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position interpolates the smooth effect
 
 
@@ -71,7 +69,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
     towards = normalize(camera.rays(camera.project(positions)).direction_lab, dim=-1)
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(towards @ camera.R_cam_lab.mT)
     cap = torch.cat([_ring(share, PER_RING, k * torch.pi / PER_RING) for k, share in enumerate(CAP_RINGS)])
-    paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (cap, _ring(1.0, LIMB_POINTS)))
+    paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (cap, _ring(1.0, 12)))
     count = len(cap)
     arms = torch.cat([paint, _grazed(camera, positions, limb, radius_mm)], dim=1)
     points = positions[:, None] + arms
@@ -98,7 +96,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
 def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
     """Return arms (N, M, 3), lab, mm, to the tangent points of lines of sight; only these move with the limb."""
     outward = normalize(arms, dim=-1)
-    for _ in range(GRAZING_ROUNDS):
+    for _ in range(4):  # each reduces the error by the factor radius over distance
         along = camera.rays(camera.project(positions[:, None] + arms)).direction_lab
         arms = radius_mm * normalize(outward - (outward * along).sum(-1, keepdim=True) * along, dim=-1)
     return arms
@@ -126,3 +124,22 @@ def with_systematic_errors(
             own = {name: cameras[name] for name in some}
             place[rows], turn[rows] = systematic_errors(own, covariance, position[rows], radius_mm)
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
+
+
+def with_lasting_errors(track: Trajectory, covariance: Tensor, alone: Tensor) -> Trajectory:
+    """Add the errors that all frames share, which no path averages away, to the covariances of the poses.
+    Covariances of delta (rad, lab) and position (mm): (6, 6) by all cameras together, (C, 6, 6) by each alone.
+    """
+    use = torch.from_numpy(track.believed)
+    # Those of each camera are its own: the fewer count, the less of them is averaged away.
+    together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * covariance
+    single = (use.to(torch.float64) @ alone.flatten(1)).reshape(-1, 6, 6)
+    whole = torch.where((use.sum(1) == 1)[:, None, None], single, together).numpy()
+    turn, place = whole[:, :3, :3], whole[:, 3:, 3:]
+    return replace(
+        track,
+        position_cov=track.position_cov + place,
+        position_smooth_cov=track.position_smooth_cov + place,
+        orientation_cov=track.orientation_cov + turn,
+        orientation_smooth_cov=track.orientation_smooth_cov + turn,
+    )

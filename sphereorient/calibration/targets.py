@@ -15,7 +15,7 @@ from sphereorient.files.yaml_file import short
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 MOST = 1000  # columns or rows: arrays of all points are made, and no camera resolves more
-LONGEST_MM = 1e5
+LONGEST_MM = 1e5  # of any length of a plate: 100 m
 FIDUCIALS = ("origin", "+x", "+y")  # their names, in the order of `DotPlate.fiducials`
 
 

@@ -1,21 +1,30 @@
-"""Tsai's calibration of one camera.
+"""Tsai's calibration of one camera, and the first guess of all cameras, from which `bundle` goes on.
 
-Distortion is radial: a pixel and its point have the same direction from the optical axis, taken at the picture's
+Tsai: distortion is radial; a pixel and its point have the same direction from the optical axis, taken at the picture's
 middle. Linear equations give R, T_x, T_y, then f, T_z; a search refines f, T_z, kappa1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
+from sphereorient import so3
+from sphereorient.calibration.bundle import Rig
+from sphereorient.calibration.document import CalibrationDocument
 from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
+from sphereorient.calibration.targets import PlateView
+from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
+from sphereorient.cameras.brown import TsaiCamera
 from sphereorient.cameras.checks import camera_error, check_image_size, check_known, check_positive
+from sphereorient.cameras.io.cameras_yaml import MODELS
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
-from sphereorient.cameras.tsai import TsaiCamera
 from sphereorient.errors import CameraError
 
 FLAT = 3e-3  # relief over width below which the linear stage takes points as a plane
@@ -28,6 +37,9 @@ ALSO = ("sx", "centre_u", "centre_v")
 ADD = "add points"
 Pose = tuple[Tensor, Tensor]  # R (3, 3) or its first two rows, and T (3,), mm, or T_x, T_y
 FREE = ("f", "kappa1", *ROTATION, *TRANSLATION)
+POINTS_MIN = 6  # of a picture that is used
+VIEWS_MIN = 3  # of a camera: two planes do not determine the focal length
+SAME = ("image_size", "R_cam_lab", "T_cam_lab_mm", "centre_px")  # fields of all models
 
 
 def tsai_stages(
@@ -194,3 +206,110 @@ def _check_fit(camera: TsaiCamera, points: Tensor, pixels: Tensor) -> None:
 def _parallel(got: str) -> CameraError:
     do = "tilt the plate by 20 degrees or more, or add points at other depths"
     return camera_error("f", "points at different depths, to separate f from T_z", got, do)
+
+
+def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, PlateView]]) -> Rig:
+    """Return cameras without distortion and plate poses from the tied views of each camera, keyed by row of the pose.
+    T is NaN for a pose without enough points; CameraError for too few pictures or a camera that shares no pose.
+    Source: Zhang 2000 (OpenCV's calibrateCamera).
+    """
+    lenses = {name: _zhang(name, seen, document) for name, seen in views.items()}
+    placed, plate = _chained({name: relative for name, (_, _, relative) in lenses.items()}, document.surveyed)
+    cameras: dict[str, Camera] = {}
+    for name, (f_px, centre_px, _) in lenses.items():
+        R, T = placed[name]
+        pose: dict[str, Any] = {"image_size": document.keys.image_size, "R_cam_lab": R, "T_cam_lab_mm": T}
+        cameras[name] = _camera(document, name, PinholeCamera(f_px=f_px, centre_px=centre_px, **pose))
+    unknown = torch.eye(3, dtype=torch.float64), torch.full((3,), torch.nan, dtype=torch.float64)
+    R_all, T_all = zip(*(plate.get(row, unknown) for row in range(len(document.poses))), strict=True)
+    return Rig(cameras=cameras, R_lab_plate=torch.stack(R_all), T_lab_plate_mm=torch.stack(T_all))
+
+
+def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor, uv_px: Tensor) -> Camera:
+    """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2), by Tsai 1987 (CameraError)."""
+    found = calibrate_tsai(x_lab_mm, uv_px, document.keys.image_size, document.keys.pixel_pitch)
+    same: dict[str, Any] = {name: getattr(found, name) for name in SAME}
+    return _camera(document, name, PinholeCamera(f_px=found.f_mm / document.keys.pixel_pitch[1], **same))
+
+
+def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
+    """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid.
+    The keys of the model tell which focal length it has; distortion begins with their defaults.
+    """
+    port, (pitch_u, pitch_v), kind = document.ports.get(name), document.keys.pixel_pitch, MODELS[document.keys.model]
+    start = start if port is None else _in_air(start, port)
+    fields: dict[str, Any] = {key.field: (key.default,) * len(key.parts) or key.default for key in kind.KEYS}
+    square = any(key.field == "f_px" and key.place is None for key in kind.KEYS)
+    if square and pitch_u != pitch_v:
+        got, do = f"pixel_pitch {pitch_u:g}, {pitch_v:g}", "choose model: tsai or brown"
+        raise camera_error(f"model: {kind.MODEL}", "square pixels", got, do)
+    f_px = start.f_px if square else torch.stack([start.f_px * pitch_v / pitch_u, start.f_px])
+    focal = {"f_px": f_px, "f_mm": start.f_px * pitch_v, "pixel_pitch_mm": (pitch_u, pitch_v)}
+    fields |= {field: value for field, value in focal.items() if field in fields}
+    lens = kind(**fields | {field: getattr(start, field) for field in SAME})
+    return lens if port is None else PortCamera(camera=lens, port=port)
+
+
+def _zhang(
+    name: str, seen: Mapping[int, PlateView], document: CalibrationDocument
+) -> tuple[Tensor, Tensor, dict[int, Pose]]:
+    """Return focal length (px along v), centre (px) and the plate's poses in one camera's frame."""
+    rows = [row for row, view in sorted(seen.items()) if len(view) >= POINTS_MIN]
+    if len(rows) < VIEWS_MIN:
+        got, do = f"{len(rows)}", "take pictures of the plate in more poses, tilted differently"
+        raise camera_error(name, f"{VIEWS_MIN} pictures or more with {POINTS_MIN} points of the plate", got, do)
+    points = [seen[row].points_plate_mm.astype(np.float32) for row in rows]
+    pixels = [seen[row].uv_px.astype(np.float32) for row in rows]
+    (width, height), (pitch_u, pitch_v) = document.keys.image_size, document.keys.pixel_pitch
+    guess = np.array([[pitch_v / pitch_u * 3000.0, 0, width / 2], [0, 3000.0, height / 2], [0, 0, 1]])
+    flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    flags |= cv2.CALIB_FIX_PRINCIPAL_POINT  # hardly improves the guess, and spoils it with a weak set of poses
+    none: Any = None
+    _, K, _, turns, moves = cv2.calibrateCamera(points, pixels, document.keys.image_size, guess, none, flags=flags)
+    turn, move = (torch.from_numpy(np.stack(parts)[..., 0]) for parts in (turns, moves))
+    relative = {row: (so3.exp(turn[k]), move[k]) for k, row in enumerate(rows)}
+    lens = torch.from_numpy(K)
+    return lens[1, 1], lens[:2, 2], relative
+
+
+def _chained(
+    relative: Mapping[str, Mapping[int, Pose]], surveyed: Mapping[int, Pose]
+) -> tuple[dict[str, Pose], dict[int, Pose]]:
+    """Propagate the lab frame from the surveyed poses to cameras, from those to other poses, and so on."""
+    plate, placed = dict(surveyed), dict[str, Pose]()
+    grown = True
+    while grown:
+        grown = False
+        for name, poses in relative.items():
+            known = [row for row in poses if row in plate]
+            if name not in placed and known:
+                (R_cam_plate, T_cam_plate), (R_lab_plate, T_lab_plate) = poses[known[0]], plate[known[0]]
+                R = R_cam_plate @ R_lab_plate.mT
+                placed[name] = R, T_cam_plate - R @ T_lab_plate
+                grown = True
+            if name in placed:
+                R, T = placed[name]
+                for row in set(poses) - set(plate):
+                    plate[row] = R.mT @ poses[row][0], R.mT @ (poses[row][1] - T)
+                    grown = True
+    missing = [name for name in relative if name not in placed]
+    if missing:
+        do = "take a picture of one pose with both cameras, or let each see a surveyed pose"
+        raise camera_error(missing[0], "a picture of a known pose", "none that ties it to the surveyed pose", do)
+    return placed, plate
+
+
+def _in_air(start: PinholeCamera, port: Port) -> PinholeCamera:
+    """Return the camera in air for one in the liquid: small-angle Snell, angles times n, distance to the wall / n."""
+    R, centre, normal, n = start.R_cam_lab, start.centre_lab_mm, port.normal_lab, float(port.n_fluid)
+    height = float(centre @ normal) - float(port.offset_mm)
+    true_height = height / n + float(port.thickness_mm) * (1 - 1 / float(port.n_glass))
+    centre = centre + (true_height - height) * normal
+    axis = R[2]
+    along = axis - (axis @ normal) * normal
+    across = (1 - (n * along).square().sum()).clamp_min(0.1).sqrt() * normal
+    swing = torch.linalg.cross(axis, torch.nn.functional.normalize(n * along - across, dim=0))
+    size = swing.norm()
+    if float(size) > 1e-12:
+        R = R @ so3.exp(swing / size * torch.asin(size.clamp_max(1.0))).mT
+    return replace(start, f_px=start.f_px / n, R_cam_lab=R, T_cam_lab_mm=-(R @ centre))

@@ -1,5 +1,6 @@
 """Cameras: their models and files; projection, lines of sight, triangulation."""
 
+from sphereorient.cameras.brown import TsaiCamera
 from sphereorient.cameras.camera import (
     Camera,
     ParameterCovariance,
@@ -16,4 +17,3 @@ from sphereorient.cameras.camera import (
 from sphereorient.cameras.ideal import PinholeCamera
 from sphereorient.cameras.io.cameras_yaml import add_model, load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.port import Port, PortCamera, in_air
-from sphereorient.cameras.tsai import TsaiCamera

@@ -10,7 +10,6 @@ from sphereorient.cameras.model import CentralCamera, Key
 
 UNIT_TOLERANCE = 1e-3  # of |normal| - 1: three digits are enough to write a normal; its length is not used
 STEPS = 12  # of Newton's method, before those that carry derivatives; 11 suffice up to 89.9 degrees of incidence
-ROUNDS = 40  # of the iteration for cameras without one centre; one is exact for parallel rays
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,7 +175,7 @@ class PortCamera:
         inside = (x_lab_mm @ normal <= self.port.offset_mm.to(x_lab_mm))[..., None]
         apparent = x_lab_mm
         missed = torch.zeros_like(x_lab_mm)
-        for _ in range(ROUNDS):
+        for _ in range(40):  # of the iteration for cameras without one centre; one is exact for parallel rays
             ray = self.rays(self.camera.project(apparent))
             to_go = ((x_lab_mm - ray.origin_lab_mm) @ normal) / (ray.direction_lab @ normal)
             missed = x_lab_mm - ray.origin_lab_mm - to_go[..., None] * ray.direction_lab

@@ -109,7 +109,6 @@ app = Commands(
 )
 
 LINE_S = 60.0  # from one line of a stage to its next, without a terminal
-TABLE = 140  # characters, of a table without a terminal
 SLOWEST = 0.05  # units per second: slower rates are told by the time left
 EXIT_REFUSED = 2  # an error that the user can correct
 NO_MEMORY = re.compile("(not enough|out of|insufficient|n't allocate|not allocate|to allocate) memory|bad_alloc", re.I)
@@ -149,7 +148,8 @@ def print_table(table: Any) -> None:
     from rich.console import Console
 
     console = Console()
-    console.width = console.width if console.is_terminal else max(console.width, TABLE)
+    # Characters, of a table without a terminal.
+    console.width = console.width if console.is_terminal else max(console.width, 140)
     console.print(table)
 
 

@@ -13,9 +13,8 @@ from typer import Argument, Option
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet
 from sphereorient.errors import ExperimentError, SettingsError, SphereOrientError, refusal
-from sphereorient.files.draft import DraftKey, draft_yaml, given, open_keys
 from sphereorient.files.whole_file import check_ending, relative_path, write_text
-from sphereorient.files.yaml_file import read_yaml
+from sphereorient.files.yaml_file import DraftKey, draft_yaml, given, open_keys, read_yaml
 
 if TYPE_CHECKING:
     import numpy as np

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from sphereorient.bench import BenchSettings, Results, Score
 
-PASSING_S = 0.03  # correlation time of the velocity: balls pass before each other in a short movie
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -203,7 +202,8 @@ def balls_curve(given: _BallsOptions) -> None:
     from sphereorient.report.plots.style import write_figure
 
     plain: dict[str, Any] = {"degradations": (), "seeds": tuple(range(given.seeds)), "frames": given.frames}
-    plain |= {"paints": given.paints, "volume_mm": given.volume, "velocity_time": PASSING_S}
+    # Correlation time of the velocity: balls pass before each other in a short movie.
+    plain |= {"paints": given.paints, "volume_mm": given.volume, "velocity_time": 0.03}
     plans = {
         f"{b}-balls-{c}-cameras": read_model(BenchSettings, **plain, balls=b, cameras=c)
         for c in _numbers_in("--cameras", given.cameras)

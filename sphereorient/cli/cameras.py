@@ -50,7 +50,7 @@ def calibrate(
         for line in result.verdict:
             typer.echo(f"doubtful: {line}", err=True)
         return
-    from sphereorient.calibration.table import parameters_table, pictures_table, summary
+    from sphereorient.calibration.calibrated import parameters_table, pictures_table, summary
 
     print_table(pictures_table(result))
     print_table(parameters_table(result))
@@ -59,7 +59,7 @@ def calibrate(
 
 def _repair(cameras: Path, track: Path, out: Path, quiet: bool) -> None:
     from sphereorient.calibration import refine_with_track
-    from sphereorient.calibration.table import repair_lines
+    from sphereorient.calibration.self_calibration import repair_lines
     from sphereorient.cameras import load_cameras, save_cameras
 
     result = refine_with_track(cameras, track)
@@ -79,7 +79,7 @@ def check_cameras_command(
 ) -> None:
     """Report how far the cameras' lines of sight to the sphere miss each other, over a movie."""
     from sphereorient.calibration import check_cameras
-    from sphereorient.calibration.table import check_lines, contradiction_lines
+    from sphereorient.calibration.self_calibration import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
     from sphereorient.run.stages import track_movies
     from sphereorient.trajectory import Tracks

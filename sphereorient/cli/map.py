@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sphereorient.mapping import LearntMap
     from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
-    from sphereorient.tools.wear.series import WearSeries
+    from sphereorient.tools.wear import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
 PAINT_MIN = 0.7  # correlation of held-out pictures below which a map is doubted
@@ -182,7 +182,6 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
     from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.so3 import angle
 
     after, before = (_known_map(path) for path in maps)
     comparison = compare_maps(after, before, turned=turned)
@@ -198,13 +197,15 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
         typer.echo(json.dumps(numbers))
         return
     _print_moved(comparison, f"{maps[0]} against {maps[1]}")
-    typer.echo(f"body frames: {math.degrees(float(angle(R))):.2f}° apart; correlation {comparison.correlation:.3f}")
+    typer.echo(
+        f"body frames: {math.degrees(comparison.angle_rad):.2f}° apart; correlation {comparison.correlation:.3f}"
+    )
     typer.echo(f"texture changed by more than {100 * CHANGED:g} % of black to white: {100 * changed:.1f} % of the map")
 
 
 def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.tools.wear.series import wear_figure, wear_series
+    from sphereorient.tools.wear import wear_figure, wear_series
 
     known = [_known_map(path) for path in maps]
     found = wear_series(known, turned)

@@ -129,7 +129,7 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
 
 def _print_summary(result: "Trajectory", name: str) -> None:
     """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
-    from sphereorient.calibration.table import contradiction_lines
+    from sphereorient.calibration.self_calibration import contradiction_lines
 
     summary = result.summary()
     echo_lines(f"note: {remark}" for remark in result.provenance.get("remarks", []))

@@ -17,7 +17,7 @@ from sphereorient.movies.response import Response
 from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"
-MAX_CAMERAS = 8
+MAX_CAMERAS = 8  # of an experiment: all subsets of them may be tried
 MOVIES_OWN = "movies"  # value of `times`
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 FrameNumber = Annotated[int, Field(ge=0)]

@@ -1,24 +1,162 @@
+"""Experiments with open movies: a camera with its pictures (those of its movie, frame by frame, and the given ones of
+its scene and of what hides the ball), and the recording of all cameras.
+"""
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
 from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths, refused
-from sphereorient.experiment.stream import CameraStream, given_mask
-from sphereorient.experiment.timeline import Rows, Timeline, timeline
+from sphereorient.experiment.timeline import NONE, Rows, Timeline, timeline
+from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
+from sphereorient.files.whole_file import read_whole
+from sphereorient.movies import Grey, Movie, flipped_picture
+from sphereorient.movies.response import Response
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
+Shown = TypeVar("Shown", bound=Grey | OnDemand)
+
+BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a given picture, uncompressed, and of its header
+EVERY = 4  # pixels: faults of whole pictures show in every fourth row and column
+GLARE_SHARE = 0.5  # share of saturated pixels that excludes a picture from the background
 UNKNOWN = 0.5  # grey of texels that are no paint, for searches
 
-Progress = Callable[[str, int, int], None]  # (stage, frames done, all frames); the command line draws a bar
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraStream:
+    """A camera, its movie, and the picture of each frame; made by `open_recording`."""
+
+    name: str
+    camera: Camera
+    movie: Movie
+    rows: NDArray[np.int64]  # (N,), number in the movie, or NONE
+    shown: NDArray[np.bool_] | None = None  # (H, W), False where something hides the sphere; None: nowhere
+    response: Response | None = None  # of the camera; None: not given
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
+        """Yield the pictures of frames first .. last - 1, from the first frame in use, or None, with the reason."""
+        return self._with_reasons(self.movie.readable, first, last)
+
+    def on_demand(
+        self, pool: Executor, first: int = 0, last: int | None = None
+    ) -> Iterator[tuple[Grey | OnDemand | None, Reason]]:
+        """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
+        return self._with_reasons(partial(self.movie.on_demand, pool), first, last)
+
+    def _with_reasons(
+        self, read: Callable[[int, int], Iterator[Shown | None]], first: int, last: int | None
+    ) -> Iterator[tuple[Shown | None, Reason]]:
+        rows = self.rows[first:last]
+        for row, picture in zip(rows.tolist(), _of_rows(read, rows), strict=True):
+            why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
+            yield picture, why if picture is None else Reason.OK
+
+    def spread(self, count: int) -> Grey:
+        """Return at most `count` evenly spread readable pictures, (n, H, W); raise MovieError if there are none."""
+        numbers = self.rows[self.rows != NONE].tolist()
+        wanted = [numbers[k] for k in spread_frames(range(len(numbers)), count)]
+        try:
+            pictures = list(self.movie.sample(wanted))
+        except MovieError:
+            pictures = [picture for picture in _read(self.movie.readable, wanted) if picture is not None]
+        good = [picture for picture in pictures if not (uniform(picture) or _glares(picture))]
+        if not good:
+            got, do = "none (black, white or damaged ones)", "check the movie with `sphereorient movie`"
+            raise MovieError(refusal(str(self.movie.path), expected="readable pictures", got=got, do=do))
+        return np.stack(good)
 
 
-def silent(stage: str, done: int, total: int) -> None:
-    """Report no progress."""
+def spread_frames(frames: range, count: int) -> list[int]:
+    """Return at most `count` evenly spread frame numbers of a range, ends included."""
+    if len(frames) <= count:
+        return list(frames)
+    return [frames[int(i)] for i in np.linspace(0, len(frames) - 1, count).round()]
+
+
+def uniform(picture: Grey) -> bool:
+    """Return whether a picture has only one grey level."""
+    some = picture[::EVERY, ::EVERY]
+    return bool(some.min() == some.max())
+
+
+def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
+    """Yield a movie's pictures by number (N,); None for NONE and undecodable pictures."""
+    return _of_rows(movie.readable, rows)
+
+
+def _of_rows(read: Callable[[int, int], Iterator[Shown | None]], rows: NDArray[np.int64]) -> Iterator[Shown | None]:
+    found = _read(read, rows[rows != NONE].tolist())
+    for row in rows.tolist():
+        yield None if row == NONE else next(found)
+
+
+def _read(read: Callable[[int, int], Iterator[Shown | None]], numbers: Sequence[int]) -> Iterator[Shown | None]:
+    """Yield pictures by number, consecutive ones in one pass."""
+    for run in np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1):
+        if len(run):
+            yield from read(int(run[0]), int(run[-1]) + 1)
+
+
+def _glares(picture: Grey) -> bool:
+    return float(np.mean(picture[::EVERY, ::EVERY] == np.iinfo(picture.dtype).max)) > GLARE_SHARE
+
+
+def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
+    """Return a camera's background, (H, W) grey levels, flipped as its movie; None if not given."""
+    path, flip = experiment.background_paths.get(name), experiment.flip.get(name, "none")
+    return None if path is None else flipped_picture(load_background(path, frame_shape), flip)
+
+
+def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """Return a camera's mask, (H, W), False where the sphere is hidden, flipped as its movie; None if not given."""
+    path, flip = experiment.mask_paths.get(name), experiment.flip.get(name, "none")
+    return None if path is None else flipped_picture(load_mask(path, frame_shape), flip)
+
+
+def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Read a background, (H, W), grey levels; raise ExperimentError unless it is a picture of the movie's size."""
+    do = "save a frame without the ball as PNG, in the movie's own grey levels"
+    return np.asarray(_picture(path, f"background {path}", frame_shape, do), np.float32)
+
+
+def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read a mask, (H, W), True (white) where the sphere is visible, False (black) where something hides it.
+    Raises ExperimentError (missing, not a picture, not of the movie's size, or all black).
+    """
+    name, do = f"mask {path}", "paint what hides the ball black, all else white, on a frame of the movie"
+    picture = _picture(path, name, frame_shape, do)
+    shown = np.asarray(picture > np.iinfo(picture.dtype).max // 2)
+    if not shown.any():
+        raise refused(name, "white where the ball is seen", "black only", do)
+    return shown
+
+
+def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> NDArray[Any]:
+    height, width = frame_shape
+    content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
+    claimed, expected = claimed_pixels(content), f"{width} x {height} px as the movie"
+    if claimed is not None and claimed > height * width:  # before allocating memory
+        raise refused(name, expected, f"{claimed} px", do)
+    picture = None if claimed is None else decoded_grey(content)
+    if picture is None:
+        raise refused(name, "a picture", "a file that cannot be decoded", do)
+    if picture.shape != frame_shape:
+        raise refused(name, expected, f"{picture.shape[1]} x {picture.shape[0]} px", do)
+    return picture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,4 +1,6 @@
-"""Independent pieces on all cores: torch, numpy and compiled code compute without Python's lock."""
+"""Long computations: independent pieces on all cores (torch, numpy and compiled code compute without Python's lock),
+and how much is done.
+"""
 
 import os
 from collections import deque
@@ -9,8 +11,13 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Progress = Callable[[str, int, int], None]  # (stage, steps done, all steps); the command line draws a bar
 MOST = 8  # pieces in memory
 _limit: list[int] = []  # of this process: that of a worker, which shares the machine with others
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report no progress."""
 
 
 def cores() -> int:

@@ -14,6 +14,7 @@ from sphereorient.errors import OutputError, SphereOrientError, error_words, ref
 
 TEXT_BYTES = 1_000_000  # of a text file written by hand: a hundred times the usual size
 TABLE_BYTES = 5_000_000  # of a table of points: 100,000 of them
+LARGEST_RATIO = 1200  # compression ratio of content of one value; a file that claims more does not hold it
 ROOM = "choose a folder that exists, may be written and has room"
 MARK = "made by sphereorient"  # of files that a later run may replace
 HEAD_BYTES = 512  # of a file, where the mark is

@@ -1,5 +1,5 @@
 """Along time: appearance, search without history, chunks of frames, one tracker for all balls."""
 
 from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import Tracker
+from sphereorient.pose.poses import Poses

@@ -18,13 +18,12 @@ from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.chunk import Ahead, Chunk, Expected
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
-from sphereorient.follow.poses import Poses, no_pose, poses_of, supported
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
 from sphereorient.pose.fitter import DisksPx, Fitter, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 
 Floats = NDArray[np.float64]
 
@@ -130,7 +129,7 @@ class BallTracker:
         place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
         return replace(pose, position_lab_mm=place, place_spread=spread)
 
-    def stated(self, poses: Poses) -> Poses:
+    def _stated(self, poses: Poses) -> Poses:
         """Return poses with the errors of a fixed centre."""
         return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
@@ -159,7 +158,8 @@ class BallTracker:
             )
         ]
         poses = [
-            poses_of(fit, slice(n, n + 1), found.use[n], reasons[n]) if found.good[n] else None for n in range(asked)
+            self._stated(poses_of(fit, slice(n, n + 1), found.use[n], reasons[n])) if found.good[n] else None
+            for n in range(asked)
         ]
         for n in torch.nonzero(there.beyond[:asked])[:, 0].tolist():
             (poses[n],) = self._wider(float(there.disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
@@ -351,6 +351,9 @@ class BallTracker:
 
     def searched(self, shots: Sequence[Frame]) -> Poses:
         """Find the poses of a frame without history, with those cameras whose pictures support them."""
+        return self._stated(self._searched(shots))
+
+    def _searched(self, shots: Sequence[Frame]) -> Poses:
         poses = self.search.poses(shots)
         if not len(poses):
             return poses

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import Reason
-from sphereorient.follow.poses import Poses, supported
 from sphereorient.pose.neighbours import Neighbours
+from sphereorient.pose.poses import Poses, supported
 
 Floats = NDArray[np.float64]
 

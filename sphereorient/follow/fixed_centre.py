@@ -9,11 +9,10 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import best_poses
 from sphereorient.locate import Frame
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, PoseStart, best_poses
 from sphereorient.pose.residuals import EDGE_PX
 
 ROUNDS = 10  # of robust weights

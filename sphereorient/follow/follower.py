@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.errors import Reason
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.recording import Recording, spread_frames
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.ball import OWN, BallTracker
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.locate.outline import Outline
 from sphereorient.pose import CameraView
+from sphereorient.pose.poses import Poses, no_pose
 
 MOST, KEPT = 8, 2  # times the frames that are wanted: looked at, and kept
 SHOWN = 0.75  # of the frames that are wanted, in which each camera is to show the ball

@@ -15,12 +15,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import Reason
-from sphereorient.follow.poses import Poses, no_pose, poses_of
 from sphereorient.locate import Found, Frame, LocateSettings, Positions, ball_at, find_positions, sightings_of
 from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
 from sphereorient.pose.camera_view import CameraView, Picture
 from sphereorient.pose.fitter import Fitter
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of
 from sphereorient.search.candidates import Proposer
 from sphereorient.search.normalisation import crop_disk
 

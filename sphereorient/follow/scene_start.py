@@ -14,12 +14,13 @@ from sphereorient.cameras import Camera, sphere_disk_px
 from sphereorient.errors import Reason
 from sphereorient.follow.chunk import Ahead
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.locate import Frame, Match, assigned, find_disks, match_disks, places_of
 from sphereorient.locate.outline import Outline
+from sphereorient.pose.poses import Poses, no_pose
 
 Floats = NDArray[np.float64]
 Kind = tuple[float, ...]  # the same for balls that are alike
+SceneFound = Mapping[str, Poses]  # of each ball in one frame
 
 EXPLAINED = 0.35  # of the radius: a disk whose middle is that near to a known ball is its own
 PATCHES = 40.0  # of paint on a disk that say something of their own

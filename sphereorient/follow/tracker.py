@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.errors import Reason
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
-from sphereorient.follow.poses import Poses, no_pose, supported
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.trajectory import Reason
+from sphereorient.pose.poses import Poses, no_pose, supported
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 
@@ -127,7 +127,7 @@ class Tracker:
                             chunk.forget()
                     elif poses is not None:
                         lost[name, number] = was
-                        found[number] |= {name: tracker.stated(poses)}
+                        found[number] |= {name: poses}
                 own = [chunks[name][n] for n in now]
                 here = [found[number][name] for number in numbers]
                 for chunk, number, one, turn in zip(own, numbers, here, tracker.turns(own, here), strict=True):
@@ -156,18 +156,19 @@ class Tracker:
             ]
             again = self._followed(ahead, at, frames, rough)
             found = [again[n] if unsure else row for n, (unsure, row) in enumerate(zip(rough, found, strict=True))]
+        done = [{name: poses for name, poses in row.items() if poses is not None} for row in found]
+        if all(len(row) == len(self.balls) for row in done):
+            return done
         past = [
             {
                 name: before
-                for name, poses in row.items()
-                if poses is None and (before := chunks[name][n].extrapolated(chunks[name][n].first + k)) is not None
+                for name, of_ball in chunks.items()
+                if name not in row and (before := of_ball[n].extrapolated(of_ball[n].first + k)) is not None
             }
-            for n, row in enumerate(found)
+            for n, row in enumerate(done)
         ]
         rests = [all(of_ball[n].rests(of_ball[n].first + k) for of_ball in chunks.values()) for n in range(len(frames))]
-        rows = list(zip(found, known, frames, past, rests, strict=True))
-        whole = all(poses is not None for row in found for poses in row.values())
-        return [*map(self._completed, rows)] if whole else list(side_by_side(self._completed, rows))
+        return list(side_by_side(self._completed, zip(done, known, frames, past, rests, strict=True)))
 
     def _followed(
         self,
@@ -187,24 +188,23 @@ class Tracker:
 
     def _completed(
         self,
-        frame: tuple[Mapping[str, Poses | None], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead], bool],
+        frame: tuple[dict[str, Poses], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead], bool],
     ) -> dict[str, Poses]:
         """Return the poses of all balls of a frame: those followed, and those that a search finds unless it rests."""
-        followed, known, shots, past, rests = frame
+        done, known, shots, past, rests = frame
         if rests:
             reason = [Reason.NOT_FOUND if shot.readable else shot.read for shot in shots]
             return dict.fromkeys(self.balls, no_pose(len(shots), reason))
-        done = {name: poses for name, poses in followed.items() if poses is not None}
         lost = [name for name in self.balls if name not in done]
         if not lost:
-            return {name: self.balls[name].stated(poses) for name, poses in done.items()}
+            return done
         places = {name: _found_place(poses, known.get(name)) for name, poses in done.items()}
         there = self.start(shots, lost, {name: place.position_lab_mm for name, place in places.items()}, past)
         places |= {name: _found_place(poses, None) for name, poses in there.items() if len(poses)}
         for name in lost:
             among = self._among(name, places) if len(there[name]) else None
             done[name] = there[name] if among is None else self.balls[name].looked_past(there[name], shots, among)
-        return {name: self.balls[name].stated(done[name]) for name in self.balls}
+        return {name: done[name] for name in self.balls}
 
     def _among(self, name: str, places: Mapping[str, _Place]) -> Neighbours | None:
         """Return the neighbours of one ball in one frame; None where there are none."""

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from sphereorient import so3
 from sphereorient.errors import Reason
 from sphereorient.learn.settings import NetworkSettings
-from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
+from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import rim_share
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -23,7 +23,6 @@ SEARCHED = 48  # likeliest grid points among which modes are searched
 APART_DEG = 25.0  # nearer modes are suppressed by a better one
 AROUND_DEG = 22.0  # grid points whose mean is the mode
 # Disks at once, padded: the last bits of a product depend on its number of rows, a disk's result must not.
-BATCH = 32
 CANDIDATES = 8
 PROBABILITY_MIN = 1e-5  # of a candidate
 DEFAULT_CHECKPOINT = Path(__file__).with_name("proposer.ckpt")

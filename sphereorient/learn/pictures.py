@@ -12,11 +12,12 @@ from sphereorient import so3
 from sphereorient.learn.network import map_blurs
 from sphereorient.learn.settings import PictureSettings
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.texture import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn
 from sphereorient.synth.disks import film_disks
 from sphereorient.synth.severities import DEGRADATIONS, LEVELS
-from sphereorient.synth.textures import random_texture
 
+MAPS = 24  # that no training sees, of a validation or a benchmark
 VALIDATION_SEED = 1 << 20  # of the first validation map; training maps begin at 0
 BLUR_BATCH = 64  # maps blurred at once
 

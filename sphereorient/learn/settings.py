@@ -3,8 +3,8 @@ from typing import Self
 from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.sphere.texture import KINDS
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings
-from sphereorient.synth.textures import KINDS
 
 
 class NetworkSettings(BaseModel, frozen=True, extra="forbid"):

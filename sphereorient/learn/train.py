@@ -21,20 +21,19 @@ from torch.utils.data import DataLoader
 
 from sphereorient import __version__
 from sphereorient.errors import CheckpointError, SettingsError, refusal
-from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import make_folder, put_aside, writing
 from sphereorient.learn import metrics
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
 from sphereorient.learn.metrics import WITHIN_DEG, Metrics, Predictions
 from sphereorient.learn.network import Correlator, find_modes, first_right
-from sphereorient.learn.pictures import VALIDATION_SEED, TrainingBatch, draw_batch, generator_of, make_textures
+from sphereorient.learn.pictures import MAPS, VALIDATION_SEED, TrainingBatch, draw_batch, generator_of, make_textures
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.sphere import load_texture
 
 CHECKPOINT = "proposer.ckpt"
 LENGTH = ("epochs", "minutes", "patience")  # may change when training is resumed
 LAST = "last.ckpt"
-VALIDATION_MAPS = 24
 TRAINING, VALIDATION = 0, 1  # random streams: no picture occurs in both
 VALIDATION_SHAPE = 1, 2, 8  # of a validation batch: maps, groups of each, pictures of a group
 WARM_UP_STEPS = 100  # of the learning rate; at most a tenth of all steps
@@ -50,7 +49,7 @@ class TrainingData(LightningDataModule):
         pictures, nodes = settings.pictures, settings.network.nodes
         self._settings = settings
         self.textures = make_textures(pictures, nodes, count=pictures.textures, first_seed=0)
-        unseen = make_textures(pictures, nodes, count=VALIDATION_MAPS, first_seed=VALIDATION_SEED)
+        unseen = make_textures(pictures, nodes, count=MAPS, first_seed=VALIDATION_SEED)
         rng = generator_of(settings.training.seed, VALIDATION)
         count = -(-pictures.validation // math.prod(VALIDATION_SHAPE))
         self.validation = [draw_batch(unseen, pictures, rng, VALIDATION_SHAPE) for _ in range(count)]

@@ -10,7 +10,7 @@ from threading import Condition, Thread
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream
 
 Picture = NDArray[np.generic]
 Tell = Callable[[str], object]  # gets what is wrong, in one line

@@ -23,18 +23,18 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.online import OnlineTracker
-from sphereorient.follow.poses import Poses, supported
+from sphereorient.live.live import OnlineTracker
 from sphereorient.locate import Frame
+from sphereorient.mapping.chain import RelativeTracker
 from sphereorient.mapping.disks import Crop, Crops, cut_out
 from sphereorient.mapping.grid import ROUGH_SIDE, map_table
 from sphereorient.mapping.growing import GrowingMap, LiveMap
-from sphereorient.mapping.relative import RelativeTracker
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, widest_px
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.lasting import Lasting
+from sphereorient.pose.poses import Poses, supported
 
 HANDED_RAD = 0.025  # turn from one frame that is handed over to the next
 HANDED = 400  # frames that are handed over at most; the ball has shown its sides by then

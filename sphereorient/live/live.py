@@ -10,14 +10,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import Reason
-from sphereorient.follow import Appearance
-from sphereorient.follow.poses import Poses, supported
+from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.ball import BallTracker
+from sphereorient.follow.chunk import Chunk
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
 from sphereorient.methods.results import fit_flags, missed_by
 from sphereorient.pose import CameraView
+from sphereorient.pose.poses import Poses, supported
 
 Floats = NDArray[np.float64]
+
+
+class OnlineTracker:
+    """Follows frames one after the other, none ahead: each from those before it, else from a search without history.
+    `tracker` has one chunk at a time (setting `refine.chunks`). Memory does not grow.
+    """
+
+    number = 1  # of the map in use; 0: none yet
+
+    def __init__(self, tracker: BallTracker, appearance: Appearance) -> None:
+        self.appearance = appearance
+        self._tracker = tracker
+        self._time_s: dict[int, float] = {}  # of the last frames
+        self._chunk = Chunk(0, 0, self._time_s)
+        self._number = 0
+        self._last: Poses | None = None  # of the last frame, before it is remembered
+
+    def resume(self, seen: Sequence[tuple[float, Poses]]) -> None:
+        """Take the poses of the last frames, with their times, s, from who followed the ball before."""
+        for time_s, poses in seen:
+            self._time_s[self._number] = time_s
+            self._last = poses
+            self.between()
+
+    def followed(self, time_s: float, shots: Sequence[Frame]) -> Poses | None:
+        """Return the poses of the frame of a time as the frames before predict them; None where they say nothing of it,
+        or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
+        """
+        self.between()
+        if not time_s > self._time_s.get(self._number - 1, -math.inf):
+            self._chunk.forget()
+        self._time_s[self._number] = time_s
+        ahead = self._tracker.ahead(self._chunk, self._number)
+        if ahead is not None:
+            (self._last,) = self._tracker.follow([ahead], [shots])
+        return self._last
+
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the poses of the frame of a time, and whether they were searched for; see `followed`."""
+        followed = self.followed(time_s, shots)
+        if followed is not None:
+            return followed, False
+        poses = self._tracker.searched(shots)
+        self._chunk.forget()  # what was before says nothing of the motion from here
+        self._last = poses
+        return poses, True
+
+    def between(self) -> None:
+        """Remember the last frame: what can wait until it was told."""
+        if self._last is not None:
+            turn = self._tracker.turns([self._chunk], [self._last])[0]
+            self._chunk.saw(self._number, self._last, turn)
+            self._number += 1
+            self._time_s.pop(self._number - 4, None)
+            self._last = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

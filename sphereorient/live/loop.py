@@ -11,21 +11,19 @@ import torch
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment
-from sphereorient.experiment.recording import Recording, open_recording, silent
+from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.files.threads import silent
 from sphereorient.files.whole_file import writing
-from sphereorient.follow.online import OnlineTracker
 from sphereorient.live.feed import Feed, Tell
 from sphereorient.live.lines import FicTracLines, JsonLines, Told
-from sphereorient.live.live import LiveTracker, measured
-from sphereorient.live.monitor import Monitor
+from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
-from sphereorient.live.page import LivePage
+from sphereorient.live.page import LivePage, Monitor
 from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
 
-SWITCH_S = 0.0002  # longest that a thread that computes holds up the one that reads
 MAP = "texture.png"  # beside the experiment, where that names none
 
 
@@ -106,7 +104,7 @@ def run_live(
     table, json_lines = FicTracLines(views[0].camera.R_cam_lab.numpy()), JsonLines(recording.experiment.fixed)
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
-    sys.setswitchinterval(SWITCH_S)
+    sys.setswitchinterval(0.0002)  # longest that a thread that computes holds up the one that reads
     feed = Feed(source.frames(recording), most=64, wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
     if page is not None:

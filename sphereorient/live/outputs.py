@@ -20,7 +20,6 @@ from sphereorient.live.track import TrackBlocks
 from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
-MOST_ROWS = 100_000  # likewise, for a disk: minutes
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
 BLOCK_S = 0.5  # from one write of a track's rows to the next
 
@@ -213,7 +212,7 @@ class FileOutput(Output):
         check_new(path)
         self._path, self._tell = path, tell
         self._file: IO[bytes] | None = None
-        self._spool = Spool(self._write, lambda error: tell(no_room(path, error)), MOST_ROWS, pause_s)
+        self._spool = Spool(self._write, lambda error: tell(no_room(path, error)), 100_000, pause_s)  # minutes
 
     def send(self, thing: Any) -> None:
         """Take a line."""

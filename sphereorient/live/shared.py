@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream
 from sphereorient.live.feed import Arrival, FrameBytes
 
 MAGIC = b"SPHEREO1"
 SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # places of the numbers behind MAGIC
 HEAD = 5  # words of 8 bytes
-WORD = 8
+WORD = 8  # bytes
 REPLACED_S = 0.5  # between looks for another ring
 NEXT_S = 0.0002  # between looks for a new frame
 # No look before this share of the usual interval has passed: each holds up the thread that computes. From one frame to

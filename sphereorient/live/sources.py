@@ -15,14 +15,12 @@ import cv2
 import numpy as np
 
 from sphereorient.errors import MovieError, SettingsError, error_words, refusal
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.picture import luma
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
 from sphereorient.live.shared import shared_frames
 
 AGAIN_S = 1.0  # between attempts to open a camera
-WAIT_S = 1.0  # of one call of a GenICam driver; a camera that waits for its trigger is asked again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +98,8 @@ def genicam_pictures(where: str) -> Iterator[Picture]:
                 camera.start()
                 while True:
                     try:
-                        buffer = camera.fetch(timeout=WAIT_S)
+                        # Of one call of a GenICam driver; a camera that waits for its trigger is asked again.
+                        buffer = camera.fetch(timeout=1.0)
                     except TimeoutException:
                         continue
                     with buffer:  # its memory is the driver's again behind this

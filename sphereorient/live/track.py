@@ -6,16 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from sphereorient.calibration.systematic import with_systematic_errors
+from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import input_files
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
-from sphereorient.follow.poses import Poses, no_pose, pose_table
 from sphereorient.live.live import LiveTracker, Measured
-from sphereorient.methods.results import measured_track
+from sphereorient.methods.results import measured_track, with_errors
 from sphereorient.methods.settings import Settings, settings_yaml
-from sphereorient.pose.lasting import with_lasting_errors
-from sphereorient.trajectory import Flag, Reason, Trajectory
+from sphereorient.pose.poses import Poses, no_pose, pose_table
+from sphereorient.trajectory import Trajectory
 
 MOST_MISSING = 100_000  # frames between two that are written as missing
 REMARK = "measured frame by frame by `sphereorient live`: no smoother ran, so no smooth poses and no velocities"
@@ -77,7 +76,6 @@ class TrackBlocks:
         clock = torch.tensor(time_s, dtype=torch.float64)
         learnt = self.tracker.appearance
         track = measured_track(experiment, clock, table, choice, learnt)
-        track = with_systematic_errors(track, cameras, self.recording.covariance, experiment.radius_mm)
-        track = with_lasting_errors(track, learnt.lasting)
+        track, _ = with_errors(track, self.recording, learnt.lasting, compared=False)
         segment, flags = np.array(marks, np.int64).T
         return replace(track, segment=segment, flags=track.flags | flags.astype(np.uint32))

@@ -2,12 +2,10 @@
 
 from sphereorient.locate.background import Background, Frame, screened, screened_frames
 from sphereorient.locate.disks import find_disks
-from sphereorient.locate.matching import Match, assigned, match_disks, places_of
-from sphereorient.locate.position import Positions, find_positions
+from sphereorient.locate.position import Match, Positions, assigned, find_positions, match_disks, places_of
 from sphereorient.locate.scene import (
     CameraScene,
     expected_diameter_px,
-    find_scene,
     find_scenes,
     known_diameter_px,
     learn_background,

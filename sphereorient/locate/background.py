@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import Reason
-from sphereorient.experiment.stream import EVERY, CameraStream, uniform
+from sphereorient.experiment.recording import EVERY, CameraStream, uniform
 from sphereorient.files.picture import OnDemand
 
 Picture = NDArray[Any]

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera, nearest_point
 from sphereorient.errors import ExperimentError, SettingsError, refusal
-from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream, given_scene
+from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.locate.background import LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
@@ -25,12 +24,11 @@ CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in s
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
-WINDOW = 5  # median filter against single pixels, px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraScene:
-    """Background and expected diameter, px, of one camera; made by `find_scene`."""
+    """Background and expected diameter, px, of one camera; made by `find_scenes`."""
 
     background: Background
     diameter_px: float
@@ -45,42 +43,28 @@ def known_diameter_px(recording: Recording, name: str, settings: LocateSettings)
     return settings.diameter_px or expected_diameter_px(name, recording.cameras, recording.experiment.diameter_mm)
 
 
-def find_scene(recording: Recording, stream: CameraStream, count: int, settings: LocateSettings) -> CameraScene:
-    """Return one camera's scene from `count` frames or from the given background.
+def find_scenes(
+    recording: Recording, stream: CameraStream, count: int, settings: LocateSettings
+) -> dict[str, CameraScene]:
+    """Return one camera's scene for each sphere, by name, from `count` frames or from the given background: one
+    background, expected diameters of their own.
 
     Raises:
         ExperimentError: a sphere declared fixed does not rotate in one place.
         SettingsError: unknown diameter.
     """
-    empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
-    diameter_px = known_diameter_px(recording, stream.name, settings)
-    if recording.experiment.fixed and (empty is None or diameter_px is None):
-        outline, guess = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
-        diameter_px = diameter_px or 2 * outline.radius_px
-        if empty is None:
-            return CameraScene(background=guess, diameter_px=diameter_px, response=stream.response)
-    assert diameter_px is not None
-    background = learn_background(stream.spread(count), diameter_px, settings, empty, stream.shown)
-    return CameraScene(background=background, diameter_px=diameter_px, response=stream.response)
-
-
-def find_scenes(
-    recording: Recording, stream: CameraStream, count: int, settings: LocateSettings
-) -> dict[str, CameraScene]:
-    """Return one camera's scene for each sphere, by name: one background, expected diameters of their own.
-    Raises as `find_scene`, which is what a single sphere gets.
-    """
     each = {name: recording.of(name) for name in recording.experiment.names}
-    if len(each) == 1:
-        return {name: find_scene(one, stream, count, settings) for name, one in each.items()}
-    diameters_px = {
-        name: expected_diameter_px(stream.name, one.cameras, one.experiment.diameter_mm) for name, one in each.items()
-    }
-    empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
-    pictures = stream.spread(count)
-    background = learn_background(pictures, tuple(diameters_px.values()), settings, empty, stream.shown)
-    first = CameraScene(background=background, diameter_px=0.0, response=stream.response)
-    return {name: replace(first, diameter_px=size) for name, size in diameters_px.items()}
+    sizes = {name: known_diameter_px(one, stream.name, settings) for name, one in each.items()}
+    empty, background = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None
+    if all(one.experiment.fixed for one in each.values()) and (empty is None or None in sizes.values()):
+        outline, guess = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
+        sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
+        background = guess if empty is None else None
+    known = {name: px for name, px in sizes.items() if px is not None}  # all
+    if background is None:
+        background = learn_background(stream.spread(count), tuple(known.values()), settings, empty, stream.shown)
+    scene = CameraScene(background=background, diameter_px=0.0, response=stream.response)
+    return {name: replace(scene, diameter_px=px) for name, px in known.items()}
 
 
 def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:
@@ -195,7 +179,7 @@ def fixed_ball(
         scatter = np.where(shown, scatter, np.float32(0))
     full_scale = float(np.iinfo(pictures.dtype).max)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255
-    moved = (cv2.medianBlur(scatter, WINDOW) > CHANGES * usual).astype(np.uint8)
+    moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter against single pixels, px
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
     if count < 2:
         raise _none_fixed("nothing that changes")

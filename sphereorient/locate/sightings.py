@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator, make_lsq_spline
 from torch import Tensor
 
-from sphereorient.errors import ExperimentError, ShapeError, refusal
+from sphereorient.errors import ExperimentError, Flag, Reason, ShapeError, refusal
 from sphereorient.locate.background import Background
 from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline, window_about
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.trajectory import Flag, Reason
 
 DEGREE = 3  # of the spline
 Found = tuple[Outline | None, Reason]

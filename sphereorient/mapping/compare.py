@@ -19,11 +19,10 @@ CHUNK = 256  # rotations tried at once
 PEAKS = 6  # best rotations that are refined
 BLURS_DEG = (5.0, 2.0, 0.8)  # of the refinement
 STEPS = 8  # of each refinement, of rotations and of patches
-TURN_ITERATIONS = 5  # of robust weights
 KNOWN_USUAL = 0.1  # share of the sphere of which a correlation is half believed
 ALIKE_MIN = 0.55  # correlation below which two maps do not show one ball; of two balls, or mirrored: up to 0.5
 DIRECTIONS = 500  # in which the displacement is measured
-FINE_BLUR_DEG = 0.5
+FINE_BLUR_DEG = 0.5  # of the finest tables: below a cell of theirs
 SIDE = 256  # of the tables: 0.7 degrees, tangent planes between
 HALF = 0.5  # share of a patch that must have been seen
 RADIUS_DEG = 1.0  # within which the other map must show a grey level: displacement alone is no wear
@@ -48,6 +47,11 @@ class MapComparison:
     correlation: float  # of both maps after that rotation, where both are known
     direction_body: Tensor  # (D, 3) float64, where the displacement was measured
     moved_rad: Tensor  # (D, 2) float64, displacement to the east and north in the other map; NaN if unknown
+
+    @property
+    def angle_rad(self) -> float:
+        """Angle between the body frames, rad."""
+        return float(so3.angle(self.R_other_reference))
 
     @property
     def length_rad(self) -> Tensor:
@@ -190,7 +194,7 @@ def _common_turn(direction: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
     # turn x d to the east is turn . (d x east), and d x east is north; to the north it is -turn . east.
     columns = torch.stack([north, -east], dim=1)
     known, turn = torch.isfinite(moved).all(1), torch.zeros(3, dtype=torch.float64)
-    for _ in range(TURN_ITERATIONS if known.any() else 0):
+    for _ in range(5 if known.any() else 0):  # of robust weights
         left = moved[known] - columns[known] @ turn
         length = left.norm(dim=-1)
         weight = 1 / (1 + (length / (2 * length.median().clamp_min(1e-6))) ** 2)

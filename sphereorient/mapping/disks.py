@@ -17,8 +17,9 @@ from torch.nn import functional as F
 from sphereorient import locate
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, Reason, refusal
-from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.experiment.stream import CameraStream, given_scene
+from sphereorient.experiment.recording import CameraStream, Recording, given_scene
+from sphereorient.files.threads import Progress
+from sphereorient.follow.initialise import GAP_SHARE
 from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
@@ -31,7 +32,6 @@ from sphereorient.sphere.view import perspective_view
 
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
-GAP_SHARE = 0.3  # of the radius: a larger median distance between lines of sight means two different balls
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
 OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its median times this is the sigma of noise
 # Scatter of a fixed ball's outlines that is refused: px, of the radius, and of that of their size. Where outlines are
@@ -101,7 +101,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         if experiment.fixed:  # what changes in the pictures is the ball
             outline, scene = _fixed_scene(recording, stream, settings, locating)
         else:
-            scene = locate.find_scene(recording, stream, settings.background_frames, locating)
+            (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
         found: list[Found] = []
         row: list[Crop | None] = []
         for k, shot in enumerate(locate.screened_frames(stream, scene.background)):

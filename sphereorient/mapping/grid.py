@@ -18,7 +18,6 @@ READS = 16  # texels that a look-up reads
 WIDER = 4.0  # times the blur of the map, at which its edges are counted
 SLOPES, ROUGH_SIDE = 64, 128  # cells per axis: of the directions in which their slope is averaged, of the table
 FEWEST_EDGES = 0.01  # rad/sr
-SHARPENING_ITERATIONS = 200
 Array = NDArray[Any]
 
 
@@ -224,5 +223,5 @@ def sharpened(normal: NormalMatrix, right: Array, blur_rad: float, tie: float, e
         return pulled
 
     left = back @ (right - normal @ (blur @ known))
-    change = conjugate_gradients(apply, lambda p: p / diagonal, left, 1e-12, SHARPENING_ITERATIONS)
+    change = conjugate_gradients(apply, lambda p: p / diagonal, left, 1e-12, 200)
     return torch.from_numpy((known + change).reshape(height, 2 * height))

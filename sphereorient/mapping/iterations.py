@@ -22,12 +22,12 @@ from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics, widest_px
 from sphereorient.pose.fitter import Fitter, first_fitter
-from sphereorient.pose.lights.common import noise_curves
 from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
 from sphereorient.pose.lights.kinds import lit_in_the_lab
 from sphereorient.pose.model import no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart
+from sphereorient.pose.residuals import noise_curves
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
 
@@ -43,12 +43,11 @@ LAB_ITERATIONS, LAB_FRAMES = 3, 32  # in which one light in the lab is estimated
 # Share of the paint's expected smoothness while poses are sought: a smoother map shifts the position of a ball in one
 # place (0.041 degrees with all of it, 0.016 with this), a rougher one lets poses follow noise.
 LOOSE = 0.1
-BLUR_FRAMES = 32
+BLUR_FRAMES = 32  # instants from which the blur is estimated, evenly spread
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
 BATCH = 24  # instants at once
 LONGEST_RAD = 0.05  # joint step
-MAP_STEPS = 10  # of conjugate gradients: what they leave, the next iteration finds
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
 BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
 NOISE_EVERY = 4  # pixels from which the noise is estimated
@@ -316,7 +315,8 @@ def extended(state: State, new: State, tie: float, unseen: TextureTable | None) 
 def _changed(state: State, normal: NormalMatrix, right: NDArray[np.float64], tie: float) -> State:
     """Return the state with the change of its map that solves normal equations (T, T), (T,)."""
     height = len(state.texture)
-    texture = state.texture + grid.solve_map(normal, right, height, tie, MAP_STEPS).float()
+    # Of conjugate gradients: what they leave, the next iteration finds.
+    texture = state.texture + grid.solve_map(normal, right, height, tie, 10).float()
     weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight)
 

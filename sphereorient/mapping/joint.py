@@ -17,7 +17,7 @@ from sphereorient.pose.residuals import Residuals, grey_by_pose, residuals
 DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
 POSE = 6  # unknowns of a pose
 DAMPING = 1e-5  # of the diagonal: the body frame is free, the step along it zero
-RIDGE = 1e-7
+RIDGE = 1e-7  # of the light's normal equations: rounding must not make them singular
 LONGEST_SHARE = 0.1  # typical length of a turn, rad, and of a move, radii
 STEPS = 12  # of conjugate gradients: each iteration linearises anew, and more of them fit the noise
 

@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
-from sphereorient.experiment.recording import Progress
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
+from sphereorient.files.threads import Progress
 from sphereorient.files.whole_file import writing
 from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
@@ -36,17 +36,14 @@ SHOWN_MIN = 0.4
 FINER = 2  # rows of the sharpened map over those of the fitted one
 RECOVERY_AFTER = (3, 6)  # iterations after which instants that do not fit are searched again
 GOOD_SHARE = 0.85  # of the median score, from which on an instant fits
-RECOVERY_ITERATIONS = 5  # at each pyramid level
-POSE_ITERATIONS = 2  # of each pose by itself with the final map
 POSITION_ITERATIONS = 4  # that find the position of a ball that stays in its place
 FEW_PIXELS = 250_000  # of photographs together
-PIXELS_A_TEXEL = 3.0
+PIXELS_A_TEXEL = 3.0  # of few photographs: pixels that determine a texel
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
 HELD_EVERY = 5  # instants; the map of the others is compared with this one
 SEEN_MIN = 0.99  # share of a pixel on texels that other pictures show, below which it is not compared
-HELD_ITERATIONS = 2  # of the held poses with that map
 JUMP_RAD, JUMPS = math.radians(3.0), 10.0  # rotations so far off their neighbours', and so many times the usual
 WINDOW = 5  # rotations whose median is usual
 SCHEMA = "sphereorient-unfinished-map/1"  # of the file of an unfinished map
@@ -236,7 +233,7 @@ def _finished(
 ) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
-    state, fit = iterations.fitted(state, POSE_ITERATIONS, crops)
+    state, fit = iterations.fitted(state, 2, crops)  # of each pose by itself with the final map
     state = replace(state, R_lab_body=so3.nearest_rotation(state.R_lab_body))
     all_R = interpolated(chain.R_lab_body, rows, state.R_lab_body)
     Q = all_R[0].clone()  # R_new = R Q^T, and new directions are Q times the old
@@ -292,7 +289,7 @@ def recovered(crops: Crops, state: State, chain: Tensor) -> State:
     R = interpolated(chain, torch.nonzero(good)[:, 0], state.R_lab_body[good])[lost]
     again, fitter = replace(state.where(lost), R_lab_body=R), state.map_fitter()
     optics = fitter.optics
-    steps = [(level, 1, RECOVERY_ITERATIONS) for level in (optics.coarse, optics.middle, optics.fine)]
+    steps = [(level, 1, 5) for level in (optics.coarse, optics.middle, optics.fine)]  # at each pyramid level
     fit = fitter.fit_through(steps, crops.pictures(again.frames), again.start(held=state.fixed))
     better = _scores(fit, again.use) > score[lost]
     rows, X = (lost[better],), again.position_lab_mm if state.fixed else fit.position_lab_mm
@@ -326,7 +323,7 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
         return found
     others, _ = iterations.with_map(replace(state, use=state.use.index_fill(0, rows, False)))
     known = (iterations.map_weight(others) > 0).float()
-    one, _ = iterations.fitted(replace(others, use=state.use).where(rows), HELD_ITERATIONS, crops)
+    one, _ = iterations.fitted(replace(others, use=state.use).where(rows), 2, crops)  # of the held poses with that map
     X = crops.position_lab_mm.index_put((one.frames,), one.position_lab_mm)
     filmed = disks_of(replace(crops, position_lab_mm=X), one.frames, settings)
     for c in range(found.shape[1]):

@@ -16,13 +16,12 @@ from sphereorient.mapping.disks import Disks, disk_places
 from sphereorient.so3 import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement
-RIDGE = 1e-3
+RIDGE = 1e-3  # of the trace: a pair without slopes does not turn
 BATCH = 64  # pairs compared at once
 LOOKS = 1 << 21  # look-ups at once, at most, in a search
 SCALE = 0.7  # residual, in deviations of a normalised picture, that counts half
 OVERLAP_MIN = 0.2  # share of a disk visible in both pictures, below which a correlation is half believed
-GRAPH_ITERATIONS = 20
-ARRIVED_RAD = 1e-6
+ARRIVED_RAD = 1e-6  # largest step of the graph that ends it
 Sampled = tuple[Tensor, Tensor, Tensor]
 
 
@@ -221,7 +220,7 @@ def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) 
     """
     R = R_lab_body.clone()
     shape = pairs.information / pairs.information.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-12)
-    for k in range(GRAPH_ITERATIONS):
+    for k in range(20):
         wide = scale_rad * max(1.0, 16.0 * 0.6**k)
         residual = pairs.residual(R)
         weight = 1 / (1 + (residual.norm(dim=-1) / wide).square()).square()

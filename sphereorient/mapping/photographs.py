@@ -24,17 +24,15 @@ SEARCH_EVERY = 1  # pixels of the small disks
 MODES, PEAKS = 96, 3  # best rotations of a pair, and distinct ones among them that are refined
 PEAK_DEG = 18.0  # between distinct ones
 FINER = 2.7  # detail, window and pixels of the disks in the last comparison, where the pictures have it
-DISK_PX_MAX = 128
+DISK_PX_MAX = 128  # side of these disks, px: bounds time and memory
 CHANCE_PAIRS = 500  # pairs at random rotations, which show how well different patches correlate
 CHI2_MEDIAN = 0.4549  # of the square of a normal number
-JOIN_ITERATIONS = 4  # of the refinement of a pair between two sets
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
 LIKE_MAX = 0.98  # largest correlation that counts
 # Log-odds above which two sets are joined; the best wrong of 5 million rotations of 30 pictures has about 20.
 SURE = 25.0
 REACH_RAD = math.radians(10.0)  # by which a pair may differ from the orientations of the others
 SCALE_RAD = math.radians(2.0)  # scatter of pairs that share only slanted places, by errors of the outlines
-SETTLE = 2  # comparisons in fine detail, each from the orientations of all together
 OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second set so large is another ball
 
 
@@ -75,7 +73,7 @@ def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> Pairw
     label, joined_R = joined_sets(rough, all_pairs(disks))
     rows, R, pairs = _settled(rough, _largest(label), joined_R)
     fine = measured_evidence(finer, settings)
-    for _ in range(SETTLE):
+    for _ in range(2):  # comparisons in fine detail, each from the orientations of all together
         rows, R, pairs = _settled(fine, rows, R)
     before, after = (so3.nearest_rotation(attitudes[rows] @ attitudes[rows[0]].mT) for attitudes in (joined_R, R))
     place = torch.full((len(R),), -1).index_put((rows,), torch.arange(len(rows)))
@@ -136,7 +134,8 @@ def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, T
                 continue
             one, other = label == label[i], label == label[j]
             placed = torch.where(other[:, None, None], R @ (R[j].mT @ R_ji @ R[i]), R)
-            between, gained = _compared_at(evidence, placed, one[:, None] & other, JOIN_ITERATIONS)
+            # Of the refinement of a pair between two sets.
+            between, gained = _compared_at(evidence, placed, one[:, None] & other, 4)
             if float(gained.sum()) > SURE:
                 pairs = RelativeRotations.joined([pairs, between.where(gained > 0)])
                 label = torch.where(other, label[i], label)

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, input_files
-from sphereorient.experiment.recording import Progress, Recording, open_recording, silent
+from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.provenance import provenance
-from sphereorient.mapping import LearntMap, fit_map, take_crops
-from sphereorient.mapping.alike import SharedMap, corrected, shared_maps
-from sphereorient.mapping.balls import take_crops_of_all
+from sphereorient.files.threads import Progress, silent
+from sphereorient.mapping import LearntMap, fit_map
+from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
 from sphereorient.mapping.compare import MapComparison
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
@@ -76,16 +76,12 @@ def learn_map(
     old = load_texture(Path(init)) if isinstance(init, str | Path) else init
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         names = recording.experiment.names
-        if len(names) == 1:
-            each = {names[0]: take_crops(recording, settings.paint, settings.locate, progress)}
-        elif old is None:
-            each = take_crops_of_all(recording, settings.paint, settings.locate, progress)
-        else:
+        if old is not None and len(names) > 1:
             do = "leave --init out"
             raise ExperimentError(refusal("init", expected="an experiment of one ball", got=f"{len(names)}", do=do))
         maps = {
             name: fit_map(crops, settings.paint, partial(_of_ball, progress, name), _own(kept, name), old)
-            for name, crops in each.items()
+            for name, crops in crops_of_balls(recording, settings.paint, settings.locate, progress).items()
         }
         results = {
             name: _result(recording.of(name), one, old, settings, command)

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from sphereorient.errors import TrackError, error_words, refusal
-from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.recording import Recording
 from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, whole_hdf5
+from sphereorient.files.threads import Progress
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
-from sphereorient.follow.poses import Poses
 from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
@@ -29,6 +29,7 @@ from sphereorient.pose import CameraView, Fitter, Optics
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
+from sphereorient.pose.poses import Poses
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 

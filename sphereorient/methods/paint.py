@@ -8,12 +8,12 @@ import numpy as np
 import torch
 
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording
+from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Among, Following
+from sphereorient.follow.appearance.light import estimate_blur_px
 from sphereorient.follow.follower import frames_at, frames_showing, sample_frames
 from sphereorient.follow.initialise import UNPROVEN, Initialiser
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import among_found
@@ -22,10 +22,10 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.proposers import BlurMatchedSearch, finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView
-from sphereorient.pose.blur import estimate_blur_px
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, defocus_radii
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.neighbours import spoilt
+from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
 MOSTLY_SEEN = 0.5  # share of a disk that others must leave to each camera, of the frames that light is learnt from

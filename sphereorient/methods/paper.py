@@ -14,8 +14,8 @@ from sphereorient.calibration.comparison import Seen
 from sphereorient.calibration.contradictions import majority
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import Reason
-from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording
+from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import Follower
 from sphereorient.locate import Sightings
 from sphereorient.methods import results
@@ -69,7 +69,7 @@ def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings
     """Find the sphere's outline in every frame of one camera, outliers replaced and short gaps filled."""
     stage = f"{stream.name}: locate"
     progress(stage, 0, len(stream))
-    scene = locate.find_scene(recording, stream, settings.locate.background_frames, settings.locate)
+    (scene,) = locate.find_scenes(recording, stream, settings.locate.background_frames, settings.locate).values()
     found: list[locate.Found] = []
     for done, shot in enumerate(locate.screened_frames(stream, scene.background), 1):
         if shot.usable:

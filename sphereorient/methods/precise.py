@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.assemble.identity import same_balls
-from sphereorient.errors import ExperimentError, refusal
-from sphereorient.experiment.recording import Progress
+from sphereorient.errors import ExperimentError, Flag, refusal
+from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
-from sphereorient.follow.poses import PoseTable, exchanged, pose_tables
 from sphereorient.follow.tracker import Tracker
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
 from sphereorient.methods.paint import alike, following, open_paints, studies_of
 from sphereorient.methods.proposers import BlurMatchedSearch
-from sphereorient.trajectory import Flag, Trajectory
+from sphereorient.pose.poses import PoseTable, exchanged, pose_tables
+from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 

@@ -10,19 +10,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
+from sphereorient.calibration.contradictions import with_contradictions
+from sphereorient.calibration.systematic import with_lasting_errors, with_systematic_errors
+from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import Experiment
+from sphereorient.experiment.recording import Recording
 from sphereorient.follow import Appearance
 from sphereorient.follow.appearance import LOOK_ALIKE
-from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
-from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
+from sphereorient.motion import Motion, Smoothed, datasets_of, in_middle
 from sphereorient.movies.response import LINEAR
 from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.lasting import Lasting
+from sphereorient.pose.poses import PoseTable, turned_alone
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
-from sphereorient.so3 import exp, geodesic_distance
-from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+from sphereorient.trajectory import CameraTrack, Trajectory
 
 TWO_BALLS = (
     "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "
@@ -118,7 +122,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         centre_px=centre_px.numpy(),
         centre_sigma_px=(picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm).numpy(),
         radius_px=radius_px.numpy(),
-        orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
+        orientation=torch.where(where, turned_alone(picked, place), torch.nan).numpy(),
         orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
         score=picked["score"][:, place].numpy(),
         reason=tuple(str(why) for why in reason),
@@ -134,7 +138,7 @@ def measured_track(
     """Collect poses as they were measured: those of a table at a choice (N,), -1 for none; no path, no smoother."""
     picked = table.rows(choice)
     covariance = picked["covariance"]
-    margin, angle = _margin(table, choice)
+    margin, angle = table.margin(choice)
     cameras = {view.name: precise_camera(k, table, picked, learnt) for k, view in enumerate(learnt.fitter.views)}
     missed = [
         missed_by(view, one.reason, torch.from_numpy(one.centre_px), torch.from_numpy(one.radius_px))
@@ -160,14 +164,7 @@ def precise_track(
     experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Appearance
 ) -> Trajectory:
     """Collect all results of the precise method in a trajectory, poses in the middle of the exposure."""
-    move_mm, turn = off_middle(smoothed, experiment.exposure_s or 0.0)
-    back = exp(-turn)
-    smoothed = replace(
-        smoothed,
-        position_lab_mm=smoothed.position_lab_mm - move_mm,
-        R_lab_body=back @ smoothed.R_lab_body,
-        R_given_path=back @ smoothed.R_given_path,
-    )
+    smoothed, move_mm = in_middle(smoothed, experiment.exposure_s or 0.0)
     track = measured_track(experiment, clock, table, chosen.choice, learnt)
     flags = chosen.flags | torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
     # What all other frames say is far from it.
@@ -202,6 +199,24 @@ def _alone(segment: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Return which frames (N,) are the only ones of their segment: no other one confirms their pose."""
     number, count = np.unique(segment[segment >= 0], return_counts=True)
     return np.isin(segment, number[count == 1])
+
+
+def with_errors(
+    track: Trajectory, recording: Recording, lasting: Lasting | None, *, compared: bool
+) -> tuple[Trajectory, list[str]]:
+    """Add the errors of calibration, of cameras that contradict each other, and of what lasts over frames; return also
+    what is to be remarked of the cameras. `compared`: whether these are compared, which takes all frames of a movie.
+    """
+    cameras, radius_mm = recording.cameras, recording.experiment.radius_mm
+    track, remarks = with_systematic_errors(track, cameras, recording.covariance, radius_mm), list[str]()
+    if compared and len(cameras) > 1:
+        own_rad2 = 0.0 if lasting is None else lasting.own_rad2
+        track, found = with_contradictions(track, cameras, 2 * radius_mm, recording.timeline.even, own_rad2)
+        if found.contradicts:
+            remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
+    if lasting is not None:  # after the others: only noise is scaled
+        track = with_lasting_errors(track, lasting.covariance, lasting.alone)
+    return track, remarks
 
 
 def missed_text(track: Trajectory) -> list[str]:
@@ -261,19 +276,6 @@ def _empty(experiment: Experiment, clock: Tensor, cameras: Iterable[str], **abou
     known = {"frame_rate": experiment.frame_rate_hz, "experiment": experiment.name}
     known |= {"length_unit": experiment.length_unit} | about
     return Trajectory.empty(clock.numpy(), cameras=tuple(cameras), **known)
-
-
-def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log-likelihood margin and angle to the next distinct orientation, (N,) each; NaN without one."""
-    frame, place = torch.arange(len(table)), choice.clamp_min(0)
-    others = table.mask.clone()
-    others[frame, place] = False
-    others &= (choice >= 0)[:, None]
-    nll = torch.where(others, table.nll, torch.inf)
-    best, which = nll.min(1)
-    there = torch.isfinite(best)
-    angle = geodesic_distance(table.R_lab_body[frame, which], table.R_lab_body[frame, place])
-    return torch.where(there, best - table.nll[frame, place], torch.nan), torch.where(there, angle, torch.nan)
 
 
 def missed_by(view: CameraView, reason: Sequence[str], centre_px: Tensor, radius_px: Tensor) -> NDArray[np.bool_]:

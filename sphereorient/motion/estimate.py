@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from sphereorient.motion.kalman import Bools, Floats, SmoothedStates, run_filter, smooth
-from sphereorient.motion.matern import Prior, prior_of_band
+from sphereorient.motion.kalman import Bools, Floats, Prior, SmoothedStates, prior_of_band, run_filter, smooth
 from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack, mahalanobis2
 from sphereorient.motion.settings import SmoothSettings
 
@@ -16,8 +15,6 @@ SETTLED = 0.03  # of a measurement's sigma: convergence is quadratic, so the nex
 PIECE = 200  # instants of a piece, many times the memory of the motion
 FEWEST = 5  # measurements of a piece
 NEAR = 5  # frames over which a wrong measurement makes others look wrong
-ROUNDS = 3  # of estimation
-JUDGEMENTS = 12  # rounds of rejection; outliers near each other are found one after the other
 AGAIN = 0.5  # of the limit, below which a measurement is used again; below 1 to avoid oscillation
 FAR_MOVED = 100.0  # sigmas; after a larger move of the reference the estimate is repeated
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
@@ -89,7 +86,7 @@ def estimate(
 def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:
     scales = settings.least_scale, settings.most_scale
     learnt = estimate_process(pieces, scales, band)
-    for _ in range(ROUNDS):
+    for _ in range(3):  # of estimation
         before, (settled, _, moves) = pieces, zip(*(_settled(one, learnt, settings) for one in pieces), strict=True)
         pieces = settled
         judged = any((new.used != old.used).any() for new, old in zip(pieces, before, strict=True))
@@ -118,7 +115,8 @@ def _settled(
         if step > SETTLED and tries < ITERATIONS:
             continue
         used = _judged(path, states, limit, settings.outlier_share)
-        if judgements == JUDGEMENTS or (used == path.used).all():
+        # At most 12 rounds of rejection: outliers near each other are found one after the other.
+        if judgements == 12 or (used == path.used).all():
             return replace(path, covariance=path.covariance / scale**2), states, farthest
         path, tries, judgements = replace(path, used=used), 0, judgements + 1
 

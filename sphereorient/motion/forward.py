@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sphereorient.motion.estimate import FIRST_TRIES
-from sphereorient.motion.kalman import Floats
-from sphereorient.motion.matern import ORDER, STATIONARY, Prior, grown, integral
+from sphereorient.motion.kalman import ORDER, STATIONARY, Floats, Prior, grown, integral
 from sphereorient.motion.settings import SmoothSettings
 from sphereorient.motion.smooth import LONGEST_STEP
 

@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from sphereorient.motion.kalman import Bools, Floats, StateSpace
-from sphereorient.motion.matern import NODES, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes
+from sphereorient.motion.kalman import (
+    NODES,
+    ORDER,
+    STATIONARY,
+    Bools,
+    Floats,
+    Prior,
+    StateSpace,
+    grown,
+    grown_rate,
+    integral,
+    nodes,
+)
 
 SIZE = 3 * (2 + ORDER)
 UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: next to no pull

@@ -1,7 +1,7 @@
 """Motion from the precise track: smoothed position and orientation, their derivatives, with sigmas."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, ProcessPrior, estimate
 from sphereorient.motion.kalman import Bools, Floats
@@ -24,7 +25,7 @@ LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
 LAGS = 3  # frames after which an error that remains is one that lasts
 CLIP = 4.0  # sigmas: a wrong frame is no lasting error
 AS_MANY = 20  # pairs of frames that outweigh the share that is assumed
-MOST_LASTING = 0.9
+MOST_LASTING = 0.9  # share of the variance that may last: some noise is left
 ON_PATH = 4.0  # sigmas (of three axes) within which a measured position agrees with the smoothed path
 
 
@@ -72,6 +73,19 @@ def off_middle(motion: Motion, exposure_s: float) -> tuple[Tensor, Tensor]:
     """
     share = exposure_s**2 / 24
     return 1e3 * share * motion.acceleration_m_s2.nan_to_num(), share * motion.alpha_lab_rad_s2.nan_to_num()
+
+
+def in_middle(smoothed: Smoothed, exposure_s: float) -> tuple[Smoothed, Tensor]:
+    """Return smoothed poses in the middle of the exposure, and by how much they are moved back, (..., N, 3), mm."""
+    move_mm, turn = off_middle(smoothed, exposure_s)
+    back = so3.exp(-turn)
+    middle = replace(
+        smoothed,
+        position_lab_mm=smoothed.position_lab_mm - move_mm,
+        R_lab_body=back @ smoothed.R_lab_body,
+        R_given_path=back @ smoothed.R_given_path,
+    )
+    return middle, move_mm
 
 
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import error_words
 from sphereorient.files.hdf5 import DAMAGE
-from sphereorient.movies.movie import LARGEST_RATIO, MOST_MISSING, Grey, Movie, refused
+from sphereorient.files.whole_file import LARGEST_RATIO
+from sphereorient.movies.movie import MOST_MISSING, Grey, Movie, refused
 
 KIND = "data set (N, H, W) of uint8 or uint16"
 SEPARATOR = "::"  # between the file and the data set in it

@@ -11,11 +11,10 @@ from sphereorient.errors import MovieError, refusal
 from sphereorient.files.picture import OnDemand
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
-FRAMES_A_MAP = 64
+FRAMES_A_MAP = 64  # after which a file is mapped anew: read pages count as memory meanwhile
 OTHERS = "ask for frames that the movie has"
 MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
-LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value; no real picture exceeds it
 GAMMA_CODED = "usually gamma-coded: response: srgb"
 COLOUR_REMARK = f"colour, made grey (0.299 R + 0.587 G + 0.114 B); {GAMMA_CODED}"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns

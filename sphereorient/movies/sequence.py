@@ -11,16 +11,8 @@ import numpy as np
 
 from sphereorient.errors import MovieError
 from sphereorient.files.picture import claimed_pixels, decoded, luma
-from sphereorient.movies.movie import (
-    COLOUR_REMARK,
-    GAMMA_CODED,
-    LARGEST_RATIO,
-    MOST_MISSING,
-    MOST_PIXELS,
-    Grey,
-    Movie,
-    refused,
-)
+from sphereorient.files.whole_file import LARGEST_RATIO
+from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, MOST_MISSING, MOST_PIXELS, Grey, Movie, refused
 from sphereorient.movies.tiff import TiffMovie
 
 TIFF = (".tif", ".tiff")

@@ -13,7 +13,8 @@ from tifffile import TiffFile, TiffFileError
 
 from sphereorient.errors import error_words
 from sphereorient.files.picture import luma
-from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, mapped, refused
+from sphereorient.files.whole_file import LARGEST_RATIO
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, refused
 
 # What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (
@@ -22,7 +23,6 @@ DAMAGE = (
 )
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB = 0, 1, 2  # PhotometricInterpretation
 UNCOMPRESSED = 1
-ORIENTATION = 274  # tag: where row 0 and column 0 are
 STEPS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1)}  # of rows and columns, by orientation
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damage is reported by our own refusals
@@ -136,7 +136,7 @@ def _stated(path: Path, file: TiffFile) -> int:
 
 
 def _steps(path: Path, page: Any) -> tuple[int, int]:
-    tag = page.tags.get(ORIENTATION)
+    tag = page.tags.get(274)  # tag: where row 0 and column 0 are
     orientation = 1 if tag is None else tag.value
     steps = STEPS.get(orientation)
     if steps is None:

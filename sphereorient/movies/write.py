@@ -12,21 +12,19 @@ from sphereorient.files.hdf5 import GuardedFile
 from sphereorient.files.whole_file import put_aside, write_text
 from sphereorient.movies.movie import Grey, refused
 
-PLAYER_RATE_HZ = 25.0
 WRITERS = (".mkv", ".h5", ".hdf5")
 PIXEL_FORMATS = {np.dtype(np.uint8): "gray", np.dtype(np.uint16): "gray16le"}
 # Every frame a key frame, with check sums: any frame can be read alone, and damage stays in its frame.
 FFV1_OPTIONS = {"level": "3", "g": "1", "slicecrc": "1"}
 # Of many slices only those that hold the ball are decoded; they cost 1.5 % of the file.
 SLICES, SLICED_PX = "24", 96  # and the least side of a picture that is cut into so many
-LEVEL = 1  # of gzip: higher ones cost twice the time for 4 % less
 
 
 def write_movie(
     path: Path | str,
     frames: Iterable[Grey | None],
     times_s: NDArray[np.float64] | None = None,
-    frame_rate_hz: float = PLAYER_RATE_HZ,
+    frame_rate_hz: float = 25.0,
 ) -> int:
     """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5); return their number.
     A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, go into the HDF5 file, or
@@ -86,7 +84,7 @@ def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s:
                 dtype=first.dtype,
                 chunks=(1, *first.shape),
                 compression="gzip",
-                compression_opts=LEVEL,
+                compression_opts=1,  # of gzip: higher ones cost twice the time for 4 % less
             )
             data.attrs["units"], data.attrs["description"] = "grey level", "pictures, row 0 on top"
             for picture in checked:

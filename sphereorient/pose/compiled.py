@@ -1,12 +1,16 @@
-"""The fit of poses by compiled code, refine.c; none where that was not built, on a GPU and in double."""
+"""Who computes a fit of poses: compiled code, refine.c, where it was built, on the CPU in float; else torch (fit.py),
+which defines it and has gradients.
+"""
 
 import ctypes
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,13 +18,13 @@ from torch import Tensor
 
 from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
+from sphereorient.pose import fit
 from sphereorient.pose.camera_view import CameraView, FrameDisks
+from sphereorient.pose.fit import COVERED, FIRST_EVERY, LEAST_OF_WINDOW, MARGIN_PX, MORE, MOST_EACH, NEAR_RAD, WINDOW_PX
 from sphereorient.pose.model import UNSEEN, SphereModel
-from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, pose_arrays
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY
-from sphereorient.pose.settle import FIRST_EVERY, MORE, NEAR_RAD
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
@@ -49,7 +53,7 @@ def refine(
 
 
 def kept(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
-    """Return the places that count, as `occluders.kept`."""
+    """Return the places that count, as `fit.kept`."""
     return _refined(pixels, begin, model, 0, most)[1]
 
 
@@ -110,7 +114,7 @@ def _run(name: str, task: ctypes.Structure, poses: int) -> None:
 def settle(
     disks: FrameDisks, begin: PoseStart, model: SphereModel, instants: int, most_hidden: float, first: bool
 ) -> tuple[FittedPoses, Tensor]:
-    """Fit poses to whole frames, as `settle.settle`."""
+    """Fit poses to whole frames, as `fit.settle`."""
     (poses, cameras), stencil = begin.use.shape, disks.stencil
     far = torch.full((poses,), not first)
     task, at = _task_of(begin, model, instants)
@@ -212,3 +216,22 @@ def _edge_table() -> Tensor:
     coverage, density, pull, variance = limb_shape(edge)
     z, moves = rim_shape(coverage[None], density[None])
     return torch.cat([torch.stack([coverage, density, pull, variance]), z, moves]).T.float().contiguous()
+
+
+class Body(NamedTuple):
+    """The functions of a fit; as those of `fit`."""
+
+    refine: Callable[[Pixels, PoseStart, SphereModel, int, float], FittedPoses]
+    kept: Callable[[Pixels, PoseStart, SphereModel, float], Tensor]
+    settle: Callable[[FrameDisks, PoseStart, SphereModel, int, float, bool], tuple[FittedPoses, Tensor]]
+
+
+IN_TORCH = Body(fit.refine, fit.kept, fit.settle)
+COMPILED = Body(refine, kept, settle)
+
+
+def body_of(begin: PoseStart) -> Body:
+    """Return the body for fits that begin there."""
+    X = begin.position_lab_mm
+    able = library() is not None and X.device.type == "cpu" and not X.requires_grad
+    return COMPILED if able else IN_TORCH

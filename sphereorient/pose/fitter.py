@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras import R_lab_view, sphere_disk_px
-from sphereorient.pose.bodies import body_of
 from sphereorient.pose.camera_view import (
     SIZES,
     CameraView,
@@ -20,14 +19,14 @@ from sphereorient.pose.camera_view import (
     size_steps,
     widest_px,
 )
+from sphereorient.pose.compiled import body_of
+from sphereorient.pose.fit import MOST_HIDDEN, NEAR_RAD
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
-from sphereorient.pose.occluders import MOST_HIDDEN
 from sphereorient.pose.pixels import Pixels, Stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
 from sphereorient.pose.residuals import KNOWN
-from sphereorient.pose.settle import NEAR_RAD
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -234,8 +233,8 @@ class Fitter:
             known = disks_px.spoilt or self.spoilt(begin.position_lab_mm, disks_px, begin.moved, begin.among)
             hidden = known.hidden
         disks = FrameDisks.of(self.views, frames, disks_px.middle_px, stencil, hidden)
-        there = moved_to(self.device, begin)
-        fit, far = body_of(there).settle(disks, there, self.model(), self.instants, self.most_hidden, first)
+        model, there = self.model(), moved_to(self.device, begin)
+        fit, far = body_of(there).settle(disks, there, model, self.instants, self.most_hidden, first)
         fit = moved_to(CPU, fit)
         if rows := far.nonzero()[:, 0].tolist():
             on = begin.after(fit).of(torch.tensor(rows))

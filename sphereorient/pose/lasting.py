@@ -2,7 +2,7 @@
 The fit's covariance holds what differs from frame to frame. A path through all frames averages that away; these stay.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,7 +14,6 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import by_pose, fitted_residuals
 from sphereorient.so3 import inverse_damped, solve_damped
-from sphereorient.trajectory import Trajectory
 
 TILES = 4  # along each axis of the disk: errors of light are wide
 DARKEST = 0.5  # grey levels; darker places tell no power of their light
@@ -132,23 +131,6 @@ def _joined(normal: Tensor, right: Tensor, ridge: Tensor) -> tuple[Tensor, Tenso
     joined = (place[:, None] @ normal @ place[:, None].mT).flatten(0, 1)
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
     return joined, pulled, (place @ ridge @ place.mT).sum(0)
-
-
-def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
-    """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
-    use = torch.from_numpy(track.believed)
-    # Those of each camera are its own: the fewer count, the less of them is averaged away.
-    together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * lasting.covariance
-    alone = (use.to(torch.float64) @ lasting.alone.flatten(1)).reshape(-1, 6, 6)
-    whole = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
-    turn, place = whole[:, :3, :3], whole[:, 3:, 3:]
-    return replace(
-        track,
-        position_cov=track.position_cov + place,
-        position_smooth_cov=track.position_smooth_cov + place,
-        orientation_cov=track.orientation_cov + turn,
-        orientation_smooth_cov=track.orientation_smooth_cov + turn,
-    )
 
 
 def _holding(covariance: Tensor, difference: Tensor) -> Tensor:

@@ -129,17 +129,6 @@ def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
     return view.aside[:, None] * view.outward - depth[:, None] * pixels.direction, depth
 
 
-def polynomials(across: Tensor, order: int) -> Tensor:
-    """Return all monomials of x and y up to an order, (..., K, P), from places (..., 2, P)."""
-    x, y = across[..., 0, :], across[..., 1, :]
-    columns = [torch.ones_like(x)]
-    last = columns
-    for _ in range(order):
-        last = [last[0] * x, *(column * y for column in last)]
-        columns = [*columns, *last]
-    return torch.stack(columns, dim=-2)
-
-
 def stray_basis(across: Tensor) -> Tensor:
     """Return the harmonics over the angle about the disk, (..., K, P), at places (..., 2, P): 1, cos, sin, cos 2 .."""
     cos, sin = torch.nn.functional.normalize(across, dim=-2).unbind(-2)

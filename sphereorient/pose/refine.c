@@ -55,7 +55,7 @@ typedef struct {
     int64_t iterations; /* 0: only `kept` is asked for */
     const float *limb_px; /* (cameras), or none */
     float edge_px;
-    /* occluders: share of a disk that they may cover, 0: none are sought; see occluders.py */
+    /* occluders: share of a disk that they may cover, 0: none are sought; see fit.py */
     float most_hidden, covered, most_each, least_of_window;
     int64_t window, margin;        /* half widths, px */
     const int64_t *place;          /* (2, places), px to the right and below */

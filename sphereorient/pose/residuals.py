@@ -1,16 +1,21 @@
-"""The linear problem of the fit: residuals of L disks at given poses, their sums, and how well they are explained."""
+"""The linear problem of the fit: residuals of L disks at given poses, their sums, how well they are explained, and what
+they tell of stray light beside the sphere and of the noise of each camera.
+"""
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
-from sphereorient.pose.model import SphereModel, SphereView, polynomials, scene_beside
+from sphereorient.pose.model import SphereModel, SphereView, no_stray, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.view import sphere_view
 from sphereorient.so3 import solve_damped
+from sphereorient.sphere.view import polynomials
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 KNOWN = 0.3  # least share of a disk that shows known paint
@@ -19,6 +24,9 @@ SMOOTH = 4  # order of the light and reflections that a disk without paint shows
 EVERY = 4  # n-th place suffices for numbers of a whole disk: they are in order of distance from its middle
 OUTLIERS = 4.0  # times the variance of the disk, beyond which a square counts alike
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
+NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
+STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
+STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,3 +192,51 @@ def scores_of(at: Residuals) -> Tensor:
     painted, *others = (share * torch.minimum(models.square(), OUTLIERS * spread[:, None])).sum(-1)
     score = 1.0 - painted / torch.minimum(*others).clamp_min(1e-9)
     return torch.where((spread > 1e-6) & known, score.clamp_min(-1.0), torch.zeros_like(score))
+
+
+def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Tensor:
+    """Estimate the stray light (C, K) from pixels that no sphere covers in B * C disks, those of `use` (B, C) bool.
+    `known` (C, K) is the one that the residuals hold. Robust: bubbles and other passers-by count for nothing. Light as
+    weak as the errors of the model of the limb is taken for none.
+    """
+    beside = at.inside & ~pixels.clipped & (at.view.coverage < NO_SPHERE) & use.reshape(-1, 1)
+    beside[:, : pixels.inner] = False
+    cameras = use.shape[1]
+    found = no_stray(cameras)
+    stray_known = scene_beside(at.view, pixels, known) - pixels.behind  # less what the sphere's edge adds
+    for camera in range(cameras):
+        own = slice(camera, None, cameras)
+        basis = stray_basis(at.view.across[own]).mT[beside[own]].double()
+        more = (at.residual + stray_known)[own][beside[own]].double()
+        weight = torch.ones_like(more)
+        for _ in range(STRAY_ROUNDS if len(more) >= FEWEST_BESIDE else 0):
+            weighted = basis * weight[:, None]
+            coefficients = torch.linalg.solve(weighted.mT @ basis + torch.eye(basis.shape[1]), weighted.mT @ more)
+            left = more - basis @ coefficients
+            scale = (1.4826 * left.abs().median()).clamp_min(math.sqrt(NOISE_MIN))
+            weight = (1.0 - (left / (STRAY_TUKEY * scale)).square()).clamp_min(0.0).square()
+            found[camera] = coefficients.float()
+        step = at.lit[own, : pixels.inner][use[:, camera]].median() if bool(use[:, camera].any()) else math.inf
+        if found[camera].abs().sum() < STRAY_LEAST * step:
+            found[camera] = 0.0
+    return found
+
+
+def noise_curves(model: Tensor, residual: Tensor, inside: Tensor, cameras: int) -> Tensor:
+    """Return the noise curve of each camera, (C, 4), from B * C disks (L, P); see `noise_curve`."""
+    disks = [slice(camera, None, cameras) for camera in range(cameras)]
+    return torch.stack([noise_curve(model[own], residual[own], inside[own]) for own in disks])
+
+
+def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
+    """Return the noise variance's coefficients (4,), not negative, in the grey level, from pixels (N,) inside."""
+    model, residual = model[inside].clamp_min(0).double(), residual[inside].double()
+    order = model.argsort(stable=True)
+    groups = [group for group in order.tensor_split(24) if len(group) >= 50]
+    if len(groups) < 3:
+        return torch.tensor([float(residual.square().mean()) if len(residual) else 1.0, 0.0, 0.0, 0.0])
+    at = torch.stack([model[group].mean() for group in groups])
+    # Robust: the paint's borders leave residuals that are not noise.
+    seen = torch.stack([(1.4826 * residual[group].abs().median()).square() for group in groups]).clamp_min(0.1)
+    design = torch.stack([at**power for power in range(4)], dim=-1) / seen[:, None]
+    return torch.from_numpy(nnls(design.numpy(), np.ones(len(groups)))[0]).float()

@@ -17,7 +17,7 @@ UNUSED_PAINT = "unused_paint"  # entry of a track's provenance, see `worn_text`
 CELLS = 48  # per axis, in which the paint of all pictures is averaged: 2.6 degrees
 CHANGED = 0.15  # of the step from black to white: paint that differs by more is not the map's; right maps differ by 0.1
 SLACK = 0.1  # standard deviation of a cell that hardly any pixel shows
-LIMB = 0.95  # radii, up to which pixels are averaged
+LIMB = 0.95  # radii from the disk's middle, beyond which paint is too foreshortened to be compared
 ROWS = 180  # of latitude, of the map of what is not used
 SIDE = 256  # cells per axis of its table
 

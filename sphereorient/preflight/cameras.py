@@ -9,8 +9,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.causes import other_readings
-from sphereorient.calibration.comparison import Seen
+from sphereorient.calibration.comparison import Seen, other_readings
 from sphereorient.calibration.contradictions import FEWEST, OUTLINES, compare_cameras, majority, said_alone
 from sphereorient.cameras import Camera, nearest_point
 from sphereorient.errors import SphereOrientError

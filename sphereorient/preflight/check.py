@@ -8,9 +8,9 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, open_recording, silent
-from sphereorient.experiment.stream import given_scene
+from sphereorient.experiment.recording import given_scene, open_recording
 from sphereorient.experiment.timeline import Timeline
+from sphereorient.files.threads import Progress, silent
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.proposers import as_near
 from sphereorient.methods.settings import Settings

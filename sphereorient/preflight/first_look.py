@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from sphereorient.cameras import PinholeCamera
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
-from sphereorient.experiment.recording import Progress, silent
-from sphereorient.experiment.stream import CameraStream
-from sphereorient.files.draft import DraftKey
-from sphereorient.files.threads import side_by_side
+from sphereorient.experiment.recording import CameraStream
+from sphereorient.files.threads import Progress, side_by_side, silent
 from sphereorient.files.whole_file import relative_path
+from sphereorient.files.yaml_file import DraftKey
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball

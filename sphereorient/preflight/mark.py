@@ -20,7 +20,7 @@ from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text, wri
 from sphereorient.files.yaml_file import FAULTS, parse_yaml, with_value, yaml_words
 
 SHARED = {"mark.css": "text/css; charset=utf-8", "mark.js": "text/javascript; charset=utf-8"}  # beside the pages
-MOST_BYTES = 1_000_000
+MOST_BYTES = 1_000_000  # of a request
 Json = dict[str, Any]
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import Experiment, open_movies
-from sphereorient.experiment.stream import given_mask
+from sphereorient.experiment.recording import given_mask
 from sphereorient.files.picture import eight_bits, write_picture
 from sphereorient.movies import Movie, flipped_picture
 from sphereorient.preflight.first_look import FirstLook, look_at_movie
@@ -23,7 +23,7 @@ from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
 Bools = NDArray[np.bool_]
-MOST_SHAPES = 200
+MOST_SHAPES = 200  # of a mask: far more than anyone draws
 FAR_PX = 1e5
 
 

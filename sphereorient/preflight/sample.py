@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
 from sphereorient.errors import MovieError, Reason, refusal
-from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
+from sphereorient.experiment.recording import CameraStream, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from sphereorient.errors import PaintError
 from sphereorient.experiment import Sphere
-from sphereorient.experiment.recording import Progress, Recording, load_map
+from sphereorient.experiment.recording import Recording, load_map
+from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
-from sphereorient.follow.scene_start import SceneStart
+from sphereorient.follow.scene_start import EXPLAINED, SceneFound, SceneStart
 from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
 from sphereorient.mapping.compare import compare_maps
@@ -31,7 +31,6 @@ from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warn
 
 FRAMES = 8  # spread over the movies
 SEEN = 0.8  # share of the frames in which a ball should be found
-OWN = 0.35  # of the radius: a disk whose middle is that near to a ball is its own
 WHOLE = 0.7  # share of the rim of a disk that tells the size of a ball
 
 
@@ -74,7 +73,9 @@ def look_at_scene(
             frame=places[best],
             picture=np.asarray(shot.picture[:, :]),
             disks=tuple(disks[best][c]),
-            balls={name: _middle(balls[name], one, c) for name, one in found[best].items() if len(one)},
+            balls={
+                name: _middle(balls[name], one.position_lab_mm[0], c) for name, one in found[best].items() if len(one)
+            },
         )
         for c, (view, shot) in enumerate(zip(cameras, frames[best], strict=True))
         if shot.usable
@@ -122,8 +123,8 @@ def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[lis
     return found
 
 
-def _middle(ball: Initialiser, poses: Poses, camera: int) -> tuple[float, float]:
-    u, v = ball.fitter.views[camera].camera.project(poses.position_lab_mm[0]).tolist()
+def _middle(ball: Initialiser, position_lab_mm: Tensor, camera: int) -> tuple[float, float]:
+    u, v = ball.fitter.views[camera].camera.project(position_lab_mm).tolist()
     return u, v
 
 
@@ -142,7 +143,7 @@ def disk_counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str
         yield judged(f"balls {view.name}", measured, *complaints)
 
 
-def found_balls(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
+def found_balls(found: Sequence[SceneFound], balls: Mapping[str, Initialiser]) -> Iterator[Finding]:
     """Count the frames in which each ball is found by its paint."""
     for name in balls:
         count = sum(len(one[name]) > 0 for one in found)
@@ -154,7 +155,7 @@ def found_balls(found: Sequence[Mapping[str, Poses]], balls: Mapping[str, Initia
 
 
 def ball_sizes(
-    found: Sequence[Mapping[str, Poses]], disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]
+    found: Sequence[SceneFound], disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str, Initialiser]
 ) -> Iterator[Finding]:
     """Compare the diameters of balls that several cameras see with the named ones."""
     ratios: dict[str, float] = {}
@@ -166,7 +167,8 @@ def ball_sizes(
             for c, view in enumerate(ball.fitter.views)
             for disk in frame[c]
             if disk.coverage > WHOLE
-            and math.dist((disk.u_px, disk.v_px), _middle(ball, poses[name], c)) < OWN * disk.radius_px
+            and math.dist((disk.u_px, disk.v_px), _middle(ball, poses[name].position_lab_mm[0], c))
+            < EXPLAINED * disk.radius_px
         ]
         if seen:
             ratios[name] = median(seen)

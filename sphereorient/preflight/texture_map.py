@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.recording import spread_frames
 from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning

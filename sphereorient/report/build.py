@@ -10,7 +10,7 @@ from typing import Any
 
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import ROOM, has_mark, unfinished
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text
 from sphereorient.report.frame_warnings import bad_stretches
@@ -29,7 +29,6 @@ from sphereorient.trajectory import Trajectory
 KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, and what is in them
 MOST_STRIPS = 8  # tracks shown frame by frame
 PICTURES = 120  # frames of a report with pictures
-PX_PER_INCH = 120  # on the page, the same for all figures: so is their text
 FLOW_KEYS = {
     "viscosity": "viscosity_m2_s",
     "dissipation": "dissipation_w_kg",
@@ -144,7 +143,7 @@ def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[d
         figure = draw()
         write_figure(figure, folder / name)
         png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
-        width = round(PX_PER_INCH * figure.get_figwidth())
+        width = round(120 * figure.get_figwidth())  # on the page, the same for all figures: so is their text
         drawn.append({"name": name, "title": title, "caption": caption, "png": png, "width": width})
     progress("figures", len(plans), len(plans))
     return drawn

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.trajectory import Flag, Reason, Trajectory, runs_of
+from sphereorient.errors import Flag, Reason
+from sphereorient.trajectory import Trajectory, runs_of
 
 FLAG_WORDS = {
     Flag.POSITION_INTERPOLATED: "position interpolated over a gap",

@@ -23,13 +23,11 @@ from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes
 from sphereorient.trajectory import Trajectory
 
 BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
-QUALITY = 85  # of the JPEG
 TO_COMPARE = "good; to compare with"
 TILE, GAP, HEAD, TITLE, LINE, LINES = 152, 6, 54, 22, 17, 3  # px; lines of text under a frame
 BETWEEN = 18  # px, between frames
 PICTURES = 12  # side by side in a row, at most
 SUFFIXES = (".png", ".pdf", ".jpg")
-LETTER_PX = 7.4  # usual width
 Progress = Callable[[int, int], None]
 Rows = NDArray[np.int64]
 
@@ -78,7 +76,8 @@ def gallery(
             canvas, jpeg = Canvas(*_pairs_size(page)), io.BytesIO()
             _draw_pairs(canvas, page, k, pictures, (0, 0))
             # No subsampling: it blurs thin coloured lines.
-            Image.fromarray(canvas.finished()).save(jpeg, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
+            # Of the JPEG.
+            Image.fromarray(canvas.finished()).save(jpeg, "JPEG", quality=85, subsampling=0, optimize=True)
             frames[k] = GalleryFrame(k=k, words=why[k], jpeg=jpeg.getvalue())
             progress(done, len(rows))
     chosen = tuple(frames[k] for k in why)
@@ -157,7 +156,7 @@ def worst_frames(
             left, top = corner[k]
             canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {track.time[k]:.4f} s", 14)
             _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
-            lines = [line for words in bad[k] for line in textwrap.wrap(words, int(width / LETTER_PX))]
+            lines = [line for words in bad[k] for line in textwrap.wrap(words, int(width / 7.4))]  # usual width
             if len(lines) > LINES:
                 lines = [*lines[: LINES - 1], f"{lines[LINES - 1]} ..."]
             colour = ink.INK if bad[k][0].startswith("not in doubt") else ink.DOUBT

@@ -15,7 +15,7 @@ from sphereorient.calibration import Calibrated, PictureReport
 from sphereorient.files.picture import decoded_grey
 from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
-from sphereorient.movies.survey import Survey, SurveyedFrame
+from sphereorient.movies.survey import BRIGHT_QUANTILE, Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
 from sphereorient.preflight.cameras import expected_outline_px, sample_positions
 from sphereorient.preflight.first_look import FirstLook
@@ -32,7 +32,6 @@ MARKS = {Severity.OK: ("\u25cf", FOUND), Severity.WARNING: ("\u25b2", "#E69F00")
 WIDTH = 13.0  # inches, of the figures; so are:
 COLUMNS, TITLE, HEAD = 6, 0.27, 0.8  # of a contact sheet: frames in a row; the line above a frame, the title
 PICTURE, LINE = 3.3, 0.165  # of a check: a row of pictures, a line of text
-BRIGHT_QUANTILE = 0.999  # of the pixels of a contact sheet: shown white
 SHOWN = 3  # pictures of each camera
 NEAR = 1.4  # of the radius: half the side of a picture of the ball alone
 CHARACTERS = 145  # in a line of the list

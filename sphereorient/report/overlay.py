@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, OutputError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
-from sphereorient.experiment.stream import CameraStream, given_mask, pictures_of
+from sphereorient.experiment.recording import CameraStream, given_mask, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown

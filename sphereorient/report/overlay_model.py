@@ -12,13 +12,13 @@ from torch import Tensor
 from sphereorient.cameras import Camera
 from sphereorient.movies import Grey
 from sphereorient.pose.lights.disk import DiskLight, light_basis, solved_light
+from sphereorient.pose.worn import LIMB
 from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.sphere import see_sphere
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 MARGIN = 1.3  # half the side of a crop, in radii of the sphere
-LIMB = 0.95  # radii from the disk's middle beyond which the paint is too foreshortened for the light's fit
 FINE = 2  # samples along each side of a pixel
 
 

@@ -37,15 +37,9 @@ HEAD, FOOT, GAP, TITLE = 62, 40, 10, 24  # px: bands above and below, between pa
 SIDE = 310  # px, of square panels, at most
 STRIP = 16  # px, from strip to strip
 NAME = 14  # letters of a sphere's name that are shown
-ABOVE = 0.25  # of the radius: from the outline to the name
-FRAME_HEIGHT = 440  # px, of a camera's frame
-WIDEST = 1.4  # of a frame's height
-LEAST_WIDTH = 1150  # px, of a page: the line of the legend
-TRAIL_FRAMES = 40
+TRAIL_FRAMES = 40  # whose path is drawn
 OWN_PX = 1.5  # a camera's own centre further off than this is drawn
 LINE, LETTER = 18, 8  # px, of text: from line to line, and a letter's usual width
-WORDS_LETTER = 9.6  # px, the width of a letter below the panels, at most
-LABEL_AT = 1.16  # of the sphere's radius: letters of the axes
 RESIDUAL_REACH = 0.5  # of the contrast of white and black: the ends of the residual's scale
 BLANK = 45  # grey of pixels without a residual
 
@@ -208,14 +202,14 @@ class Page:
 
     def draw(self, k: int, pictures: Mapping[str, Grey | None]) -> NDArray[np.uint8]:
         """Return row k of the tracks, from the pictures (h, w) by camera, as (H, W, 3) with H and W even."""
-        height, foot = FRAME_HEIGHT, FOOT + STRIP * len(self.balls)
+        height, foot = 440, FOOT + STRIP * len(self.balls)  # px, of a camera's frame
         sizes = [view.model.camera.image_size for view in self.balls[0].views]
-        widths = [round(min(width / rows, WIDEST) * height) for width, rows in sizes]
+        widths = [round(min(width / rows, 1.4) * height) for width, rows in sizes]  # of a frame's height
         rows = math.ceil(math.sqrt(len(self.balls)))
         columns = math.ceil(len(self.balls) / rows)
         side = min(SIDE, height // rows - TITLE - LINE - 4)
         across = 3 * (side + GAP)
-        width = max(max(widths) + columns * across + 2 * GAP, LEAST_WIDTH)
+        width = max(max(widths) + columns * across + 2 * GAP, 1150)  # px, of a page: the line of the legend
         canvas = Canvas(width + width % 2, HEAD + len(sizes) * (height + GAP) + foot + foot % 2)
         self._head(canvas, k)
         for camera, name in enumerate(self.cameras):
@@ -256,7 +250,8 @@ class Page:
                 draw_outline(frame, view, k)
                 draw_axes(frame, view, k, letters=False)
                 (u, v), top = view.trail_px[k], outline_px(view.model.camera, view.model.path, k)[:, 1].min()
-                frame.text(np.array([u, top - ABOVE * (v - top)]), self.balls[place].name, 15, states[place])
+                # Of the radius: from the outline to the name.
+                frame.text(np.array([u, top - 0.25 * (v - top)]), self.balls[place].name, 15, states[place])
             frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], TRAIL, 1)
         canvas.text((corner[0] + 8, corner[1] + 20), views[0].name, 16)
         frame.say("no picture" if picture is None else "", 16)
@@ -316,7 +311,7 @@ class Panels:
             around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, INK, 1, dotted=True)
         top, room = corner[1] + TITLE + side, height - side - TITLE
-        letters = int(2 * (side + GAP) / WORDS_LETTER)
+        letters = int(2 * (side + GAP) / 9.6)  # px, the width of a letter below the panels, at most
         wrapped = [(part, colour) for text, colour in self._words(k, seen) for part in textwrap.wrap(text, letters)]
         for row, (text, colour) in enumerate(wrapped[: max(1, room // LINE)]):
             canvas.text((corner[0], top + min(24, room - 6) + LINE * row), text, 14, colour)
@@ -425,7 +420,8 @@ def draw_axes(panel: Panel, view: OverlayView, k: int, letters: bool = True) -> 
     for tip, towards, colour, letter in zip(tips, near, AXES, "xyz", strict=True):
         panel.line(np.stack([centre, tip]), colour, 2, dotted=not towards)
         if letters:
-            panel.text(centre + LABEL_AT * (tip - centre), letter, 15, colour)
+            # Of the sphere's radius: letters of the axes.
+            panel.text(centre + 1.16 * (tip - centre), letter, 15, colour)
 
 
 def own_distance_px(view: OverlayView, seen: CameraTrack, k: int) -> float:

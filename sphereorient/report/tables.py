@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import OutputError
+from sphereorient.errors import Flag, OutputError, Reason
 from sphereorient.files.whole_file import put_aside
 from sphereorient.report.columns import package, plain_cell
 from sphereorient.report.frame_warnings import stated_error
@@ -21,7 +21,7 @@ from sphereorient.statistics.lags import Correlation
 from sphereorient.statistics.moments import COMPONENTS, STATISTICS
 from sphereorient.statistics.noise import MultiLag, WidthCurve
 from sphereorient.statistics.summary import Distributions
-from sphereorient.trajectory import Flag, Reason, Trajectory
+from sphereorient.trajectory import Trajectory
 
 POOLED = ("x", "y", "z", "all")
 VECTOR = ("x", "y", "z", "vector")

@@ -31,12 +31,9 @@ from sphereorient.sphere.texture import seen_path
 from sphereorient.trajectory import Trajectory
 
 EXTENT = -180, 180, -90, 90  # of the axes of a map, degrees
-UNSEEN_GREY = 128  # of texels that no picture shows, in the file
-MOST = 255  # counts beyond are written as this
 EXAMPLES = 6  # frames that are shown
 UNSEEN = "#C9B48A"  # sand colour: differs from any paint
 REACH = 0.5  # of the contrast of white and black paint: the ends of the residual's scale
-LEAST_ARROW_DEG = 4.0  # length on the page of the largest arrow, in degrees of the map
 ARROW = "#D0021B"
 LEARNT = {  # tensors of a learnt map in its file, without a unit
     "texture": "paint, 0 black .. 1 white; NaN where never seen",
@@ -51,13 +48,14 @@ CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scal
 
 def write_texture(texture: Tensor, path: Path) -> None:
     """Write a texture map (H, 2 H), 0 .. 1 or NaN (mid-grey), as 8-bit picture; may raise OutputError."""
-    grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN_GREY))
+    # Of texels that no picture shows, in the file.
+    grey = torch.where(torch.isfinite(texture), 255 * texture, float(128))
     write_picture(path, grey.round().clamp(0, 255).byte().numpy())
 
 
 def write_seen(seen: Tensor, texture: Path) -> None:
     """Write counts (H, 2 H) beside a texture map as 8-bit picture, limited to 255; may raise OutputError."""
-    write_picture(seen_path(texture), seen.clamp(0, MOST).byte().numpy())
+    write_picture(seen_path(texture), seen.clamp(0, 255).byte().numpy())  # counts beyond are written as this
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
@@ -230,7 +228,8 @@ def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
     longitude, latitude = torch.atan2(y, x), torch.asin(z.clamp(-1, 1))
     moved = torch.rad2deg(comparison.moved_rad[known])
     largest = float(moved.norm(dim=-1).quantile(0.95).clamp_min(1e-6))
-    times = max([step for step in (1, 2, 5, 10, 20, 50) if step * largest <= 2 * LEAST_ARROW_DEG], default=1)
+    # Length on the page of the largest arrow, in degrees of the map.
+    times = max([step for step in (1, 2, 5, 10, 20, 50) if step * largest <= 2 * 4.0], default=1)
     # The map stretches longitudes away from the equator.
     along = moved[:, 0] / latitude.cos().clamp_min(0.1)
     style: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "color": ARROW, "width": 0.0022}

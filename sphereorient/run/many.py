@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
-from sphereorient.experiment.recording import Progress, silent
-from sphereorient.files.threads import limit_cores
+from sphereorient.files.threads import Progress, limit_cores, silent
 from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import one_thread
 from sphereorient.run.stages import Task, Work, check_method, check_out, opened, stages

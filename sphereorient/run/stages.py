@@ -9,12 +9,11 @@ from typing import Any
 
 import torch
 
-from sphereorient.calibration.contradictions import with_contradictions
-from sphereorient.calibration.systematic import with_systematic_errors
 from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
-from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.provenance import provenance, sha256
+from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import check_folder, check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
@@ -22,7 +21,6 @@ from sphereorient.methods.kinds import METHODS
 from sphereorient.methods.method import Job, Learnt, Method, load_learnt, one_thread, save_learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
-from sphereorient.pose.lasting import Lasting, with_lasting_errors
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -122,10 +120,7 @@ class Work:
         joined = self.method.join(self.job, self.follower, measured, self.progress)
         learnt = {name: known for name, (_, known) in joined.items() if known is not None}
         tracks = Tracks(
-            {
-                name: finished(track, self.job.of(name), self.request, None if known is None else known.lasting)
-                for name, (track, known) in joined.items()
-            }
+            {name: finished(track, self.job.of(name), self.request, known) for name, (track, known) in joined.items()}
         )
         with writing_of(self.request):
             if learnt and self.request.save_learnt is not None:
@@ -187,22 +182,14 @@ def track_movies(
     return run(request, MemoryStore(), progress=progress)
 
 
-def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | None) -> Trajectory:
-    """Add the errors of calibration, of cameras that contradict each other, and of what lasts, and the provenance."""
+def finished(track: Trajectory, job: Job, request: Request, known: Learnt | None) -> Trajectory:
+    """Add the errors that the fits do not hold, and the provenance."""
     recording, settings = job.recording, job.settings
-    track = with_systematic_errors(track, recording.cameras, recording.covariance, recording.experiment.radius_mm)
     remarks = [*recording.remarks, *track.provenance.get("remarks", ()), *results.missed_text(track)]
-    if len(recording.cameras) > 1:
-        diameter_mm, even = 2 * recording.experiment.radius_mm, recording.timeline.even
-        lasting_rad2 = 0.0 if lasting is None else lasting.own_rad2
-        track, found = with_contradictions(track, recording.cameras, diameter_mm, even, lasting_rad2)
-        if found.contradicts:
-            remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
-    if lasting is not None:
-        track = with_lasting_errors(track, lasting)  # after the others: only noise is scaled
+    track, doubts = results.with_errors(track, recording, None if known is None else known.lasting, compared=True)
     inputs = input_files(recording.experiment, list(recording.cameras))
     origin = dict(track.provenance) | provenance(inputs, recording.experiment.folder, request.command)
-    origin["remarks"] = remarks
+    origin["remarks"] = remarks + doubts
     if settings.propose.checkpoint is not None:
         origin["proposer_sha256"] = sha256(checkpoint_path(settings.propose.checkpoint))
     return replace(track, method=request.method, settings=settings_yaml(settings), provenance=origin)

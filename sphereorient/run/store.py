@@ -20,11 +20,10 @@ from sphereorient.experiment import Experiment, input_files, load_experiment
 from sphereorient.files.hdf5 import DAMAGE, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.files.whole_file import is_forced, write_text, writing
 from sphereorient.follow.follower import Batch
-from sphereorient.follow.poses import Poses
 from sphereorient.methods.method import Learnt, load_learnt, save_learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
-from sphereorient.pose.poses import POSE_PARTS
+from sphereorient.pose.poses import POSE_PARTS, Poses
 
 SCHEMA = "sphereorient-poses/1"
 LOCK, PROCESS = "lock", "process"  # files in the folder of a run

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from sphereorient.errors import Reason, ShapeError, check_finite, check_tail, refusal, tensor_of
 
+BATCH = 32  # disks at once: full ones give the same bits for any number of disks
 SAME_DEG = 12.0  # proposals of two proposers nearer than this are one
 
 

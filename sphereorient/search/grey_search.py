@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
+from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
@@ -18,7 +18,6 @@ from sphereorient.sphere import orthographic_view, perspective_view
 from sphereorient.sphere.texture_table import texture_table
 
 # Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
-BATCH = 32
 PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
 GROUP = 8  # neighbouring templates, represented by their best one
 LOOKED_AT = 32  # best groups that are searched for peaks: a broad peak spans several

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.model import polynomials
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere import DiskView
 from sphereorient.sphere.texture_table import TextureTable
+from sphereorient.sphere.view import polynomials
 
 WHITE_ORDER, BLACK_ORDER = 2, 1  # of the light's polynomials over the disk: on the paint, and without it
 STEP_RAD = 0.14  # longest step that the paint's slope predicts

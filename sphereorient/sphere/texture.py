@@ -12,9 +12,8 @@ from sphereorient.errors import ShapeError, TextureError, check_tail, refusal, t
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
-PICTURE_BYTES = 100_000_000
+PICTURE_BYTES = 100_000_000  # of a picture file, which is read whole
 MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
-OPAQUE = 128  # of 255: texels of less alpha are no paint
 SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
 OVERSHOOT = 2.0  # a map that was learnt may exceed white a little; grey levels are far above
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
@@ -78,7 +77,8 @@ def load_unseen(texture: Path) -> Tensor | None:
     with Image.open(texture) as picture:
         size = picture.height, picture.width
         alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else np.full(size, 255)
-    unseen, counts = torch.from_numpy(alpha < OPAQUE), read_seen(seen_path(texture))
+    # Of 255: texels of less alpha are no paint.
+    unseen, counts = torch.from_numpy(alpha < 128), read_seen(seen_path(texture))
     if counts is not None and counts.shape != unseen.shape:
         expected, got = (f"{shape[1]} x {shape[0]}" for shape in (size, counts.shape))
         do = f"take the one that was written with {texture.name}, or move it away"
@@ -212,3 +212,45 @@ def spline_weights(place: Tensor) -> tuple[Tensor, Tensor]:
     s = 1.0 - t
     weights = [s**3, 4.0 - 3.0 * t * t * (1.0 + s), 4.0 - 3.0 * s * s * (1.0 + t), t**3]
     return below.long() - 1, torch.stack(weights, dim=-1) / 6.0
+
+
+def random_directions(count: int, rng: torch.Generator) -> Tensor:
+    """Draw uniform unit directions, (count, 3) float64."""
+    draw = torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    return torch.nn.functional.normalize(draw, dim=-1)
+
+
+def blobs(height: int, rng: torch.Generator) -> Tensor:
+    """Draw smooth blobs, half of the sphere white."""
+    wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
+    phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
+    rows = torch.split(map_directions(height), 2)  # all at once would fill 250 MB
+    value = torch.cat([torch.cos(body @ wave.T + phase).sum(-1) for body in rows])
+    return _edge(value - value.median(), 0.25)
+
+
+def polygons(height: int, rng: torch.Generator) -> Tensor:
+    """Draw black and white regions nearest to random points."""
+    points = random_directions(60, rng)
+    owner = (map_directions(height) @ points.T).argmax(-1)
+    return (owner % 2).float()
+
+
+def dots(height: int, rng: torch.Generator) -> Tensor:
+    """Draw black dots of 8 to 14 degrees radius on white."""
+    points = random_directions(34, rng)
+    radius = torch.deg2rad(8 + 6 * torch.rand(34, generator=rng, dtype=torch.float64))
+    outside = (torch.acos((map_directions(height) @ points.T).clamp(-1, 1)) - radius).amin(-1)
+    return _edge(outside, math.pi / height)
+
+
+def _edge(value: Tensor, width: float) -> Tensor:
+    return (0.5 + value / width).clamp(0, 1).float()
+
+
+KINDS = {"blobs": blobs, "patches": polygons, "dots": dots}
+
+
+def random_texture(kind: str, seed: int, height: int = 512) -> Tensor:
+    """Draw a texture map of a kind in `KINDS`, (H, 2 H) float32, 0 black .. 1 white; equal seeds give equal maps."""
+    return KINDS[kind](height, torch.Generator().manual_seed(seed))

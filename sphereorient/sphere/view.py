@@ -117,3 +117,14 @@ def smooth_positive(x: Tensor, width: float) -> Tensor:
     root = (x * x + width * width).sqrt()
     # The second form avoids the difference of nearly equal numbers.
     return torch.where(x > 0, 0.5 * (x + root), 0.5 * width * width / (root + x.abs()))
+
+
+def polynomials(across: Tensor, order: int) -> Tensor:
+    """Return all monomials of x and y up to an order, (..., K, P), from places (..., 2, P)."""
+    x, y = across[..., 0, :], across[..., 1, :]
+    columns = [torch.ones_like(x)]
+    last = columns
+    for _ in range(order):
+        last = [last[0] * x, *(column * y for column in last)]
+        columns = [*columns, *last]
+    return torch.stack(columns, dim=-2)

@@ -19,7 +19,7 @@ FEWEST = 2  # segments; one alone has no scatter
 AT_ONCE = 4_000_000  # numbers of a block of weights
 ENOUGH = 20  # segments of the studentized bootstrap; with fewer the resampled errors are too rough
 STEP = 0.01  # of a derivative by differences, relative to the root of the sum of squares over the segments
-RESAMPLES_AT_ONCE = 200
+RESAMPLES_AT_ONCE = 200  # bounds memory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

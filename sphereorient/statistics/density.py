@@ -17,8 +17,7 @@ NODES = 120  # values of a at which the likelihood is tabulated
 STEP = 1e-3  # of ln|x|, of its derivative
 FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
-TINY = 1e-300
-HERMITE = 24  # nodes for the noise
+TINY = 1e-300  # keeps the logarithm of 0 finite
 REACH, BINS = 10.0, 61  # of the PDF to either side, standard deviations; odd: one bin is about 0
 
 
@@ -33,7 +32,7 @@ def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
 def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float = 0.0) -> Floats:
     """Return the logarithm of `stretched_exponential`; `noise_share` (< 1) of the variance of x is normal noise."""
     if noise_share > 0:
-        place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
+        place, weight = np.polynomial.hermite_e.hermegauss(24)  # nodes for the noise
         clean = np.sqrt(1 - noise_share)
         each = [log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a) for z in place]
         logs = [np.log(w / np.sqrt(2 * np.pi)) + one for w, one in zip(weight, each, strict=True)]

@@ -7,11 +7,11 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import TrackError, refusal
+from sphereorient.errors import Flag, TrackError, refusal
 from sphereorient.motion import RATE_UNITS
 from sphereorient.statistics.bootstrap import FEWEST, Floats, Interval, Rows
 from sphereorient.statistics.settings import SegmentSettings
-from sphereorient.trajectory import Flag, Trajectory
+from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.datasets import stored_fields
 
 UNITS = {name: spec.units for name, spec in stored_fields(Trajectory) if name in RATE_UNITS}  # of the six quantities

@@ -12,13 +12,12 @@ from sphereorient import so3
 from sphereorient.cameras import Rays
 from sphereorient.sphere import reduced_texture, see_sphere
 from sphereorient.sphere.renderer import lambert
+from sphereorient.sphere.texture import random_directions
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth.degrade import OPERATIONS, Disk, blurred, centre_error, degrade, radius_error
 from sphereorient.synth.scene import LIT
 from sphereorient.synth.severities import DEGRADATIONS, check_values
-from sphereorient.synth.textures import random_directions
 
-MARGIN = 0.2  # picture beyond the limb, radii
 BLUR_INSTANTS = 8  # sampled orientations per exposure
 LEVELS = (120.0, 200.0), (8.0, 30.0), (8.0, 40.0)  # grey level ranges of white paint, black paint, background
 AMBIENT = (0.3, 1.0)  # range of the ambient share
@@ -57,7 +56,7 @@ def film_disks(
         scale = max(scale, min(1.0, settings.size_px / diameter))  # coarse pictures keep their size
     radius = diameter * scale / 2
     count = len(R_view_body)
-    side = 2 * math.ceil(radius * (1 + MARGIN)) + 2
+    side = 2 * math.ceil(radius * (1 + 0.2)) + 2  # picture beyond the limb, radii
     middle = side / 2 - 0.5 + torch.rand((count, 2), generator=rng) - 0.5
     disk = Disk(centre_px=middle, radius_px=torch.full((count,), radius))
     grey, behind = _lit(texture, R_view_body.float(), values, disk, side, rng)

@@ -1,6 +1,6 @@
 import math
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.cameras import Camera, centre_lab_mm
+from sphereorient.cameras import Camera, centre_lab_mm, sphere_disk_px
 from sphereorient.sphere import reduced_texture
 from sphereorient.sphere.renderer import fine_pixels, reach_px
 from sphereorient.sphere.texture import closed_texture
@@ -18,6 +18,7 @@ from sphereorient.synth.settings import SynthSettings
 
 SUPERSAMPLING = 3  # rays per pixel and axis: edges are accurate to a few per cent
 AT_ONCE = 256  # frames whose places in the picture are computed at once
+POINTS = 41  # across a disk, of which some are hidden
 ROOM = 6  # rays are computed for windows that are wider by this part on each side: they serve some frames
 
 # Lamp directions from the sphere (lab) and shares: two bright, one weak, so that no side is black.
@@ -266,3 +267,27 @@ def seeded(*what: str | int) -> torch.Generator:
     words = [zlib.crc32(word.encode()) if isinstance(word, str) else word for word in what]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(state[0]) >> 1)
+
+
+def hidden_shares(
+    places: Mapping[str, Doubles], cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
+) -> dict[str, Doubles]:
+    """Return for each ball at places (N, 3), lab, mm, the share of its disk that nearer ones cover, (C, N), all as
+    circles.
+    """
+    across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
+    grid = torch.cartesian_prod(across, across)
+    grid = grid[grid.square().sum(1) < 1]
+    shares: dict[str, list[Doubles]] = {name: [] for name in places}
+    for camera in cameras.values():
+        X = {name: torch.from_numpy(place) for name, place in places.items()}
+        disks = {name: sphere_disk_px(camera, place, radii_mm[name]) for name, place in X.items()}
+        far_mm = {name: (place - centre_lab_mm(camera)).norm(dim=-1) for name, place in X.items()}
+        for name, (middle, radius) in disks.items():
+            at = middle[:, None] + radius[:, None, None] * grid
+            covered = torch.zeros(at.shape[:2], dtype=torch.bool)
+            for other, (there, size) in disks.items():
+                inside = (at - there[:, None]).norm(dim=-1) < size[:, None]
+                covered |= inside & (far_mm[other] < far_mm[name])[:, None]
+            shares[name].append(covered.double().mean(1).numpy())
+    return {name: np.stack(each) for name, each in shares.items()}

@@ -21,15 +21,15 @@ from sphereorient.files.hdf5 import ball_group, whole_hdf5
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
+from sphereorient.sphere.texture import random_texture
 from sphereorient.synth.degrade import OF_ONE_BALL, Disk
 from sphereorient.synth.degrade_scene import Filming, degraded_settings, picture_of_ball, worn, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion, without_seam
 from sphereorient.synth.scene import Exposure, digitise, exposures, make_scene, seeded
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import degradation, severity
-from sphereorient.synth.textures import random_texture
 
-PIXEL_PITCH_MM = 0.02
+PIXEL_PITCH_MM = 0.02  # of usual high-speed cameras
 DRAWS = 500  # motions tried for each ball
 NEXT_SEED = 1_000_003  # from one ball or draw to the next: no two scenes share one
 

@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import ShapeError, TrackError, refusal
+from sphereorient.errors import Reason, ShapeError, TrackError, refusal
+from sphereorient.files.whole_file import LARGEST_RATIO
 
 KEY = "column"
-LARGEST_RATIO = 1200  # compression ratio; a dataset that claims more is not in the file
 
 
 @dataclass(frozen=True)
@@ -135,3 +135,9 @@ def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return first and last + 1 of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def reasons_of(texts: Any) -> tuple[str, ...]:
+    """Return stored texts (N,), bytes, as reasons; texts of newer files stay texts."""
+    known = {str(reason): reason for reason in Reason}
+    return tuple(known.get(text, text) for text in (each.decode() for each in texts.tolist()))

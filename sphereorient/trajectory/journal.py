@@ -13,8 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.trajectory.datasets import blank_datasets, stored_fields
-from sphereorient.trajectory.reasons import reasons_of
+from sphereorient.trajectory.datasets import blank_datasets, reasons_of, stored_fields
 
 SCHEMA = "sphereorient-journal/1"
 MARK = f'{{"schema": "{SCHEMA}"'.encode()

@@ -13,11 +13,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
+from sphereorient.errors import Flag, OutputError, Reason, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, SPHERES, whole_hdf5
 from sphereorient.trajectory import datasets, journal
-from sphereorient.trajectory.datasets import in_length, stored, stored_fields
-from sphereorient.trajectory.reasons import Flag, Reason, reasons_of
+from sphereorient.trajectory.datasets import in_length, reasons_of, stored, stored_fields
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,9 +18,10 @@ from sphereorient.bench.figures import density_figure, write_table
 from sphereorient.bench.results import compare_runs, summaries
 from sphereorient.bench.run import track_scene
 from sphereorient.bench.scenes import BenchmarkScene
-from sphereorient.bench.score import given_to_others, hidden_shares, named_as_true, score_track
+from sphereorient.bench.score import given_to_others, named_as_true, score_track
 from sphereorient.cameras import PinholeCamera, save_cameras
 from sphereorient.errors import BenchError, SettingsError, TrackError
+from sphereorient.synth.scene import hidden_shares
 from sphereorient.synth.write import default_cameras, experiment_document
 from sphereorient.trajectory import Tracks, Trajectory
 
@@ -88,7 +89,7 @@ def test_a_track_of_one_ball_is_no_track_of_several(tmp_path):
         score_track(track, tmp_path / "truth.h5")
 
 
-def test_what_nearer_balls_hide_is_the_lens_that_two_circles_share(tmp_path):
+def test_what_nearer_balls_hide_is_the_lens_that_two_circles_share():
     """By hand: circles whose centres are a radius apart share 2/3 - sqrt(3) / (2 pi), 0.391, of each."""
     far, radius = 1e6, 9.0  # so far away that depth changes no size
     lens = PinholeCamera(
@@ -99,12 +100,9 @@ def test_what_nearer_balls_hide_is_the_lens_that_two_circles_share(tmp_path):
         f_px=torch.tensor(5.0 * far, dtype=torch.float64),
     )
     places = {"a": [0.0, 0.0, 0.0], "b": [radius, 0.0, -40.0], "c": [-3 * radius, 0.0, -80.0], "d": [0.0, 0.0, 50.0]}
-    with h5py.File(tmp_path / "truth.h5", "w") as file:
-        for name, place in places.items():
-            group = file.create_group(f"spheres/{name}")
-            group["time"], group["position"] = np.zeros(1), np.array([place])
-            group["orientation"] = np.eye(3)[None]
-    found = hidden_shares(tmp_path / "truth.h5", {"cam1": lens}, dict.fromkeys(places, radius))
+    found = hidden_shares(
+        {name: np.array([place]) for name, place in places.items()}, {"cam1": lens}, dict.fromkeys(places, radius)
+    )
     assert found["a"].shape == (1, 1)
     assert found["a"][0, 0] == pytest.approx(2 / 3 - np.sqrt(3) / (2 * np.pi), abs=0.02)  # b covers it
     assert found["b"][0, 0] == found["c"][0, 0] == 0.0

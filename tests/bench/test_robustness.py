@@ -17,6 +17,7 @@ from sphereorient.bench import (
     compare_runs,
     load_results,
     scenes_of,
+    write_scene,
 )
 from sphereorient.bench.figures import robustness_figure, worst_first, write_table
 from sphereorient.bench.results import save_results, summaries, summarised
@@ -215,7 +216,7 @@ def never(experiment: Path) -> Trajectory:
 
 def test_what_a_method_refuses_is_an_outcome(tmp_path):
     (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), frames=12, together=0))
-    (found,) = track_scene(tmp_path / "experiment.yaml", scene, "never", never)
+    (found,) = track_scene(write_scene(tmp_path, scene), scene, "never", never)
     assert found.refused.startswith("movies: expected a ball")
     assert found.lost == 12
 

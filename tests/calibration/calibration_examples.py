@@ -13,7 +13,7 @@ from sphereorient import so3
 from sphereorient.calibration import DotPlate, PlateView, disk_centre_shift
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
 from sphereorient.calibration.document import CalibrationDocument, CalibrationKeys
-from sphereorient.calibration.guess import guess_rig
+from sphereorient.calibration.tsai_method import guess_rig
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.parameters import with_parameters

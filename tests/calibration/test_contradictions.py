@@ -12,10 +12,10 @@ import torch
 
 from sphereorient import so3
 from sphereorient.calibration.contradictions import with_contradictions
+from sphereorient.calibration.systematic import with_lasting_errors
 from sphereorient.cameras import Camera, sphere_radius_px
 from sphereorient.methods.results import missed_by
 from sphereorient.pose.camera_view import CameraView
-from sphereorient.pose.lasting import Lasting, with_lasting_errors
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
 from sphereorient.trajectory import Flag, Reason, Trajectory
@@ -112,13 +112,12 @@ def test_what_lasts_is_added_by_the_cameras_that_measured_a_frame():
     rng = np.random.default_rng(5)
     whole, cam1, cam2 = (torch.from_numpy(a @ np.swapaxes(a, -1, -2)) for a in (rng.normal(size=(3, 6, 6))))
     alone = torch.stack([cam1, cam2])
-    lasting = Lasting(covariance=whole, own_rad2=torch.zeros(2, 3, 3), alone=alone)
     track = track_of({}, {})
     track = replace(track, orientation_smooth_cov=2 * track.orientation_cov, position_smooth_cov=2 * track.position_cov)
     reason = (Reason.OK, Reason.CONTRADICTS, Reason.NOT_FOUND, *[Reason.OK] * (FRAMES - 3))
     reasons = {"cam1": reason[::-1], "cam2": reason}
     one = {name: replace(camera, reason=reasons[name]) for name, camera in track.cameras.items()}
-    added = with_lasting_errors(replace(track, cameras=one), lasting)
+    added = with_lasting_errors(replace(track, cameras=one), whole, alone)
     more = np.stack([whole.numpy()] * FRAMES)
     more[1:3], more[-3:-1] = cam1.numpy(), cam2.numpy()
     for kind in ("_cov", "_smooth_cov"):
@@ -214,8 +213,8 @@ def test_of_three_cameras_in_use_one_that_is_off_moves_the_mean_by_a_third():
 
 
 def test_lasting_errors_are_larger_where_fewer_cameras_count():
-    lasting = replace(Lasting.none(3), covariance=torch.eye(6, dtype=torch.float64))
+    lasting = torch.eye(6, dtype=torch.float64), torch.zeros(3, 6, 6, dtype=torch.float64)
     all_three = track_of({}, {}, of=THREE)
     two = track_of({}, {}, Reason.LOW_SCORE, THREE)
-    added = [with_lasting_errors(one, lasting).position_cov[0, 0, 0] - 1e-6 for one in (all_three, two)]
+    added = [with_lasting_errors(one, *lasting).position_cov[0, 0, 0] - 1e-6 for one in (all_three, two)]
     np.testing.assert_allclose(added, [1.0, 1.5])

@@ -16,7 +16,7 @@ from calibration_examples import (
 )
 
 from sphereorient import so3
-from sphereorient.calibration.guess import guess_from_points, guess_rig
+from sphereorient.calibration.tsai_method import guess_from_points, guess_rig
 from sphereorient.cameras import PinholeCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.errors import CameraError

@@ -10,7 +10,7 @@ from conftest import assert_close
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sphereorient.cameras.tsai import FOLD, shrinkage
+from sphereorient.cameras.brown import FOLD, shrinkage
 from sphereorient.errors import CameraError
 
 

@@ -12,8 +12,7 @@ from conftest import REPO
 
 from sphereorient import cli, so3
 from sphereorient.calibration import check_cameras, refine_with_track
-from sphereorient.calibration.self_calibration import observations_of
-from sphereorient.calibration.table import check_lines, contradiction_lines, repair_lines
+from sphereorient.calibration.self_calibration import check_lines, contradiction_lines, observations_of, repair_lines
 from sphereorient.cameras import TsaiCamera, load_cameras, save_cameras
 from sphereorient.cameras.parameters import with_parameters
 from sphereorient.errors import CameraError, TrackError

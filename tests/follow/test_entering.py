@@ -11,9 +11,9 @@ from run_examples import EXCERPT, SHORT
 
 from sphereorient import so3
 from sphereorient.follow.ball import BallTracker
-from sphereorient.follow.poses import no_pose
 from sphereorient.methods.method import load_learnt
 from sphereorient.methods.settings import load_settings
+from sphereorient.pose.poses import no_pose
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.trajectory import Reason
 

@@ -16,18 +16,18 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, follows_place, mean_place
 from sphereorient.follow.follower import sample_frames
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 

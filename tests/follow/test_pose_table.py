@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from sphereorient import so3
-from sphereorient.follow.poses import Poses, exchanged, no_pose, pose_table, pose_tables
-from sphereorient.pose.poses import POSE_PARTS
+from sphereorient.pose.poses import POSE_PARTS, Poses, exchanged, no_pose, pose_table, pose_tables
 from sphereorient.trajectory import Reason
 
 CAMERAS = 2

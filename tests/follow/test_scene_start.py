@@ -15,12 +15,11 @@ from locate_examples import SETTINGS, even_background, looking_along_y, looking_
 
 from sphereorient import so3
 from sphereorient.cameras import sphere_disk_px
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.scene_start import Ahead, SceneStart, look_of
 from sphereorient.locate import CameraScene, Frame, Match, places_of
-from sphereorient.locate.matching import assigned
+from sphereorient.locate.position import assigned
 from sphereorient.pose import CameraView
-from sphereorient.pose.poses import blank_parts
+from sphereorient.pose.poses import Poses, blank_parts
 from sphereorient.trajectory import Reason
 
 RADIUS = 9.0

@@ -11,12 +11,12 @@ from several_examples import FRAMES, write_several
 
 from sphereorient import so3
 from sphereorient.experiment.recording import open_recording
-from sphereorient.follow.poses import no_pose
 from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import screened_frames
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import load_settings
+from sphereorient.pose.poses import no_pose
 from sphereorient.run.stages import run
 from sphereorient.run.store import FolderStore, MemoryStore, Request, read_poses
 from sphereorient.trajectory import Reason, Tracks

@@ -16,8 +16,7 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import Chunk, mirrored, regained
 from sphereorient.follow.follower import cameras_disagree
 from sphereorient.follow.initialise import by_decreasing_size
-from sphereorient.follow.poses import Poses, no_pose
-from sphereorient.pose.poses import blank_parts
+from sphereorient.pose.poses import Poses, blank_parts, no_pose
 from sphereorient.trajectory import Reason
 
 TIMES = [0.0, 1.0, 2.5, 3.2]

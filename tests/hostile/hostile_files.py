@@ -26,7 +26,7 @@ from movie_examples import smooth
 from movie_formats import EIGHT_BIT, LOSSLESS, Frames, Writer, cine, video
 from movie_formats import tiff as tiff_writer
 
-from sphereorient.experiment.stream import load_background
+from sphereorient.experiment.recording import load_background
 from sphereorient.experiment.timeline import load_times
 from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture

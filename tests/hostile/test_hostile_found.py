@@ -20,7 +20,7 @@ from sphereorient.cameras import Camera, load_cameras
 from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, TextureError
-from sphereorient.experiment.stream import load_background
+from sphereorient.experiment.recording import load_background
 from sphereorient.files.whole_file import read_whole
 from sphereorient.files.yaml_file import parse_yaml
 from sphereorient.methods.settings import load_settings

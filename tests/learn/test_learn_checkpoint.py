@@ -26,7 +26,7 @@ from sphereorient.learn.checkpoint import (
     texture_sha256,
 )
 from sphereorient.sphere import load_texture
-from sphereorient.synth.textures import random_texture
+from sphereorient.sphere.texture import random_texture
 
 ABOUT = {"torch": "2.6", "steps": 100, "validation_ece": 0.02}
 

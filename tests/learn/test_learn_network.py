@@ -16,9 +16,8 @@ from sphereorient import so3
 from sphereorient.learn.metrics import cross_entropy, predict
 from sphereorient.learn.network import SCALES, Correlator, find_modes, first_right, map_blurs
 from sphereorient.learn.pictures import TrainingBatch
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import map_directions, random_texture
 from sphereorient.sphere.texture_table import octahedral_directions
-from sphereorient.synth.textures import random_texture
 
 SIDE = 32
 DIRECTION = octahedral_directions(SIDE)

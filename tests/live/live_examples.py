@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 from conftest import REPO
 
-from sphereorient.follow.poses import no_pose
 from sphereorient.live.feed import Arrival
 from sphereorient.live.live import Measured
+from sphereorient.pose.poses import no_pose
 from sphereorient.trajectory import Reason, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"

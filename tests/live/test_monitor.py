@@ -17,12 +17,12 @@ from overlay_examples import true_track
 from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.live import Measured, measured
 from sphereorient.live.loop import open_live
-from sphereorient.live.monitor import LOST_S, Monitor
+from sphereorient.live.page import LOST_S, Monitor
 from sphereorient.live.sources import movie_frames
 from sphereorient.methods.method import Learnt, save_learnt
 from sphereorient.methods.settings import Settings
 from sphereorient.report.texture_map import write_texture
-from sphereorient.synth.textures import blobs
+from sphereorient.sphere.texture import blobs
 from sphereorient.trajectory import Reason
 
 

@@ -25,8 +25,7 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.files.page_server import HOST
 from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.lines import FicTracLines
-from sphereorient.live.monitor import Monitor
-from sphereorient.live.page import LivePage, open_page
+from sphereorient.live.page import LivePage, Monitor, open_page
 from sphereorient.live.sources import movie_frames
 from sphereorient.trajectory import Reason
 

@@ -11,7 +11,7 @@ import pytest
 from locate_examples import BACK, DIAMETER, SETTINGS, Paint, blobs, even_background, filmed, plant, white
 
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.stream import load_background, spread_frames
+from sphereorient.experiment.recording import load_background, spread_frames
 from sphereorient.locate import Background, learn_background
 from sphereorient.locate.background import measure_background, without_ball
 from sphereorient.locate.outline import find_blobs

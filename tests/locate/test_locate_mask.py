@@ -11,7 +11,7 @@ import torch
 from locate_examples import BACK, DIAMETER, SETTINGS, SHAPE, blobs, even_background, filmed, looking_down, plant
 
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.stream import load_mask
+from sphereorient.experiment.recording import load_mask
 from sphereorient.locate import Background, find_ball
 from sphereorient.locate.scene import fixed_ball, learn_background
 from sphereorient.pose.pixels import LinesOfSight, cut_pixels, disk_stencil

@@ -10,8 +10,8 @@ from conftest import assert_close
 from locate_examples import looking_along_y, looking_down
 
 from sphereorient.cameras import sphere_disk_px
-from sphereorient.locate.matching import match_disks, places_of
 from sphereorient.locate.outline import Outline
+from sphereorient.locate.position import match_disks, places_of
 
 RADIUS = 9.0
 S = 2**-0.5

@@ -10,7 +10,8 @@ import torch
 import yaml
 from torch import Tensor
 
-from sphereorient.experiment.recording import Recording, open_recording, silent
+from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import LearntMap, MapSettings, fit_map, take_crops
 from sphereorient.mapping.disks import Crops

@@ -9,7 +9,7 @@ from sphereorient import so3
 from sphereorient.mapping.disks import Disks, normalised_disks
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.sphere import perspective_view, sample_texture
-from sphereorient.synth.textures import random_texture
+from sphereorient.sphere.texture import random_texture
 
 SIZE, DISTANCE = 48, 20.0
 LAMP_LAB = torch.tensor([0.5, -0.6, -0.6], dtype=torch.float64)

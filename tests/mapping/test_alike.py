@@ -8,13 +8,12 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.experiment.recording import silent
+from sphereorient.files.threads import silent
 from sphereorient.mapping import LearntMap
-from sphereorient.mapping.alike import shared_maps
+from sphereorient.mapping.balls import shared_maps
 from sphereorient.mapping.compare import turned_map
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import map_directions, random_texture
 from sphereorient.synth import SynthSettings
-from sphereorient.synth.textures import random_texture
 
 pytestmark = pytest.mark.slow  # 15 s
 ROWS, SIGMA = 64, 0.06

@@ -11,8 +11,8 @@ import torch
 from sphereorient.cameras import sphere_disk_px
 from sphereorient.errors import PaintError
 from sphereorient.locate import CameraScene
-from sphereorient.locate.matching import assigned
 from sphereorient.locate.outline import Outline
+from sphereorient.locate.position import assigned
 from sphereorient.mapping.balls import FARTHEST, FREE, _crops_of, _instant, _linked, _places
 from sphereorient.mapping.disks import Crop
 from sphereorient.pose.camera_view import CameraView

@@ -11,7 +11,7 @@ from map_examples import shift_field, warped
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.mapping.alike import nearest_texels
+from sphereorient.mapping.balls import nearest_texels
 from sphereorient.mapping.compare import (
     compare_maps,
     compass,
@@ -21,8 +21,7 @@ from sphereorient.mapping.compare import (
     turned_map,
     without_changed,
 )
-from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.textures import random_texture
+from sphereorient.sphere.texture import map_directions, random_texture
 
 HEIGHT = 128
 TURN = so3.exp(torch.tensor([1.2, -2.0, 0.4], dtype=torch.float64))

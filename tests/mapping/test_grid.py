@@ -26,8 +26,7 @@ from sphereorient.mapping.grid import (
     texel_weights,
 )
 from sphereorient.mapping.joint import LinearSystem
-from sphereorient.sphere.texture import map_directions, sample_spline
-from sphereorient.synth.textures import random_directions, random_texture
+from sphereorient.sphere.texture import map_directions, random_directions, random_texture, sample_spline
 
 
 def test_a_look_up_is_the_spline_of_the_room_sphere(rng):

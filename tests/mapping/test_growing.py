@@ -9,12 +9,11 @@ from growing_examples import RATE_HZ, SETTINGS, grown_map, turning_ball  # noqa:
 from renders import error_deg
 
 from sphereorient import so3
-from sphereorient.follow.poses import Poses
 from sphereorient.locate import Frame
+from sphereorient.mapping.chain import RelativeTracker
 from sphereorient.mapping.disks import cut_out
 from sphereorient.mapping.growing import FIRST, FIRST_FRAMES, GrowingMap
-from sphereorient.mapping.relative import RelativeTracker
-from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.poses import Poses, PoseStart
 from sphereorient.trajectory import Reason
 
 

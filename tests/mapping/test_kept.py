@@ -9,7 +9,8 @@ import torch
 from map_examples import unpainted
 
 from sphereorient.errors import PaintError
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, fit_map, iterations, learn, take_crops
 from sphereorient.mapping.learn import read_kept, write_kept

@@ -17,9 +17,9 @@ from renders import error_deg
 
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment, open_movies
-from sphereorient.experiment.recording import Recording, TextureMap, silent
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.recording import CameraStream, Recording, TextureMap
 from sphereorient.experiment.timeline import timeline
+from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
 from sphereorient.mapping.compare import fibonacci_directions

@@ -23,7 +23,7 @@ from sphereorient.mapping.compare import compare_maps
 from sphereorient.movies import open_movie
 from sphereorient.report.texture_map import shares_seen, write_seen, write_texture
 from sphereorient.sphere import load_texture, read_seen, seen_path
-from sphereorient.synth.textures import random_texture
+from sphereorient.sphere.texture import random_texture
 from sphereorient.trajectory import Trajectory
 
 

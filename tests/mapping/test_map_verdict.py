@@ -15,7 +15,8 @@ from map_examples import SMALL, rewrite, settled, unpainted
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
-from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.recording import open_recording
+from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
 from sphereorient.mapping.learn import jumps, paint_correlation

@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError
 from sphereorient.motion import omega_from_orientations, to_body
-from sphereorient.motion.angular_velocity import omega_stencil, usable_separations
+from sphereorient.motion.measure import omega_stencil, usable_separations
 from sphereorient.motion.stencil import apply, gaussian_derivative
 
 DT = 1 / 600

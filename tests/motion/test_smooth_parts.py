@@ -8,8 +8,20 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from sphereorient.motion import kalman
-from sphereorient.motion.kalman import StateSpace, run_filter, smooth
-from sphereorient.motion.matern import _M, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes, prior_of_band
+from sphereorient.motion.kalman import (
+    _M,
+    ORDER,
+    STATIONARY,
+    Prior,
+    StateSpace,
+    grown,
+    grown_rate,
+    integral,
+    nodes,
+    prior_of_band,
+    run_filter,
+    smooth,
+)
 from sphereorient.motion.path import RotationTrack, propagated, rotation_of, rotvec_between
 
 

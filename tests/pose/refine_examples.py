@@ -14,8 +14,8 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
 from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.bodies import body_of
 from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.compiled import body_of
 from sphereorient.pose.fitter import Fitter, first_fitter
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import LATER, Shading, SphereModel

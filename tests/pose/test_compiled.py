@@ -22,7 +22,7 @@ from refine_examples import (
 
 from sphereorient import so3
 from sphereorient.files.compiled import built_for
-from sphereorient.pose import compiled, fit, occluders
+from sphereorient.pose import compiled, fit
 from sphereorient.pose.lights.lab import lab_lights
 from sphereorient.pose.model import FIRST, LATER, SphereModel
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
@@ -123,7 +123,7 @@ def test_occluders_are_those_of_torch(pixels, kind):
     covered[1, :] = covered[1].flip(0)  # so much differs that nothing is taken for an occluder
     hidden, model = replace(pixels, grey=covered), MODELS[kind](pixels)
     for most in (0.4, 1e-4):
-        inside = occluders.kept(hidden, begin(), model, most)
+        inside = fit.kept(hidden, begin(), model, most)
         assert torch.equal(compiled.kept(hidden, begin(), model, most), inside)
         assert bool((pixels.inside & ~inside)[0, near].any()) == (most == 0.4)
         assert torch.equal(inside[1], pixels.inside[1])

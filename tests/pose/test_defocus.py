@@ -11,7 +11,7 @@ from orient_examples import attitudes, texture_of
 from refine_examples import BLUR_PX, balls, base_of, cut, fitter_of, noisy, pictures_of, rig_of
 
 from sphereorient import so3
-from sphereorient.pose.blur import FINER, FINEST, best_blur_px, steepest_blur_px
+from sphereorient.follow.appearance.light import FINER, FINEST, best_blur_px, steepest_blur_px
 from sphereorient.pose.camera_view import defocus_radii
 from sphereorient.pose.poses import PoseStart
 from sphereorient.search import GreySearch, GreySearchSettings

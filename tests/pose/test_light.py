@@ -25,12 +25,13 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.lights.common import noise_curve
 from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
-from sphereorient.pose.model import FIRST, SphereView, no_stray, polynomials
+from sphereorient.pose.model import FIRST, SphereView, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.residuals import noise_curve
 from sphereorient.pose.view import sphere_view
+from sphereorient.sphere.view import polynomials
 
 KINDS = ("patches",)
 NOISE = torch.tensor([[4.0, 0.05, 0.001, 0.0]])  # grey levels^2 and so on

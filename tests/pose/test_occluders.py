@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from refine_examples import balls, cut, noisy, pictures_of, rig_of
 
-from sphereorient.pose.occluders import MOST_HIDDEN, occluded
+from sphereorient.pose.fit import MOST_HIDDEN, occluded
 
 SIGMA, RIG = 3.0, rig_of(64.0)
 X, R = balls(2, 5)

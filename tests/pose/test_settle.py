@@ -26,9 +26,9 @@ from sphereorient.locate import CameraScene
 from sphereorient.movies.response import Response
 from sphereorient.pose import compiled
 from sphereorient.pose.camera_view import CameraView
+from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
-from sphereorient.pose.settle import NEAR_RAD
 
 RIG, COUNT = rig_of(), 6
 pytestmark = pytest.mark.skipif(

@@ -27,8 +27,8 @@ from sphereorient.cli import app
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import ExperimentKeys
-from sphereorient.files.draft import DraftKey, draft_yaml, given
 from sphereorient.files.whole_file import has_mark
+from sphereorient.files.yaml_file import DraftKey, draft_yaml, given
 from sphereorient.movies import open_movie
 from sphereorient.preflight.fictrac import read_fictrac_config
 from sphereorient.preflight.first_look import FirstLook, experiment_keys, look_at

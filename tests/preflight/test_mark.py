@@ -17,7 +17,7 @@ from preflight_examples import PAINTED, Example, clean_example, write
 
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.stream import given_mask
+from sphereorient.experiment.recording import given_mask
 from sphereorient.preflight.mark_masks import MaskMarking, drawn_mask
 
 pytest_plugins = ["browser_examples"]

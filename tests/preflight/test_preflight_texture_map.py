@@ -24,8 +24,7 @@ from sphereorient.preflight.texture_map import (
     views_towards,
 )
 from sphereorient.search.settings import GreySearchSettings
-from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.textures import random_texture
+from sphereorient.sphere.texture import map_directions, random_texture
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 RADIUS_PX = 39.0

@@ -14,7 +14,7 @@ from orient_examples import attitudes, clean_disks
 
 from sphereorient.errors import ShapeError
 from sphereorient.search import OrientSettings, extract_paint
-from sphereorient.search.extraction import otsu, stretch_contrast
+from sphereorient.search.template_bank import otsu, stretch_contrast
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.view import disk_offsets
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sphereorient.errors import ShapeError
-from sphereorient.statistics.reliability import reliability
+from sphereorient.learn.metrics import reliability
 
 
 def calibrated(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -7,9 +7,8 @@ import torch
 from conftest import assert_close
 
 from sphereorient.sphere import sample_texture
-from sphereorient.sphere.texture import map_directions, texture_coordinates
+from sphereorient.sphere.texture import KINDS, map_directions, texture_coordinates
 from sphereorient.synth import random_texture
-from sphereorient.synth.textures import KINDS
 
 CASES = [(kind, seed) for kind in KINDS for seed in range(3)]
 

@@ -7,14 +7,13 @@ import torch
 from pydantic import BaseModel, create_model
 from scipy.linalg import block_diag
 
-from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
+from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera, TsaiCamera
 from sphereorient.cameras.camera import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error, check_known, named
 from sphereorient.cameras.ideal import PinholeCamera, TelecentricCamera
 from sphereorient.cameras.model import CameraModel, Key
 from sphereorient.cameras.parameters import parameter_names
 from sphereorient.cameras.port import Port, PortCamera
-from sphereorient.cameras.tsai import TsaiCamera
 from sphereorient.errors import CameraError
 from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated, write_document
 

@@ -15,11 +15,10 @@ from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, Reason, refusal
 from sphereorient.follow.appearance.presence import nothing, proven
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses, best_poses, pose_table
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import Picture, widest_px
 from sphereorient.pose.fitter import Fitter
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, best_poses, pose_table
 
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one

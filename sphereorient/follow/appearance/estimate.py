@@ -27,12 +27,12 @@ from sphereorient.follow.appearance.record import Among, Appearance, Following, 
 from sphereorient.follow.appearance.response import with_more_blur, with_response
 from sphereorient.follow.appearance.worn import without_worn
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import CameraView, Optics, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
+from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used

@@ -12,11 +12,10 @@ from sphereorient.follow.appearance.agreement import TRIED
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import CLEAR, Following, Studied
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import best_poses
 from sphereorient.pose.camera_view import FINEST_PX, Optics, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.neighbours import Neighbours
-from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.poses import PoseStart, best_poses
 
 LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
 MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured

@@ -11,11 +11,10 @@ from sphereorient.errors import ExperimentError, Reason, refusal
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance.record import ALWAYS, clear_of, soft
 from sphereorient.follow.initialise import FAINT, Initialiser
-from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fitter import LEAST_LEFT, Fitter
-from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.poses import Poses, PoseStart, poses_of
 
 BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this

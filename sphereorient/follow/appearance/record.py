@@ -8,14 +8,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from sphereorient.follow.poses import Poses
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import Picture, defocus_radii, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart
 from sphereorient.pose.worn import worn_share
 from sphereorient.sphere.texture_table import TextureTable
 

@@ -6,12 +6,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sphereorient.pose.lights.common import learn_stray, noise_curves
-from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_stray, polynomials, scene_beside
+from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_stray, scene_beside
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals
+from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals, learn_stray, noise_curves
 from sphereorient.so3 import inverse_damped
+from sphereorient.sphere.view import polynomials
 
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)

@@ -11,22 +11,13 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
-from sphereorient.pose.lights.common import learn_stray, noise_curves
-from sphereorient.pose.model import (
-    LATER,
-    Light,
-    LightTables,
-    SphereModel,
-    SphereView,
-    polynomials,
-    scene_beside,
-    surface_normals,
-)
+from sphereorient.pose.model import LATER, Light, LightTables, SphereModel, SphereView, scene_beside, surface_normals
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import by_pose, residuals
+from sphereorient.pose.residuals import by_pose, learn_stray, noise_curves, residuals
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
+from sphereorient.sphere.view import polynomials
 
 SCATTERED, MIRRORED = 6, 16  # degrees of the harmonics over the normal and over the mirrored direction
 KNOTS = (0.0, 0.12, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0)  # depths, radii, between which the paint's cover is linear

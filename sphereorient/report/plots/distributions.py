@@ -21,8 +21,7 @@ from sphereorient.statistics.summary import Distributions
 Floats = NDArray[np.float64]
 
 FOUR = (*look.COMPONENTS, look.ALL)
-CURVE_POINTS = 401
-SHORTEST = 4.0  # bars of shifted PDFs end at this part of the value
+CURVE_POINTS = 401  # of a smooth curve
 SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or lags of the first zero
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
 
@@ -143,7 +142,8 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
         there = density.counts > 0
         pdf = density.pdf.part(there).scaled(factor)
         # Bars that reach zero would cross the other curves.
-        look.points(axes, density.centres[there], replace(pdf, low=np.maximum(pdf.low, pdf.value / SHORTEST)), look.X)
+        # Bars of shifted PDFs end at this part of the value.
+        look.points(axes, density.centres[there], replace(pdf, low=np.maximum(pdf.low, pdf.value / 4.0)), look.X)
         _gaussian(axes, density, factor)
         top = float(np.nanmax(density.pdf.value, initial=0.4))
         axes.text(0, 1.25 * top * factor, f"{lag_ms[lag]:.2g} ms", ha="center", va="bottom")

@@ -23,9 +23,6 @@ Floats = NDArray[np.float64]
 BAR, BESIDE = 0.24, 0.2  # width of a bar, distance of components, where quantities are 1 apart
 NOISE_WORDS = {"added": "noise in the variance (%)", "removed": "variance smoothed away (%)"}
 WIDTHS_OF = ("acceleration", "alpha_lab")
-TOO_WIDE = 15.0  # medians: even bins with a longer range show the smaller distances as one bar
-NEAREST = 30.0  # the smaller median over the first of the geometric bins
-GEOMETRIC_BINS = 36
 
 
 def figures(of: look.Reported) -> Iterator[look.Plan]:
@@ -193,9 +190,11 @@ def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
         return
     edges = np.rad2deg(distance.edges_rad)
     nearest = min(float(np.median(law[0])) for law in laws)
-    even = edges[-1] <= TOO_WIDE * nearest or not nearest
+    # Medians: even bins with a longer range show the smaller distances as one bar.
+    even = edges[-1] <= 15.0 * nearest or not nearest
     if not even:
-        edges = np.geomspace(nearest / NEAREST, edges[-1] * (1 + 1e-9), GEOMETRIC_BINS + 1)
+        # The smaller median over the first of the geometric bins.
+        edges = np.geomspace(nearest / 30.0, edges[-1] * (1 + 1e-9), 36 + 1)
     for values, pdf, style, what in laws:
         if even:
             pdf = pdf * np.pi / 180

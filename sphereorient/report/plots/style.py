@@ -30,14 +30,12 @@ Reported = tuple[Summary, ByFile, Sequence[CameraDistance]]  # what a report is 
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
-TEXT_PT = 8.0  # of all text, as in report.mplstyle
 # Okabe and Ito's colours: distinct for colour-blind readers, and in grey print.
 AXIS_COLOURS = COLOURS["x"], COLOURS["y"], COLOURS["z"]
 BLACK = "#000000"
 GREY = "#666666"
 SHADE = "#BBBBBB"  # of what does not count
 BAND = 0.2  # opacity
-LETTERS_PER_INCH = 15  # of a note; narrow enough for wide letters
 SYMBOLS = {
     "velocity": "v",
     "acceleration": "a",
@@ -153,8 +151,8 @@ def legend_of_figure(figure: Figure, handles: Sequence[Any], ncols: int) -> None
 
 def note(figure: Figure, words: str) -> None:
     """Write a note below all panels, with line breaks."""
-    letters = round(LETTERS_PER_INCH * figure.get_figwidth())
-    figure.supxlabel(textwrap.fill(words, letters), fontsize=TEXT_PT)
+    letters = round(15 * figure.get_figwidth())  # of a note; narrow enough for wide letters
+    figure.supxlabel(textwrap.fill(words, letters), fontsize=8.0)  # of all text, as in report.mplstyle
 
 
 def plain_logarithms(axis: Axis) -> None:

@@ -32,9 +32,6 @@ RATES = {
     "acceleration": "acceleration, lab (m/s²)",
     "alpha_lab": "α, lab (rad/s²)",
 }
-TRIPODS = 14
-TRIPOD_SIZE = 0.09  # of the path's largest extent
-THINNEST = 0.35  # of the largest extent: the least length of the box's shortest side
 
 
 def figures(of: look.Reported) -> Iterator[look.Plan]:
@@ -123,7 +120,7 @@ def path_figure(*tracks: Trajectory) -> Figure:
     styles = [look.ALL, *(replace(look.ALL, colour=colour) for colour in look.BALLS)]
     named = [(part, styles[k % len(styles)], part.track.sphere or "path") for k, part in enumerate(parts)]
     if len(whole):
-        size = TRIPOD_SIZE * max(float(np.ptp(whole, axis=0).max()), 1.0)
+        size = 0.09 * max(float(np.ptp(whole, axis=0).max()), 1.0)  # of the path's largest extent
         for part, style, name in named:
             position = part.track.position_smooth
             there = np.flatnonzero(np.isfinite(position).all(1))
@@ -225,7 +222,7 @@ def _dots(axes: Axes, time: Floats, values: Floats) -> None:
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
-    chosen = known[look.spread(len(known), TRIPODS)]
+    chosen = known[look.spread(len(known), 14)]
     start = track.position_smooth[chosen]
     for i, style in enumerate(look.COMPONENTS):
         tip = start + size * track.orientation_smooth[chosen, :, i]
@@ -237,7 +234,8 @@ def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float
 def _equal_scale(axes: Any, position_mm: Floats, size: float) -> None:
     """Give all axes the same scale; the box is as long as the path, and not too thin."""
     low, high = position_mm.min(0) - size, position_mm.max(0) + size
-    extent = np.maximum(high - low, THINNEST * (high - low).max())
+    # Of the largest extent: the least length of the box's shortest side.
+    extent = np.maximum(high - low, 0.35 * (high - low).max())
     middle = (low + high) / 2
     axes.set_box_aspect(tuple(extent), zoom=0.95)  # a tuple: it scales an array in place
     limits = (centre + np.array([-0.5, 0.5]) * length for centre, length in zip(middle, extent, strict=True))

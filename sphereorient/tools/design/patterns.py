@@ -12,8 +12,7 @@ from torch import Tensor
 from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.sphere import sample_texture
-from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.textures import random_directions
+from sphereorient.sphere.texture import map_directions, random_directions
 
 POINTS = 40_000  # at which a map is sampled: 1 degree apart
 CIRCLES, AROUND = 400, 1440  # great circles on which borders are counted, and points of each
@@ -21,7 +20,6 @@ LOST_SHARE = 0.02  # of the sphere, the corners of patches, that a round brush m
 BRUSHES_DEG = tuple(float(width) for width in range(2, 61))  # widths that are tried
 WAVES = 60  # of a random function
 SIZES_DEG = (3.0, 60.0)  # smallest and largest patches
-PUSHES = 40  # steps in which dots push each other apart
 
 
 def view_directions(count: int) -> Tensor:
@@ -127,7 +125,7 @@ def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
 def _apart(points: Tensor) -> Tensor:
     """Push points (D, 3) apart, like charges, until they are spread but not a lattice."""
     step = 0.1 * math.sqrt(4 * math.pi / len(points))
-    for _ in range(PUSHES):
+    for _ in range(40):  # steps in which dots push each other apart
         away = points[:, None] - points
         push = (away / (away.norm(dim=-1, keepdim=True) ** 3 + 1e-9)).sum(1)
         push = push / push.norm(dim=-1, keepdim=True).clamp_min(1e-9)

@@ -20,15 +20,15 @@ from sphereorient.errors import PaintError, error_words, refusal
 from sphereorient.files.whole_file import TABLE_BYTES, read_text, read_whole
 from sphereorient.search import crop_disk
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.texture import PICTURE_BYTES
 from sphereorient.sphere.view import fitted_circle
 from sphereorient.tools.spin.dots import DotTable
 
 Photograph = NDArray[Any]
 
-PICTURE_BYTES = 100_000_000
-MOST_PIXELS = 50_000_000
+MOST_PIXELS = 50_000_000  # of a photograph
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-MOST_PHOTOGRAPHS = 1000
+MOST_PHOTOGRAPHS = 1000  # at once: all are held in memory
 FINER = 4  # times: the outline is followed on a lattice finer than the pixels
 CORNER = 0.08  # of the shorter side: squares in the corners that show the scene
 RIM = (0.85, 0.95)  # of the radius: the outline is half as bright as this
@@ -37,7 +37,7 @@ RADIUS_MIN_PX = 6.0  # below this a disk shows next to no texture
 ROUND_SHARE = 0.6  # of the outline's points that must lie on the circle
 ON_CIRCLE = 0.06  # distance from the circle, of its radius, up to which they do
 STEPS = 12  # of the circle's robust fit
-PICTURES_MIN = 3
+PICTURES_MIN = 3  # two fit any spin
 NO_CIRCLE = math.nan, math.nan, math.nan, 0.0
 
 

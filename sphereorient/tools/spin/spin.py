@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import Progress, silent
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure
 from sphereorient.search import Candidates, GreySearch, GreySearchSettings, Proposer
 from sphereorient.search.refine_rotation import DetailLevel, detail_level, refine_rotation
@@ -23,9 +23,7 @@ from sphereorient.tools.spin.dots import DOT_SEARCH, DotSearch, DotTable
 from sphereorient.tools.spin.fit import PictureCandidates, Spins
 
 FINEST = 0.05  # detail of the last fit, radii: a pixel of a disk of 40
-REFINEMENT_STEPS = 6
 FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own orientation may lie from the spin's
-LAST_ITERATIONS = 8
 AS_EVIDENT = 6.0  # difference of evidence (log) below which pictures do not distinguish two spins
 AT_ONCE = 4  # photographs between two reports of progress
 COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: in a row, and altogether, the first ones
@@ -77,10 +75,10 @@ def spin_of(
     drawn = texture.texture() if isinstance(texture, DotTable) else texture
     view = orthographic_view(settings.search.size_px)
     level = detail_level(view, texture_table(drawn.float(), FINEST), FINEST, every=1)
-    own, _ = _refined(level, disks, spins.R_view_body(time_s)[0], REFINEMENT_STEPS)
+    own, _ = _refined(level, disks, spins.R_view_body(time_s)[0], 6)
     # Refit the spins to one orientation per picture; keep the evidence of all candidates.
     single = fit.picture_candidates(time_s, torch.arange(len(own) + 1), own, torch.ones(len(own)))
-    fitted = fit.refine_spins(single, spins, iterations=LAST_ITERATIONS)
+    fitted = fit.refine_spins(single, spins, iterations=8)
     total = fit.evidence_of(seen, spins).sum(1)
     close = total > total.max() - AS_EVIDENT
     rate = fitted.omega_view_rad_s.norm(dim=-1)

@@ -35,8 +35,6 @@ LEAST_DEG = 1.5  # radius of the smallest place that is reported
 HALF = 0.5  # share of a place that a map must know to give its worn share
 SHOWN = 6  # maps that are drawn at most, spread over the series
 NAMED = 6  # places that have their number in the maps, and their own curve
-NUMBER = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5}
-LEAST_PERCENT = 0.1  # height of the smallest scale of the curve
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -210,7 +208,8 @@ def _mark(axes: Axes, series: WearSeries, k: int) -> None:
     for number, place in enumerate(series.places[:NAMED], start=1):
         if place.share[k] > 0:
             at, beside = (place.longitude_deg, place.latitude_deg), (7, 7)
-            axes.annotate(str(number), at, beside, textcoords="offset points", fontsize=7, bbox=NUMBER)
+            box = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5}
+            axes.annotate(str(number), at, beside, textcoords="offset points", fontsize=7, bbox=box)
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
@@ -220,6 +219,7 @@ def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
     for number, place in enumerate(series.places[:NAMED], start=1):
         axes.plot(at, 100 * np.array([0, *place.share]), marker=".", linewidth=0.9, label=f"place {number}")
     axes.set_xticks(at, list(names))
-    axes.set(ylabel="worn (% of the ball)", ylim=(0, max(LEAST_PERCENT, axes.get_ylim()[1])))
+    # Height of the smallest scale of the curve.
+    axes.set(ylabel="worn (% of the ball)", ylim=(0, max(0.1, axes.get_ylim()[1])))
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.legend(loc="upper left")

@@ -20,9 +20,8 @@ from sphereorient.errors import PaintError
 from sphereorient.mapping.compare import turned_map
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_seen
-from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.textures import random_texture
-from sphereorient.tools.wear.series import WearSeries, connected_places, wear_series
+from sphereorient.sphere.texture import map_directions, random_texture
+from sphereorient.tools.wear import WearSeries, connected_places, wear_series
 
 HEIGHT = 128
 NOISE = 0.02

@@ -1,1 +1,0 @@
-"""Changes of a texture map over a series of movies."""
