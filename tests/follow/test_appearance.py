@@ -12,8 +12,7 @@ from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.follow.appearance.presence import explained, proven
-from sphereorient.follow.poses import Poses
-from sphereorient.pose.poses import blank_parts
+from sphereorient.pose.poses import Poses, blank_parts
 from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.trajectory import Reason

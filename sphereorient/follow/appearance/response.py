@@ -16,7 +16,7 @@ from sphereorient.pose.model import SphereModel
 ROUNDS, STAYS = 6, 0.01  # rounds of estimation; change of ln gamma from which they end
 MOST = math.log(2.0)  # by which a round may change ln gamma: the step is linear
 MORE = 1.02  # ratio of a blur that is a little more
-CODED = 0.1  # ln gamma from which a response is not linear: what else is not modelled looks like less
+CODED = 0.2  # ln gamma from which a response is not linear: gloss that is not modelled looks like 0.08
 SURE = 0.05  # standard deviation of ln gamma up to which pictures tell it; of one photograph it is 0.2
 
 
