@@ -157,7 +157,7 @@ def measured(
         f"{_share(score, 'omega_lab')} / {_share(score, 'omega_body')}",
         f"{_share(score, 'alpha_lab')}",
         _share(score, "velocity") if len(cameras) == 2 else "",
-        " / ".join(f"{value:.2f}" for value in score.over_stated()),
+        " / ".join(f"{value:.2f}" if np.isfinite(value) else "–" for value in score.over_stated()),
         f"{inside} of {told}",
         f"{seconds:.0f}",
     ]

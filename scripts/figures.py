@@ -59,7 +59,7 @@ FIGURES: dict[str, Figure] = {
     "paper-method": Figure(
         pages=("accuracy.md",),
         command=f"accuracy.py {SHARED}/experiment --method paper",
-        tables=("paper-method", "kernels"),
+        tables=("paper-method",),
     ),
     "robustness": Figure(pages=("robustness.md",), command="bench_robustness.py --out out/robustness"),
     "accuracy": Figure(
@@ -72,7 +72,7 @@ FIGURES: dict[str, Figure] = {
     "reliability": Figure(pages=("robustness.md",), command="reliability.py"),
     "cameras": Figure(
         pages=("accuracy.md",),
-        command=f"port_or_not.py {SHARED}/experiment --figure docs/port_or_not.png",
+        command=f"port_or_not.py {SHARED}/tank --figure docs/port_or_not.png",
         tables=("cameras",),
     ),
     "plates": Figure(pages=("accuracy.md",), command=f"plate_pictures.py {SHARED}/experiment"),

@@ -70,7 +70,7 @@ def main() -> None:
 
 def table(cases: Mapping[str, Case], exact: Mapping[str, Camera]) -> None:
     print(
-        "| cameras | plate pictures, rms px | place over the volume, rms mm | best rigid motion removed, mm | "
+        "| cameras | plate pictures, rms px | position over the volume, rms mm | best rigid motion removed, mm | "
         "orientation p50 / p95 (°) | position p50 / p95 (mm) | omega | alpha | acceleration |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
@@ -118,7 +118,7 @@ def rms(off: np.ndarray) -> float:
 
 
 def draw(cases: Mapping[str, Case], exact: Mapping[str, Camera], truth: Path, path: Path) -> None:
-    """Draw the place errors without a port over two planes, and the errors of orientation and alpha in time."""
+    """Draw the errors of position without a port over two planes, and the errors of orientation and alpha in time."""
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2)
@@ -135,7 +135,7 @@ def draw(cases: Mapping[str, Case], exact: Mapping[str, Camera], truth: Path, pa
         )  # fmt: skip
         figure.colorbar(arrows, ax=ax, label="error (mm)")
         ax.set(xlabel=f"{'xyz'[i]} (mm)", ylabel=f"{'xyz'[j]} (mm)", aspect="equal")
-        ax.set_title(f"place seen less true place without the port, {'xyz'[k]} = 0", fontsize=10)
+        ax.set_title(f"position seen less true position without the port, {'xyz'[k]} = 0", fontsize=10)
     with h5py.File(truth) as file:
         alpha, R_true = file["alpha_lab"][()], torch.from_numpy(file["orientation"][()])
     for name, case in cases.items():
