@@ -60,8 +60,7 @@ def estimate_appearance(
     others = None if among is None else among.neighbours.of(sample.frame)
     pictures = [[shot.picture for shot in frames[k]] for k in sample.frame]
     studied = light_and_blur(Studied.begun(search.fitter, base, pictures, sample.poses, others), given=given)
-    linear, studied = studied, with_response(studied, given=given)
-    coded = studied is not linear
+    studied, coded = with_response(studied, given=given)
     search = replace(search, fitter=replace(search.fitter, views=studied.fitter.views))
     if not given and (matched := _matched(search, studied)) is not None:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
@@ -70,9 +69,7 @@ def estimate_appearance(
             return estimate_appearance(matched, frames, base, known, following, among)
     # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
     best, wrong = explained(sample.found, sample.rows)
-    studied, worn = without_worn(studied) if settings.learn_paint else (studied, None)
-    if worn is not None:  # the blur, too, was found with it
-        studied = light_and_blur(studied, given=given)
+    studied, worn = without_worn(studied, given=given) if settings.learn_paint else (studied, None)
     still, sharper = studied, False
     if following is not None and sample.camera is None:
         studied, sharper = with_motion(studied, search, sample.frame, following, others)

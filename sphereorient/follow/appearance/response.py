@@ -20,9 +20,9 @@ CODED = 0.2  # ln gamma from which a response is not linear: gloss that is not m
 SURE = 0.05  # standard deviation of ln gamma up to which pictures tell it; of one photograph it is 0.2
 
 
-def with_response(studied: Studied, *, given: bool) -> Studied:
+def with_response(studied: Studied, *, given: bool) -> tuple[Studied, bool]:
     """Estimate gamma of the cameras whose response is not known, with blur and light. Those whose pictures are linear,
-    or do not tell, stay as they are. `given`: as in `light_and_blur`.
+    or do not tell, stay as they are. Return also whether one was learnt. `given`: as in `light_and_blur`.
     """
     asked = torch.tensor([view.response is None for view in studied.fitter.views])
     gamma, learnt = torch.zeros(len(asked), dtype=torch.float64), studied
@@ -31,13 +31,13 @@ def with_response(studied: Studied, *, given: bool) -> Studied:
         change, sigma = response_exponents(*fits, learnt.fitter.model(), with_more_blur(learnt))
         asked &= (sigma < SURE) & ((gamma + change).abs() > CODED)
         if not bool(asked.any()):
-            return studied
+            return studied, False
         change = torch.where(asked, change.clamp(-MOST, MOST), 0.0)
         gamma = torch.where(asked, gamma + change, 0.0)
         learnt = light_and_blur(_responding(studied, gamma), given=given)
         if bool((change.abs() < STAYS).all()):
             break
-    return learnt
+    return learnt, learnt is not studied
 
 
 def with_more_blur(studied: Studied) -> SphereModel:

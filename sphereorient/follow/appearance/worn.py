@@ -6,6 +6,7 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
+from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.camera_view import Optics, widest_px
 from sphereorient.pose.fitter import Fitter
@@ -24,9 +25,10 @@ WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which 
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 
 
-def without_worn(studied: Studied) -> tuple[Studied, Tensor | None]:
+def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | None]:
     """Do not use paint that differs from the map; return also where that is, None: nowhere.
     Found in one half of the movie, it must leave less in the other half: what differs there, too, turns with the ball.
+    `given`: as in `light_and_blur`.
     """
     fitter, pixels, fit, use = studied.fitter, studied.pixels, studied.fit, studied.use
     if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
@@ -58,4 +60,5 @@ def without_worn(studied: Studied) -> tuple[Studied, Tensor | None]:
     wrong = float(fitted.excess[use].median()) > FITS  # the paint that is left is not the map's either
     if wrong or worn is None or worn_share(worn) < WORN_LEAST:
         return studied, None
-    return replace(studied, fitter=lit, fit=fitted, paint=without(studied.paint, worn)), worn
+    studied = replace(studied, fitter=lit, fit=fitted, paint=without(studied.paint, worn))
+    return light_and_blur(studied, given=given), worn  # the blur, too, was found with worn paint
