@@ -60,7 +60,7 @@ def find_scenes(
         outline, guess = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
         background = guess if empty is None else None
-    known = {name: px for name, px in sizes.items() if px is not None}  # all
+    known = {name: px for name, px in sizes.items() if px is not None}  # by now each is known
     if background is None:
         background = learn_background(stream.spread(count), tuple(known.values()), settings, empty, stream.shown)
     scene = CameraScene(background=background, diameter_px=0.0, response=stream.response)

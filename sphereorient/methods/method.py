@@ -202,8 +202,6 @@ def _write_scenes(learnt: Learnt, file: h5py.File) -> None:
         group, background = file.create_group(f"cameras/{name}"), scene.background
         group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
         group.attrs["merit_min"] = scene.merit_min
-        if scene.response is not None:
-            group.attrs["response"] = json.dumps(asdict(scene.response))
         for part in ("mean", "noise", "shown"):
             if getattr(background, part) is not None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
@@ -215,6 +213,8 @@ def _write(learnt: Learnt, file: h5py.Group) -> None:
         if (value := getattr(learnt, name)) not in (None, ()):
             file.attrs[name] = value
     file.attrs["diameter_px"] = [scene.diameter_px for scene in learnt.scenes.values()]
+    responses = [scene.response for scene in learnt.scenes.values()]
+    file.attrs["response"] = [json.dumps(None if one is None else asdict(one)) for one in responses]
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
     for part, values in learnt.light.parts().items():
@@ -243,21 +243,17 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
             full_scale=float(group.attrs["full_scale"]),
             shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
         )
-        numbers = {part: float(group.attrs[part]) for part in ("diameter_px", "merit_min")}
-        response = None
-        if "response" in group.attrs:
-            told = json.loads(str(group.attrs["response"]))
-            response = Response(**told | {"table": tuple(map(tuple, told["table"]))})
-        scenes[name] = CameraScene(background=background, response=response, **numbers)
+        diameter_px, merit_min = (float(group.attrs[part]) for part in ("diameter_px", "merit_min"))
+        scenes[name] = CameraScene(background=background, diameter_px=diameter_px, merit_min=merit_min)
     return scenes
 
 
 def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
-    """Read what was learnt of one ball; of several, each has its own diameters in the cameras' scenes."""
+    """Read what was learnt of one ball; of several, each has its own diameters and responses of the cameras."""
     sizes = file.attrs.get("diameter_px", [scene.diameter_px for scene in scenes.values()])
-    scenes = {
-        name: replace(scene, diameter_px=float(px)) for (name, scene), px in zip(scenes.items(), sizes, strict=True)
-    }
+    responses = map(_response, file.attrs.get("response", ["null"] * len(scenes)))  # older files hold none
+    own = zip(scenes.items(), sizes, responses, strict=True)
+    scenes = {name: replace(scene, diameter_px=float(px), response=one) for (name, scene), px, one in own}
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting.none(len(scenes))
@@ -273,6 +269,11 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     return Learnt(
         scenes=scenes, light=light_of(parts, bool(light.attrs["known"])), lasting=lasting, process=process, **told
     )
+
+
+def _response(text: str) -> Response | None:
+    told = json.loads(text)
+    return None if told is None else Response(**told | {"table": tuple(map(tuple, told["table"]))})
 
 
 def _process(group: h5py.Group) -> ProcessNoise:

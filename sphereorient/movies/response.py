@@ -40,7 +40,6 @@ class Response:
 
 
 LINEAR = Response()
-SRGB = Response(srgb=True)
 
 
 @lru_cache(maxsize=16)

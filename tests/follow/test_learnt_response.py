@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -9,7 +11,8 @@ from PIL import Image
 from run_examples import off_deg
 
 from sphereorient.experiment import load_experiment, open_movies
-from sphereorient.methods.method import load_learnt
+from sphereorient.methods.method import load_learnt, save_learnt
+from sphereorient.movies.response import Response
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
@@ -44,6 +47,14 @@ def test_a_coded_camera_beside_a_linear_one_is_learnt_told_and_kept(tmp_path):
     assert np.median(off_deg(track, linear)) < 1.3 * np.median(off_deg(as_filmed, linear))
     again = run(Request(experiment=coded, learnt=known), MemoryStore())
     np.testing.assert_array_equal(again.orientation, track.orientation)
+
+    of_a, of_b = response, [Response(table=((0.0, 0.0), (0.4, 0.1), (1.0, 1.0))), Response(srgb=True)]
+    one = load_learnt(known)[""]
+    scenes = zip(one.scenes.items(), of_b, strict=True)
+    other = replace(one, scenes={name: replace(scene, response=curve) for (name, scene), curve in scenes})
+    save_learnt({"a": one, "b": other}, tmp_path / "both.h5")
+    balls = load_learnt(tmp_path / "both.h5")
+    assert [[scene.response for scene in balls[name].scenes.values()] for name in ("a", "b")] == [of_a, of_b]
 
     document["response"] = {"cam2": "linear"}
     coded.write_text(yaml.safe_dump(document))

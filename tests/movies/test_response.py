@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sphereorient.movies.response import LINEAR, SRGB, Response
+from sphereorient.movies.response import LINEAR, Response
 
 GREY = np.arange(256, dtype=np.uint8)
 
@@ -24,7 +24,7 @@ def test_a_power_of_the_grey_level_is_the_light(dtype, full_scale):
 
 def test_srgb_is_the_curve_of_its_norm():
     # IEC 61966-2-1: a half of the light is grey level 187.5 of 255, a fifth 123.6, and near black it is a line.
-    light = SRGB.light(np.array([187.516, 123.55, 5.0]), 255.0)
+    light = Response(srgb=True).light(np.array([187.516, 123.55, 5.0]), 255.0)
     np.testing.assert_allclose(light, [127.5, 51.0, 5.0 / 12.92], atol=0.03)
 
 
@@ -35,7 +35,9 @@ def test_a_table_is_linear_between_its_levels():
     )
 
 
-@pytest.mark.parametrize("response", [Response(gamma=2.4), SRGB, Response(table=((0.0, 0.0), (0.4, 0.1), (1.0, 1.0)))])
+@pytest.mark.parametrize(
+    "response", [Response(gamma=2.4), Response(srgb=True), Response(table=((0.0, 0.0), (0.4, 0.1), (1.0, 1.0)))]
+)
 def test_more_grey_is_more_light_and_white_stays_white(response):
     for full_scale in (255.0, 4095.0):
         light = response.light(np.arange(full_scale + 1), full_scale)
