@@ -180,6 +180,7 @@ def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
     at, lit, light, paint, unseen = _Addresses(), model.light, model.light.tables, model.paint, model.paint.unseen
     pointers = {"edge": _edge_table(), "light": light.cells, "cover": light.cover, "gain": light.gain}
     pointers |= {"noise": lit.noise, "stray": lit.stray, "limb_px": model.limb_px}
+    pointers["lean"] = lit.lean if bool(lit.lean.any()) else None
     numbers = {"unseen_most": UNSEEN, "known_least": KNOWN, "cover_least": COVER_MIN, "noise_least": NOISE_MIN}
     numbers |= {"tukey2": TUKEY**2, "outliers": OUTLIERS, "edges": EDGES, "edge_most": EDGE_MOST, "edge_px": EDGE_PX}
     numbers |= {"covered": COVERED, "most_each": MOST_EACH, "least_of_window": LEAST_OF_WINDOW, "margin": MARGIN_PX}

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import ClassVar, Self
 
 import torch
@@ -9,10 +10,14 @@ from torch import Tensor
 
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
+from sphereorient.so3 import solve_damped
 from sphereorient.sphere.texture_table import TextureTable
+from sphereorient.sphere.view import polynomials
 
 UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
+LEAN_ORDER, LEAN_EVERY = 3, 4  # of the polynomials of the light's slope; n-th place suffices for it
+DARKEST = 0.05  # of the brightest light of white paint: the logarithm of less has no use
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +51,7 @@ class SphereView:
     paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
     coverage_by_position: Tensor  # (L, 3, P), 1/mm
     known: Tensor | None  # (L, P) bool, whether all paint that the pixel looks at is known; None: everywhere
+    blur: Tensor  # (L, 1), standard deviation of the aperture, radii
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,6 +77,7 @@ class Light(ABC):
     black: Tensor  # coefficients of black paint
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
     stray: Tensor  # (C, K), grey levels that the empty scene lacks
+    lean: Tensor  # (C, 2, K), slope of the logarithm of `difference` across the disk, 1/radii: see `leaning`
     known: bool = True  # whether it is estimated from pictures
 
     of_cameras: ClassVar[tuple[str, ...]]  # parts with an entry for each camera
@@ -88,6 +95,20 @@ class Light(ABC):
     def of(self, *cameras: int) -> Self:
         """Return the light of some cameras."""
         return replace(self, **{name: getattr(self, name)[list(cameras)] for name in self.of_cameras})
+
+    def with_lean(self, view: SphereView, pixels: Pixels, use: Tensor) -> Self:
+        """Return the light with its slopes as B * C disks, those of `use` (B, C) bool, show them."""
+        cameras, some = use.shape[1], slice(None, None, LEAN_EVERY)
+        parts = (self.at(view, pixels)[0], view.coverage, view.across)
+        difference, coverage, across = (part[..., some].double().nan_to_num() for part in parts)
+        size = difference.abs().amax(1, keepdim=True).clamp_min(1e-6)
+        weight = coverage * (difference / size).clamp_min(0.0).square() * use.reshape(-1, 1)
+        columns = polynomials(across, LEAN_ORDER + 1)
+        target = (difference / size).clamp_min(DARKEST).log()
+        weighted = columns * weight[:, None]
+        normal, right = weighted @ columns.mT, (weighted @ target[..., None])[..., 0]
+        found = solve_damped(*(part.unflatten(0, (-1, cameras)).sum(0) for part in (normal, right)), ridge=1e-7)
+        return replace(self, lean=torch.stack([found @ by.mT for by in _slopes()], dim=1).float())
 
     def to(self, device: torch.device) -> Self:
         """Return the light on another device."""
@@ -127,6 +148,36 @@ def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
     """Return the unit normals (L, 3, P), lab, where lines of sight meet the sphere, and the depth (L, P), radii."""
     depth = (1.0 - view.aside.square()).clamp_min(0.0).sqrt()
     return view.aside[:, None] * view.outward - depth[:, None] * pixels.direction, depth
+
+
+@cache
+def _slopes() -> tuple[Tensor, Tensor]:
+    """Return the derivatives by x and by y, (n, K) float64 each, of polynomials of order LEAN_ORDER + 1."""
+    powers = [(order - k, k) for order in range(LEAN_ORDER + 2) for k in range(order + 1)]
+    by_x, by_y = torch.zeros(2, len(powers) - LEAN_ORDER - 2, len(powers), dtype=torch.float64)
+    for column, (x, y) in enumerate(powers):
+        if x:
+            by_x[powers.index((x - 1, y)), column] = x
+        if y:
+            by_y[powers.index((x, y - 1)), column] = y
+    return by_x, by_y
+
+
+def leaning(view: SphereView, pixels: Pixels, model: SphereModel) -> SphereView:
+    """Return the view of L disks with the paint that shows where light is brighter on one side: the blurred product of
+    light and paint is that of the blurred ones where these are looked up nearer to the light, by blur^2 times its slope.
+    """
+    lean = model.light.lean.to(view.paint)
+    if not bool(lean.any()):
+        return view
+    slope = (lean.repeat(len(view.paint) // len(lean), 1, 1) @ polynomials(view.across, LEAN_ORDER)).mT
+    nearer = (slope @ pixels.axes.to(slope)).mT * view.paint_by_position
+    return replace(view, paint=view.paint - model.radius_mm * view.blur.square() * nearer.sum(1))
+
+
+def no_lean(cameras: int) -> Tensor:
+    """Return the slope of even light."""
+    return torch.zeros(cameras, 2, (LEAN_ORDER + 1) * (LEAN_ORDER + 2) // 2)
 
 
 def stray_basis(across: Tensor) -> Tensor:

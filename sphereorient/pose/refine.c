@@ -12,6 +12,7 @@
 #define LANES 16
 #define NODES 4       /* most look-ups of a pixel */
 #define TINTS 15      /* monomials up to order 4 */
+#define SLOPES 10     /* the same up to order 3, of the light's slope */
 #define COLUMNS 36    /* 6 of the pose, and most coefficients of a frame's own light */
 #define HARMONICS 9
 #define EDGE_COLUMNS 12
@@ -54,6 +55,7 @@ typedef struct {
     const double *place_precision;
     int64_t iterations; /* 0: only `kept` is asked for */
     const float *limb_px; /* (cameras), or none */
+    const float *lean;    /* (cameras, 2, SLOPES), or none */
     float edge_px;
     /* occluders: share of a disk that they may cover, 0: none are sought; see fit.py */
     float most_hidden, covered, most_each, least_of_window;
@@ -234,7 +236,7 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
     }
     const float blur = t->blur_px * (t->pitch_mm[k] + t->pitch_rad[k] * (float)sqrt(distance2)) / radius;
     float nearest[BLOCK], q0[BLOCK], edge[BLOCK], out[3][BLOCK], sight_b[3][BLOCK], out_b[3][BLOCK];
-    float shape[EDGE_COLUMNS][BLOCK], q[BLOCK], at[BLOCK], depth[BLOCK], normal[3][BLOCK];
+    float shape[EDGE_COLUMNS][BLOCK], q[BLOCK], seen[BLOCK], at[BLOCK], depth[BLOCK], normal[3][BLOCK];
     float value[BLOCK], radial[BLOCK], flat[3][BLOCK], turn[3][BLOCK], hidden[BLOCK];
     int32_t cell[BLOCK];
     float(*to_centre)[BLOCK] = normal; /* not needed at the same time */
@@ -276,7 +278,10 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
             for (int c = 0; c < EDGE_COLUMNS; c++) found[c] = here[c] + up * (here[EDGE_COLUMNS + c] - here[c]);
             for (int c = 0; c < columns; c++) shape[c][i] = found[c];
         }
-    for (int i = 0; i < n; i++) q[i] = least(most(q0[i] - blur * shape[2][i], 0.0f), 1.0f);
+    for (int i = 0; i < n; i++) {
+        q[i] = least(most(q0[i] - blur * shape[2][i], 0.0f), 1.0f);
+        seen[i] = q[i] * (1.0f + blur * blur * shape[3][i]);
+    }
     memset(value, 0, sizeof value), memset(radial, 0, sizeof radial), memset(hidden, 0, sizeof hidden);
     memset(flat, 0, sizeof flat), memset(turn, 0, sizeof turn);
     const int nodes = outer ? NODES : 2;
@@ -284,9 +289,9 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
     for (int node = 0; node < nodes; node++) {
         const float *moves = outer ? shape[8 + node] : shape[3], sign = node ? 1.0f : -1.0f;
         if (outer)
-            for (int i = 0; i < n; i++) at[i] = q[i] + q[i] * (q0[i] + blur * shape[4 + node][i] - q[i]);
+            for (int i = 0; i < n; i++) at[i] = seen[i] + seen[i] * (q0[i] + blur * shape[4 + node][i] - seen[i]);
         else
-            for (int i = 0; i < n; i++) at[i] = q[i] + sign * blur * sqrtf(shape[3][i]) * q[i];
+            for (int i = 0; i < n; i++) at[i] = seen[i] + sign * blur * sqrtf(shape[3][i]) * seen[i];
         INDEPENDENT
         for (int i = 0; i < n; i++) {
             at[i] = least(most(at[i], 0.0f), t->sine_most);
@@ -472,6 +477,34 @@ static void lit_columns(const Task *t, const Disk *at, int64_t from, int n, floa
     const int count = (int)(t->n_difference + t->n_black);
     for (int c = 0; c < count; c++)
         for (int i = n; i < BLOCK; i++) to[c][i] = 0.0f;
+}
+
+/* Move the paint towards the light, as `leaning`. */
+static void lean(const Task *t, const Disk *at, const Sums *of, int64_t k) {
+    const float *slope = t->lean + (k % t->cameras) * 2 * SLOPES, *axes = t->axes + k * 6;
+    double distance2 = 0;
+    for (int c = 0; c < 3; c++) {
+        const double to_centre = of->position[c] - (double)t->origin[(k * 3 + c) * t->origins];
+        distance2 += to_centre * to_centre;
+    }
+    const float blur_mm = t->blur_px * (t->pitch_mm[k] + t->pitch_rad[k] * (float)sqrt(distance2));
+    const float by = blur_mm * blur_mm / t->radius_mm;
+    float powers[TINTS][BLOCK];
+    for (int64_t from = 0; from < t->places; from += BLOCK) {
+        const int n = (int)(t->places - from < BLOCK ? t->places - from : BLOCK);
+        float across[2][BLOCK] = {0}, *paint = at->paint + from;
+        monomials(at->x + from, at->y + from, n, SLOPES, powers);
+        for (int s = 0; s < SLOPES; s++)
+            for (int i = 0; i < n; i++) {
+                across[0][i] += slope[s] * powers[s][i];
+                across[1][i] += slope[SLOPES + s] * powers[s][i];
+            }
+        for (int c = 0; c < 3; c++) {
+            const float *move = at->move[c] + from;
+            INDEPENDENT
+            for (int i = 0; i < n; i++) paint[i] -= by * (axes[c] * across[0][i] + axes[3 + c] * across[1][i]) * move[i];
+        }
+    }
 }
 
 /* Find the frame's own light, residuals, and weights by an expected picture and weights, as `residuals`. */
@@ -813,6 +846,7 @@ static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
             render(t, at, of, k, instant, from, (int)n);
         }
     if (t->instants > 1) mean_of_instants(t, at);
+    if (t->lean) lean(t, at, of, k);
     shine(t, at, k);
     const uint8_t *clipped = t->clipped + k * t->places;
     double coefficients[COLUMNS];

@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from sphereorient.pose.model import SphereModel, SphereView, no_stray, scene_beside, stray_basis
+from sphereorient.pose.model import SphereModel, SphereView, leaning, no_stray, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.view import sphere_view
@@ -68,6 +68,7 @@ def residuals(
     """
     cameras = len(model.light.noise)
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
+    view = leaning(view, pixels, model)
     difference, black = model.light.at(view, pixels)  # as learnt
     tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
     n, n_black = model.shading.counts

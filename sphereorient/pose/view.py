@@ -73,6 +73,7 @@ def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereVi
         outward=torch.nn.functional.normalize(painted("outward"), dim=1),
         coverage_by_position=mean([view.coverage_by_position for view in views]),
         known=torch.stack(told).all(0) if told else None,
+        blur=views[0].blur,
     )
 
 
@@ -99,15 +100,17 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
     coverage, density, pull, variance = limb_shape(edge)
     q = (q0 - blur * pull).clamp(0.0, 1.0)
     inner = pixels.inner
-    variance = variance[:, :inner]
-    spread = blur * variance.sqrt() * q[:, :inner]
-    at = torch.stack([q[:, :inner] - spread, q[:, :inner] + spread], dim=1)
+    # The paint's blur is even over the surface: its mean lies as much nearer to the middle than that of the aperture.
+    seen = q * (1.0 + blur * blur * variance)
+    variance, middle = variance[:, :inner], seen[:, :inner]
+    spread = blur * variance.sqrt() * middle
+    at = torch.stack([middle - spread, middle + spread], dim=1)
     line = d, outward, nearest
     parts = [_sample(at, variance[:, None], [part[..., :inner] for part in line], R, model)]
     if inner < d.shape[-1]:
         outer = slice(inner, None)
         z, moves = rim_shape(coverage[:, None, outer], density[:, None, outer])
-        middle = q[:, None, outer]
+        middle = seen[:, None, outer]
         at = middle + middle * (q0[:, None, outer] + blur[:, None] * z - middle)
         parts.append(_sample(at, moves, [part[..., outer] for part in line], R, model))
     body, turn, shift, *known = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
@@ -121,6 +124,7 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
         paint_by_position=shift,
         coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,
         known=known[0] if known else None,
+        blur=blur,
     )
 
 

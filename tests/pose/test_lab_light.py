@@ -36,7 +36,7 @@ from sphereorient.pose.lights.lab import (
     knot_shares,
     lab_lights,
 )
-from sphereorient.pose.model import FIRST, LATER, SphereModel, no_stray, scene_beside, stray_basis
+from sphereorient.pose.model import FIRST, LATER, SphereModel, no_lean, no_stray, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.pose.residuals import residuals
@@ -113,6 +113,7 @@ def planted(cameras: int) -> LabLight:
         gain=torch.tensor([1.0, 0.7])[:cameras],
         noise=torch.tensor([[SIGMA**2, 0.0, 0.0, 0.0]]).repeat(cameras, 1),
         stray=no_stray(cameras),
+        lean=no_lean(cameras),
     )
 
 

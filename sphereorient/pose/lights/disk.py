@@ -6,7 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_stray, scene_beside
+from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_lean, no_stray, scene_beside
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals, learn_stray, noise_curves
@@ -28,7 +28,7 @@ class DiskLight(Light):
     black: Tensor  # (C, K)
     glints: Tensor  # (C, G, G), more of black, over the square about the disk: lamps that the surface mirrors
 
-    of_cameras = ("difference", "black", "noise", "stray", "glints")
+    of_cameras = ("difference", "black", "noise", "stray", "lean", "glints")
     linear = True
 
     @classmethod
@@ -38,7 +38,8 @@ class DiskLight(Light):
         difference = torch.zeros(cameras, count)
         difference[:, 0] = 1.0
         black, glints, stray = torch.zeros(cameras, count), no_glints(cameras), no_stray(cameras)
-        return cls(difference=difference, black=black, glints=glints, noise=noise, stray=stray, known=False)
+        parts = {"glints": glints, "noise": noise, "stray": stray, "lean": no_lean(cameras)}
+        return cls(difference=difference, black=black, **parts, known=False)
 
     @cached_property
     def _map(self) -> Tensor:
@@ -89,7 +90,8 @@ class DiskLight(Light):
         difference, black = solved_light(whole, force).reshape(cameras, -1).chunk(2, dim=-1)
         counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
         noise = noise_curves(at.model, at.residual, counted, cameras)
-        return DiskLight(difference=difference, black=black, noise=noise, stray=stray, glints=found)
+        parts = {"noise": noise, "stray": stray, "lean": self.lean, "glints": found}
+        return DiskLight(difference=difference, black=black, **parts).with_lean(at.view, pixels, use)
 
 
 def light_basis(across: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ class LabLight(Light):
     mirrored: Tensor  # (n,), share of light that the surface mirrors
     gain: Tensor  # (C,), of the cameras
 
-    of_cameras = ("noise", "stray", "gain")
+    of_cameras = ("noise", "stray", "lean", "gain")
     linear = False
 
     @cached_property
@@ -171,7 +171,8 @@ def lab_lights(
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
         if done in (rounds // 2, rounds):
             counted = at.inside & ~pixels.clipped & used
-            yield replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
+            light = replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
+            yield light.with_lean(at.view, pixels, use)
 
 
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
@@ -202,6 +203,7 @@ def _flat(known: Light, view: SphereView, pixels: Pixels, use: Tensor) -> LabLig
         gain=torch.where(use.any(0), difference / difference[first], 1.0),
         noise=known.noise,
         stray=known.stray,
+        lean=known.lean,
     )
 
 
