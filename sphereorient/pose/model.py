@@ -107,7 +107,8 @@ class Light(ABC):
         target = (difference / size).clamp_min(DARKEST).log()
         weighted = columns * weight[:, None]
         normal, right = weighted @ columns.mT, (weighted @ target[..., None])[..., 0]
-        found = solve_damped(*(part.unflatten(0, (-1, cameras)).sum(0) for part in (normal, right)), ridge=1e-7)
+        normal, right = (part.reshape(-1, cameras, *part.shape[1:]).sum(0) for part in (normal, right))
+        found = solve_damped(normal, right, ridge=1e-7)
         return replace(self, lean=torch.stack([found @ by.mT for by in _slopes()], dim=1).float())
 
     def to(self, device: torch.device) -> Self:
@@ -164,8 +165,8 @@ def _slopes() -> tuple[Tensor, Tensor]:
 
 
 def leaning(view: SphereView, pixels: Pixels, model: SphereModel) -> SphereView:
-    """Return the view of L disks with the paint that shows where light is brighter on one side: the blurred product of
-    light and paint is that of the blurred ones where these are looked up nearer to the light, by blur^2 times its slope.
+    """Return the view of L disks with its paint where light is brighter on one side. A blur of light times paint is the
+    product of both blurred, the paint looked up nearer to the light by blur^2 times the slope of its logarithm.
     """
     lean = model.light.lean.to(view.paint)
     if not bool(lean.any()):

@@ -100,9 +100,9 @@ def balls(count: int, seed: int, reach_mm: float = 4.0) -> tuple[Tensor, Tensor]
     return X, so3.random_rotations(count, generator=rng)
 
 
-def share_pictures(rig: Rig, kind: str, X: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+def share_pictures(rig: Rig, kind: str, X: Tensor, R: Tensor, blur_px: float = OPTICS_PX) -> tuple[Tensor, Tensor]:
     """White paint's and the ball's share of every pixel, (B, C, H, W) each: linear, so that any light can be put on."""
-    sampling = Sampling(blur_px=OPTICS_PX)
+    sampling = Sampling(blur_px=blur_px)
     shares = []
     for paint in (paint_of(kind), torch.ones(32, 64)):
         renderers = [SphereRenderer(paint, radius_mm=RADIUS_MM, camera=one, sampling=sampling) for one in rig.cameras]

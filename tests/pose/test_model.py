@@ -132,6 +132,22 @@ def test_pixels_see_what_a_render_by_force_shows(model, kind):
     assert (beside.coverage[0].double() - filled).square().mean().sqrt() > 0.008
 
 
+@pytest.mark.parametrize("kind", ["patches", "blobs"])
+def test_the_paint_is_as_large_as_the_ball(kind):
+    """Paint blurred over the surface lies nearer to the middle than paint blurred in the picture: by blur^2."""
+    one, pulls, sizes = rig("pinhole", 40.0), 0.0, 0.0
+    for seed in range(6):
+        X, R = balls(1, seed, 4.0)
+        pixels, uv = empty(one, X), places(one, X)
+        view = sphere_view(pixels, X, R, model_of(one.table(kind)))
+        _, white = seen_by_force(one.cameras[0], paint_of(kind).double(), uv, X[0], R[0])
+        larger = RADIUS_MM * ((pixels.axes.mT @ view.across) * view.paint_by_position).sum(1)[0]
+        inside = view.coverage[0] > 0.99
+        pulls += float(((view.paint[0] - white) * larger)[inside].sum())
+        sizes += float(larger[inside].square().sum())
+    assert abs(pulls / sizes) < 0.3 * (BLUR_PX / 20) ** 2
+
+
 def test_a_ball_that_looks_to_the_camera_shows_the_maps_middle_in_the_middle_with_east_to_the_right():
     # The camera looks along lab +y: docs/conventions.md, the check of all signs.
     one, X = rig("pinhole", 40.0), torch.zeros(1, 3, dtype=torch.float64)

@@ -37,9 +37,9 @@ class DiskLight(Light):
         count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
         difference = torch.zeros(cameras, count)
         difference[:, 0] = 1.0
-        black, glints, stray = torch.zeros(cameras, count), no_glints(cameras), no_stray(cameras)
-        parts = {"glints": glints, "noise": noise, "stray": stray, "lean": no_lean(cameras)}
-        return cls(difference=difference, black=black, **parts, known=False)
+        black, lean = torch.zeros(cameras, count), no_lean(cameras)
+        glints, stray = no_glints(cameras), no_stray(cameras)
+        return cls(difference=difference, black=black, glints=glints, noise=noise, stray=stray, lean=lean, known=False)
 
     @cached_property
     def _map(self) -> Tensor:
@@ -90,8 +90,8 @@ class DiskLight(Light):
         difference, black = solved_light(whole, force).reshape(cameras, -1).chunk(2, dim=-1)
         counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
         noise = noise_curves(at.model, at.residual, counted, cameras)
-        parts = {"noise": noise, "stray": stray, "lean": self.lean, "glints": found}
-        return DiskLight(difference=difference, black=black, **parts).with_lean(at.view, pixels, use)
+        parts = {"difference": difference, "black": black, "noise": noise, "stray": stray, "glints": found}
+        return replace(self, known=True, **parts).with_lean(at.view, pixels, use)
 
 
 def light_basis(across: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ Rivals = tuple[FittedPoses, FittedPoses, Tensor] | None  # fits of the same pict
 
 
 def light_of(parts: Mapping[str, Tensor], known: bool) -> Light:
-    """Return the light that consists of some tensors, `Light.parts` and others; older files lack stray light, slopes."""
+    """Return the light that consists of tensors, `Light.parts` and others; older files lack stray light and slopes."""
     parts = {"stray": no_stray(len(parts["noise"])), "lean": no_lean(len(parts["noise"])), **parts}
     kind = next((kind for kind in KINDS if parts.keys() >= set(kind.names())), DiskLight)
     return kind(known=known, **{name: parts[name] for name in kind.names()})
