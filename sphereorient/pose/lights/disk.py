@@ -128,13 +128,13 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     weight, pull = (by_pose(part, cameras) for part in sums)  # (B, C, cells)
     whole = weight.sum(0).clamp_min(1e-30)
     mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
-    off = pull - weight * mean
+    off, mean = pull - weight * mean, known.reshape(mean.shape) + mean
     error2 = off.square().sum(0) / whole.square() * number / (number - 1)
     told = number > 1
     signal2 = torch.where(told, mean.square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
     signal2 = signal2.clamp_min(0.0)[:, None]
     share = torch.where(told, signal2 / (signal2 + error2), 0.0).nan_to_num()
-    return known + (share * mean).reshape(known.shape).float()
+    return (share * mean).reshape(known.shape).float()
 
 
 def light_columns(view: SphereView) -> Tensor:
