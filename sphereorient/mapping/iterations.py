@@ -24,7 +24,7 @@ from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics, wid
 from sphereorient.pose.fitter import Fitter, first_fitter
 from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
 from sphereorient.pose.lights.kinds import lit_in_the_lab
-from sphereorient.pose.model import no_lean, no_stray
+from sphereorient.pose.model import even_light
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart
 from sphereorient.pose.residuals import noise_curves
@@ -228,7 +228,7 @@ def _with_light(state: State) -> State:
     difference, black = solved_light(normal, right).chunk(2, dim=-1)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
     noise = noise_curves(model, residual, inside, cameras)
-    none = {"glints": no_glints(cameras), "stray": no_stray(cameras), "lean": no_lean(cameras)}
+    none = {"glints": no_glints(cameras), **even_light(cameras)}
     light = DiskLight(difference=difference, black=black, noise=noise, **none, known=True)
     return replace(state, fitter=replace(state.fitter, light=light))
 

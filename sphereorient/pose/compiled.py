@@ -21,7 +21,7 @@ from sphereorient.files.threads import cores
 from sphereorient.pose import fit
 from sphereorient.pose.camera_view import CameraView, FrameDisks
 from sphereorient.pose.fit import COVERED, FIRST_EVERY, LEAST_OF_WINDOW, MARGIN_PX, MORE, MOST_EACH, NEAR_RAD, WINDOW_PX
-from sphereorient.pose.model import UNSEEN, SphereModel
+from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, pose_arrays
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY
@@ -180,9 +180,10 @@ def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
     at, lit, light, paint, unseen = _Addresses(), model.light, model.light.tables, model.paint, model.paint.unseen
     pointers = {"edge": _edge_table(), "light": light.cells, "cover": light.cover, "gain": light.gain}
     pointers |= {"noise": lit.noise, "stray": lit.stray, "limb_px": model.limb_px}
-    pointers["lean"] = lit.lean if bool(lit.lean.any()) else None
+    pointers |= {"lean": lit.lean if bool(lit.lean.any()) else None, "dark": lit.dark}
     numbers = {"unseen_most": UNSEEN, "known_least": KNOWN, "cover_least": COVER_MIN, "noise_least": NOISE_MIN}
     numbers |= {"tukey2": TUKEY**2, "outliers": OUTLIERS, "edges": EDGES, "edge_most": EDGE_MOST, "edge_px": EDGE_PX}
+    numbers["in_sight"] = IN_SIGHT
     numbers |= {"covered": COVERED, "most_each": MOST_EACH, "least_of_window": LEAST_OF_WINDOW, "margin": MARGIN_PX}
     n_difference, n_black = model.shading.counts
     task = _Task(

@@ -13,12 +13,11 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose.camera_view import FrameDisks
-from sphereorient.pose.model import Shading, SphereModel
+from sphereorient.pose.model import Shading, SphereModel, by_pose
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
 from sphereorient.pose.residuals import (
     EDGE_PX,
-    by_pose,
     disk_sums,
     loss_of,
     noise_variance,

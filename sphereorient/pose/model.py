@@ -1,5 +1,6 @@
 """The measuring model: what a picture of the painted sphere depends on, its light, and what pixels then show."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -17,6 +18,8 @@ from sphereorient.sphere.view import polynomials
 UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
 LEAN_ORDER, LEAN_EVERY = 3, 4  # of the polynomials of the light's slope; n-th place suffices for it
+SHADOW, BRIGHT = 0.3, 0.9  # share of the bright light, a quantile over the disk, below which the limb is in shadow
+IN_SIGHT = 0.99  # coverage of a pixel that the limb does not cut
 DARKEST = 0.05  # of the brightest light of white paint: the logarithm of less has no use
 
 
@@ -78,6 +81,7 @@ class Light(ABC):
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
     stray: Tensor  # (C, K), grey levels that the empty scene lacks
     lean: Tensor  # (C, 2, K), slope of the logarithm of `difference` across the disk, 1/radii: see `leaning`
+    dark: Tensor  # (C,), `difference`, grey levels, below which a place on the limb does not count
     known: bool = True  # whether it is estimated from pictures
 
     of_cameras: ClassVar[tuple[str, ...]]  # parts with an entry for each camera
@@ -97,7 +101,7 @@ class Light(ABC):
         return replace(self, **{name: getattr(self, name)[list(cameras)] for name in self.of_cameras})
 
     def with_lean(self, view: SphereView, pixels: Pixels, use: Tensor) -> Self:
-        """Return the light with its slopes as B * C disks, those of `use` (B, C) bool, show them."""
+        """Return the light with its slopes and shadows as B * C disks, those of `use` (B, C) bool, show them."""
         cameras, some = use.shape[1], slice(None, None, LEAN_EVERY)
         parts = (self.at(view, pixels)[0], view.coverage, view.across)
         difference, coverage, across = (part[..., some].double().nan_to_num() for part in parts)
@@ -107,9 +111,12 @@ class Light(ABC):
         target = (difference / size).clamp_min(DARKEST).log()
         weighted = columns * weight[:, None]
         normal, right = weighted @ columns.mT, (weighted @ target[..., None])[..., 0]
-        normal, right = (part.reshape(-1, cameras, *part.shape[1:]).sum(0) for part in (normal, right))
+        normal, right = (by_pose(part, cameras).sum(0) for part in (normal, right))
         found = solve_damped(normal, right, ridge=1e-7)
-        return replace(self, lean=torch.stack([found @ by.mT for by in _slopes()], dim=1).float())
+        lean = torch.stack([found @ by.mT for by in _slopes()], dim=1).float()
+        lit = torch.where(coverage > IN_SIGHT, difference, torch.nan).nanquantile(BRIGHT, 1).nan_to_num()
+        bright = by_pose(lit * use.reshape(-1), cameras).sum(0) / use.sum(0).clamp_min(1)
+        return replace(self, lean=lean, dark=(SHADOW * bright).float())
 
     def to(self, device: torch.device) -> Self:
         """Return the light on another device."""
@@ -151,6 +158,11 @@ def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
     return view.aside[:, None] * view.outward - depth[:, None] * pixels.direction, depth
 
 
+def by_pose(disks: Tensor, cameras: int) -> Tensor:
+    """Return (B * C, ...) as (B, C, ...)."""
+    return disks.reshape(-1, cameras, *disks.shape[1:])
+
+
 @cache
 def _slopes() -> tuple[Tensor, Tensor]:
     """Return the derivatives by x and by y, (n, K) float64 each, of polynomials of order LEAN_ORDER + 1."""
@@ -176,11 +188,6 @@ def leaning(view: SphereView, pixels: Pixels, model: SphereModel) -> SphereView:
     return replace(view, paint=view.paint - model.radius_mm * view.blur.square() * nearer.sum(1))
 
 
-def no_lean(cameras: int) -> Tensor:
-    """Return the slope of even light."""
-    return torch.zeros(cameras, 2, (LEAN_ORDER + 1) * (LEAN_ORDER + 2) // 2)
-
-
 def stray_basis(across: Tensor) -> Tensor:
     """Return the harmonics over the angle about the disk, (..., K, P), at places (..., 2, P): 1, cos, sin, cos 2 .."""
     cos, sin = torch.nn.functional.normalize(across, dim=-2).unbind(-2)
@@ -191,9 +198,11 @@ def stray_basis(across: Tensor) -> Tensor:
     return torch.stack(columns, dim=-2)
 
 
-def no_stray(cameras: int) -> Tensor:
-    """Return the coefficients of no stray light."""
-    return torch.zeros(cameras, 1 + 2 * STRAY_ORDER)
+def even_light(cameras: int) -> dict[str, Tensor]:
+    """Return the parts of a light without stray light, slopes and shadows."""
+    stray = torch.zeros(cameras, 1 + 2 * STRAY_ORDER)
+    lean = torch.zeros(cameras, 2, (LEAN_ORDER + 1) * (LEAN_ORDER + 2) // 2)
+    return {"stray": stray, "lean": lean, "dark": torch.full((cameras,), -math.inf)}
 
 
 def scene_beside(view: SphereView, pixels: Pixels, stray: Tensor) -> Tensor:

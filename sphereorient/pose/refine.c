@@ -56,6 +56,8 @@ typedef struct {
     int64_t iterations; /* 0: only `kept` is asked for */
     const float *limb_px; /* (cameras), or none */
     const float *lean;    /* (cameras, 2, SLOPES), or none */
+    const float *dark;    /* (cameras) */
+    float in_sight;
     float edge_px;
     /* occluders: share of a disk that they may cover, 0: none are sought; see fit.py */
     float most_hidden, covered, most_each, least_of_window;
@@ -848,6 +850,9 @@ static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
     if (t->instants > 1) mean_of_instants(t, at);
     if (t->lean) lean(t, at, of, k);
     shine(t, at, k);
+    const float dark = t->dark[k % t->cameras];
+    for (int64_t p = 0; p < t->places; p++) /* a limb in shadow does not count */
+        at->known[p] &= at->difference[p] >= dark || at->cover[p] >= t->in_sight;
     const uint8_t *clipped = t->clipped + k * t->places;
     double coefficients[COLUMNS];
     float deviation = 0;

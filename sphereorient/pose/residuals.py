@@ -3,14 +3,14 @@ they tell of stray light beside the sphere and of the noise of each camera.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from sphereorient.pose.model import SphereModel, SphereView, leaning, no_stray, scene_beside, stray_basis
+from sphereorient.pose.model import IN_SIGHT, SphereModel, SphereView, even_light, leaning, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.view import sphere_view
@@ -70,6 +70,9 @@ def residuals(
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     view = leaning(view, pixels, model)
     difference, black = model.light.at(view, pixels)  # as learnt
+    shadow = (difference < model.light.dark.to(difference).repeat(len(X))[:, None]) & (view.coverage < IN_SIGHT)
+    if bool(shadow.any()):
+        view = replace(view, known=~shadow if view.known is None else view.known & ~shadow)
     tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
     n, n_black = model.shading.counts
     learnt = (view.coverage * (view.paint * difference + black))[:, None]
@@ -142,11 +145,6 @@ def tile_scores(at: Residuals, mixed: Tensor, tile: Tensor) -> Tensor:
     return tiles.index_add(2, tile, score).double()
 
 
-def by_pose(disks: Tensor, cameras: int) -> Tensor:
-    """Return (B * C, ...) as (B, C, ...)."""
-    return disks.reshape(-1, cameras, *disks.shape[1:])
-
-
 def noise_variance(grey: Tensor, noise: Tensor) -> Tensor:
     """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
     grey = grey.clamp_min(0.0)
@@ -203,7 +201,7 @@ def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Te
     beside = at.inside & ~pixels.clipped & (at.view.coverage < NO_SPHERE) & use.reshape(-1, 1)
     beside[:, : pixels.inner] = False
     cameras = use.shape[1]
-    found = no_stray(cameras)
+    found: Tensor = even_light(cameras)["stray"]
     stray_known = scene_beside(at.view, pixels, known) - pixels.behind  # less what the sphere's edge adds
     for camera in range(cameras):
         own = slice(camera, None, cameras)

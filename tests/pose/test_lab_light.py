@@ -36,7 +36,7 @@ from sphereorient.pose.lights.lab import (
     knot_shares,
     lab_lights,
 )
-from sphereorient.pose.model import FIRST, LATER, SphereModel, no_lean, no_stray, scene_beside, stray_basis
+from sphereorient.pose.model import FIRST, LATER, SphereModel, even_light, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart
 from sphereorient.pose.residuals import residuals
@@ -112,8 +112,7 @@ def planted(cameras: int) -> LabLight:
         mirrored=0.04 + 0.15 * (1 - depth) ** 2,
         gain=torch.tensor([1.0, 0.7])[:cameras],
         noise=torch.tensor([[SIGMA**2, 0.0, 0.0, 0.0]]).repeat(cameras, 1),
-        stray=no_stray(cameras),
-        lean=no_lean(cameras),
+        **even_light(cameras),
     )
 
 
@@ -200,7 +199,7 @@ def test_it_explains_other_frames_better_than_maps_of_each_disk():
 
 def with_glare(pixels: Pixels, X: Tensor, R: Tensor, model: SphereModel) -> tuple[Pixels, Tensor]:
     """The same disks with light beside the sphere, below it to the right in the first camera; a bubble covers some."""
-    stray = no_stray(2)
+    stray = even_light(2)["stray"]
     stray[0, :4] = torch.tensor([6.0, 3.0, 4.0, 1.0])
     view = sphere_view(pixels, X.repeat_interleave(2, 0), R.repeat_interleave(2, 0), model)
     more = (1 - view.coverage) * (scene_beside(view, pixels, stray) - pixels.behind)
@@ -222,7 +221,7 @@ def test_light_beside_the_sphere_is_found_and_moves_no_pose():
     for light in (maps, lab):
         assert ((light.stray - planted_stray) @ basis).abs().max() < 1.0
     off, stated = [], []
-    for light in (lab, replace(lab, stray=no_stray(2))):
+    for light in (lab, replace(lab, stray=even_light(2)["stray"])):
         model = replace(model, light=light, shading=LATER)
         fit = refined(pixels, PoseStart(X, R, use), model)
         off.append(float((fit.position_lab_mm - X).mean(0).norm()))
@@ -238,7 +237,7 @@ def test_no_light_beside_the_sphere_is_invented():
 
 def test_files_without_stray_light_are_read():
     parts = {name: part for name, part in planted(2).parts().items() if name != "stray"}
-    assert light_of(parts, True).stray.equal(no_stray(2))
+    assert light_of(parts, True).stray.equal(even_light(2)["stray"])
 
 
 def test_rows_not_in_use_change_nothing():

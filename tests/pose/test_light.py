@@ -27,7 +27,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
-from sphereorient.pose.model import FIRST, SphereView, no_lean, no_stray
+from sphereorient.pose.model import FIRST, SphereView, even_light
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import PoseStart
 from sphereorient.pose.residuals import noise_curve
@@ -97,8 +97,7 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
         black=20 * torch.randn(2, 25, generator=rng),
         noise=NOISE.repeat(2, 1),
         glints=no_glints(2),
-        stray=no_stray(2),
-        lean=no_lean(2),
+        **even_light(2),
         known=True,
     )
     across = torch.cat([disk_places(3000, 0.98, seed) for seed in range(4)])
@@ -116,7 +115,7 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
 def test_a_lamp_is_looked_up_to_a_grey_level():
     across = disk_places(5000, 0.98)
     difference, black = maps_of(*lamp_coefficients())
-    none = {"glints": no_glints(1), "stray": no_stray(1), "lean": no_lean(1)}
+    none = {"glints": no_glints(1), **even_light(1)}
     light = DiskLight(difference=difference[None], black=black[None], noise=NOISE, **none, known=True)
     for got, expected in zip(looked_up(light, across), lamp(across, 0), strict=True):
         assert (got - expected)[across.norm(dim=1) < 0.9].abs().max() < 1.0

@@ -6,10 +6,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, no_lean, no_stray, scene_beside
+from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, by_pose, even_light, scene_beside
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import Residuals, by_pose, fitted_residuals, learn_stray, noise_curves
+from sphereorient.pose.residuals import Residuals, fitted_residuals, learn_stray, noise_curves
 from sphereorient.so3 import inverse_damped
 from sphereorient.sphere.view import polynomials
 
@@ -28,7 +28,7 @@ class DiskLight(Light):
     black: Tensor  # (C, K)
     glints: Tensor  # (C, G, G), more of black, over the square about the disk: lamps that the surface mirrors
 
-    of_cameras = ("difference", "black", "noise", "stray", "lean", "glints")
+    of_cameras = ("difference", "black", "noise", "stray", "lean", "dark", "glints")
     linear = True
 
     @classmethod
@@ -37,9 +37,8 @@ class DiskLight(Light):
         count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
         difference = torch.zeros(cameras, count)
         difference[:, 0] = 1.0
-        black, lean = torch.zeros(cameras, count), no_lean(cameras)
-        glints, stray = no_glints(cameras), no_stray(cameras)
-        return cls(difference=difference, black=black, glints=glints, noise=noise, stray=stray, lean=lean, known=False)
+        parts = {"glints": no_glints(cameras), "noise": noise, **even_light(cameras)}
+        return cls(difference=difference, black=torch.zeros(cameras, count), known=False, **parts)
 
     @cached_property
     def _map(self) -> Tensor:

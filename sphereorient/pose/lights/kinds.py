@@ -10,7 +10,7 @@ from torch import Tensor
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.lights.lab import LabLight, lab_lights
-from sphereorient.pose.model import Light, no_lean, no_stray
+from sphereorient.pose.model import Light, even_light
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 
@@ -25,8 +25,8 @@ Rivals = tuple[FittedPoses, FittedPoses, Tensor] | None  # fits of the same pict
 
 
 def light_of(parts: Mapping[str, Tensor], known: bool) -> Light:
-    """Return the light that consists of tensors, `Light.parts` and others; older files lack stray light and slopes."""
-    parts = {"stray": no_stray(len(parts["noise"])), "lean": no_lean(len(parts["noise"])), **parts}
+    """Return the light that consists of tensors, `Light.parts` and others; older files lack some."""
+    parts = {**even_light(len(parts["noise"])), **parts}
     kind = next((kind for kind in KINDS if parts.keys() >= set(kind.names())), DiskLight)
     return kind(known=known, **{name: parts[name] for name in kind.names()})
 

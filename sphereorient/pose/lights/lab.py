@@ -11,10 +11,19 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
-from sphereorient.pose.model import LATER, Light, LightTables, SphereModel, SphereView, scene_beside, surface_normals
+from sphereorient.pose.model import (
+    LATER,
+    Light,
+    LightTables,
+    SphereModel,
+    SphereView,
+    by_pose,
+    scene_beside,
+    surface_normals,
+)
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import by_pose, learn_stray, noise_curves, residuals
+from sphereorient.pose.residuals import learn_stray, noise_curves, residuals
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import polynomials
@@ -48,7 +57,7 @@ class LabLight(Light):
     mirrored: Tensor  # (n,), share of light that the surface mirrors
     gain: Tensor  # (C,), of the cameras
 
-    of_cameras = ("noise", "stray", "lean", "gain")
+    of_cameras = ("noise", "stray", "lean", "dark", "gain")
     linear = False
 
     @cached_property
@@ -204,6 +213,7 @@ def _flat(known: Light, view: SphereView, pixels: Pixels, use: Tensor) -> LabLig
         noise=known.noise,
         stray=known.stray,
         lean=known.lean,
+        dark=known.dark,
     )
 
 
