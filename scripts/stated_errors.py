@@ -105,10 +105,10 @@ def of_set(folder: Path, cameras: Sequence[str]) -> list[Stated]:
 
 
 def of_movie(seed: int, cameras: int) -> list[Stated]:
-    """Render and measure a synthetic movie."""
+    """Render and measure a synthetic movie; one camera: by turns lit from above and from its own side."""
     with tempfile.TemporaryDirectory() as name:
-        path = filmed(Path(name), seed, cameras, FRAMES)
-        return [of_track(f"{seed}", path, [f"cam{k + 1}" for k in range(cameras)], None)]
+        path, every = filmed(Path(name), seed, 2, FRAMES), ["cam1", "cam2"]
+        return [of_track(f"{seed}", path, every if cameras == 2 else [every[seed % 2]], None)]
 
 
 def of_stills(seed: int) -> list[Stated]:
@@ -132,8 +132,7 @@ def filmed(folder: Path, seed: int, cameras: int, frames: int) -> Path:
         diameter_px=draw.uniform(50.0, 110.0),
         blur_px=draw.uniform(0.4, 1.2),
     )
-    values = {"uneven_light": draw.uniform(1.0, 2.5), "highlights": draw.uniform(0.0, 60.0)}
-    values["paint_wear"] = draw.choice([0.0, draw.uniform(0.0, 0.04)])
+    values = {"highlights": draw.uniform(0.0, 60.0), "paint_wear": draw.choice([0.0, draw.uniform(0.0, 0.04)])}
     return write_synthetic_experiment(folder, settings, values=values)
 
 
