@@ -43,7 +43,7 @@ def report(given: _ReportOptions) -> None:
 
     chosen = given.chosen("report").statistics
     known = [load_experiment(path) for path in given.experiment or ()]
-    loaded, command = _load(given.tracks, given.sphere), command_line()
+    loaded, command = load_tracks(given.tracks, given.sphere), command_line()
     with progress_bar(given.quiet, unit="") as advance:
         words = write_report(loaded, given.out, experiments=known, settings=chosen, progress=advance, command=command)
     for verdict in words:
@@ -54,7 +54,7 @@ def report(given: _ReportOptions) -> None:
         typer.echo(f"Wrote {given.out / 'index.html'}")
 
 
-def _load(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
+def load_tracks(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
     """Read the tracks; the name of each is the shortest unique end of its path, and the name of its sphere."""
     whole = [path.resolve() for path in paths]
     for path in whole:

@@ -307,7 +307,7 @@ def final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
     texture = look_up(iterations.sharp_map(state), direction).clamp(0, 1)
     weight = look_up(iterations.map_weight(state), direction)
-    seen = _counts(state, direction)
+    seen = times_seen(state, direction)
     unknown = (seen == 0) | (weight <= 0)
     sigma = torch.where(unknown, torch.inf, weight.clamp_min(1e-30).rsqrt())
     return torch.where(unknown, torch.nan, texture).float(), torch.where(unknown, 0, seen), sigma.float()
@@ -350,7 +350,7 @@ def jumps(R_lab_body: Tensor) -> Tensor:
     return torch.nonzero(off > (JUMPS * usual).clamp_min(JUMP_RAD))[:, 0]
 
 
-def _counts(state: State, direction_body: Tensor) -> Tensor:
+def times_seen(state: State, direction_body: Tensor) -> Tensor:
     """Count the pictures that show each direction (..., 3) of the body at a small enough slant."""
     seen = torch.zeros(direction_body.shape[:-1], dtype=torch.int64)
     radius_mm = state.fitter.radius_mm
