@@ -69,7 +69,8 @@ def test_a_script_uses_names_that_exist(path):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("sphereorient"):
             module = importlib.import_module(node.module)
             for name in node.names:
-                found = getattr(module, name.name, None) or importlib.import_module(f"{node.module}.{name.name}")
+                there = hasattr(module, name.name)
+                found = getattr(module, name.name) if there else importlib.import_module(f"{node.module}.{name.name}")
                 if inspect.ismodule(found):
                     modules[name.asname or name.name] = found
     for node in ast.walk(tree):

@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from sphereorient import so3
 from sphereorient.errors import BenchError, TrackError, refusal
+from sphereorient.files.hdf5 import UNNAMED, ball_groups
 from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.walk import FICTRAC
@@ -148,7 +149,7 @@ def mahalanobis(error: Floats, covariance: Floats) -> Floats:
     return found
 
 
-def true_orientations(path: Path, time_s: Floats, sphere: str = "") -> Floats:
+def true_orientations(path: Path, time_s: Floats, sphere: str = UNNAMED) -> Floats:
     """Return R_lab_body (N, 3, 3) of truth.h5 at times (N,), s, to half a frame; raise TrackError without a match."""
     truth = _read_truth(path, sphere=sphere)
     return truth["orientation"][_rows(truth["time"], time_s, path)]
@@ -163,7 +164,7 @@ def orientations_at(path: Path, frame: Frames) -> Floats:
     return R[frame]
 
 
-def _read_truth(path: str | Path, *names: str, sphere: str = "", also: Sequence[str] = ()) -> dict[str, Floats]:
+def _read_truth(path: str | Path, *names: str, sphere: str = UNNAMED, also: Sequence[str] = ()) -> dict[str, Floats]:
     """Read what is true of a sphere; `also`: where the file has it."""
     try:
         with h5py.File(path) as file:
@@ -171,7 +172,7 @@ def _read_truth(path: str | Path, *names: str, sphere: str = "", also: Sequence[
             if "spheres" in file and not sphere and not schema.startswith("sphereorient-track"):
                 got, do = f"that of {', '.join(file['spheres'])}"[:200], "score the track of all of them"
                 raise TrackError(refusal(f"truth {path}", expected="the truth of one ball", got=got, do=do))
-            there = file[f"spheres/{sphere}"] if sphere else file
+            there = ball_groups(file)[sphere]
             wanted = ("time", "orientation", *names, *(key for key in also if key in there))
             truth = {key: np.asarray(there[key][()], np.float64) for key in wanted}
     except (OSError, KeyError) as error:

@@ -123,7 +123,7 @@ def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
     from sphereorient.report.columns import plain_names
 
     plain = plain_names(tracks, "ball")
-    paths = {name: file_of(out, plain[name] if name else "") for name in tracks}
+    paths = {name: file_of(out, name and plain[name]) for name in tracks}
     for path in paths.values():
         check_writable(path)
     return paths

@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume
+from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -133,8 +133,8 @@ def _print_summary(result: "Trajectory", name: str) -> None:
 
     summary = result.summary()
     echo_lines(f"note: {remark}" for remark in result.provenance.get("remarks", []))
-    ball = f"ball {name}: " if name else ""
-    typer.echo(f"{ball}{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
+    valid = f"{summary['valid']} of {summary['frames']}"
+    typer.echo(f"{ball_words(name)}{valid} frames valid (position and orientation measured)")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")

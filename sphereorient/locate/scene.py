@@ -1,5 +1,6 @@
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -24,6 +25,8 @@ CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in s
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
+
+DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,17 +105,19 @@ def learn_background(
     measured. `shown` is False where the sphere is hidden.
     """
     sizes = tuple(diameter_px) if isinstance(diameter_px, Sequence) else (diameter_px,)
+    several = len(sizes) > 1
+    find = partial(find_disks if several else _only_disk, diameters_px=sizes, settings=settings)
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
-        return _quieter(background, pictures, sizes, settings)
+        return _quieter(background, pictures, sizes, find)
     first, before = background, 0
-    if len(sizes) > 1:  # where spheres dwell, they are the mean, and the noise that hides them
+    if several:  # where spheres dwell, they are the mean, and the noise that hides them
         even = even_scene(first, max(sizes))
-        covered, _ = _covered(pictures, even, sizes, settings)
+        covered, _ = _covered(pictures, even, find)
         first = filled(first, even, covered, max(sizes))
         background = without_ball(first, pictures, covered)
     for _ in range(ROUNDS):
-        covered, found = _covered(pictures, background, sizes, settings)
+        covered, found = _covered(pictures, background, find)
         background = without_ball(first, pictures, covered)
         if found <= before or found == len(pictures) * len(sizes):
             break
@@ -120,14 +125,12 @@ def learn_background(
     return background
 
 
-def _quieter(
-    background: Background, pictures: NDArray[Any], sizes: Sequence[float], settings: LocateSettings
-) -> Background:
+def _quieter(background: Background, pictures: NDArray[Any], sizes: Sequence[float], find: DiskFinder) -> Background:
     """Limit the noise to the frame-to-frame change if spheres that never leave their pixels are not found otherwise."""
     loud = background.noise > LOUD * background.typical_noise
     if loud.sum() < LOUD_SHARE * np.pi / 4 * min(sizes) ** 2:
         return background
-    found = sum(len(_disks(picture, background, sizes, settings)) for picture in pictures)
+    found = sum(len(find(picture, background)) for picture in pictures)
     if 2 * found >= len(pictures) * len(sizes):
         return background
     values = pictures[:, loud].astype(np.float32)
@@ -137,23 +140,19 @@ def _quieter(
     return replace(background, noise=noise)
 
 
-def _disks(
-    picture: NDArray[Any], background: Background, sizes: Sequence[float], settings: LocateSettings
+def _only_disk(
+    picture: NDArray[Any], background: Background, diameters_px: Sequence[float], settings: LocateSettings
 ) -> list[Outline]:
-    """Return the disk of a single sphere, if it is found, or all that may be spheres."""
-    if len(sizes) > 1:
-        return find_disks(picture, background, sizes, settings)
-    outline, _ = find_ball(picture, background, sizes[0], settings)
+    """Return the disk of a single sphere, if it is found."""
+    outline, _ = find_ball(picture, background, diameters_px[0], settings)
     return [] if outline is None else [outline]
 
 
-def _covered(
-    pictures: NDArray[Any], background: Background, sizes: Sequence[float], settings: LocateSettings
-) -> tuple[NDArray[np.bool_], int]:
+def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -> tuple[NDArray[np.bool_], int]:
     """Return the pixels of all disks found in frames (n, H, W), and their number."""
     covered, found = np.zeros(pictures.shape, bool), 0
     for picture, mask in zip(pictures, covered, strict=True):
-        for disk in _disks(picture, background, sizes, settings):
+        for disk in find(picture, background):
             cover(mask, disk, RIM, True)
             found += 1
     return covered, found

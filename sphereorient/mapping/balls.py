@@ -56,9 +56,8 @@ def crops_of_balls(
     shows as many spheres as are named, each by itself).
     """
     names, streams = recording.experiment.names, recording.streams
-    first, *others = names
-    if not others:
-        return {first: take_crops(recording, settings, locating, progress)}
+    if recording.experiment.alone:
+        return {names[0]: take_crops(recording, settings, locating, progress)}
     scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]
     sizes_px = [[scene[name].diameter_px for name in names] for scene in scenes]
     radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}

@@ -12,6 +12,7 @@ import torch
 from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import open_recording
+from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.provenance import provenance, sha256
 from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import check_folder, check_target
@@ -51,7 +52,7 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
                 tasks = todo.send([work.do(task) for task in tasks])
             except StopIteration as end:
                 tracks: Tracks = end.value
-                return tracks.get("", tracks)
+                return tracks.get(UNNAMED, tracks)
 
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
