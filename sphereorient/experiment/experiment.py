@@ -10,11 +10,11 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.cameras.checks import check_known
+from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.yaml_file import read_document, short, validated
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
-from sphereorient.movies.response import Response
 from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
 from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths, refused
 from sphereorient.experiment.timeline import NONE, Rows, Timeline, timeline
 from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import Grey, Movie, flipped_picture
-from sphereorient.movies.response import Response
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
 Shown = TypeVar("Shown", bound=Grey | OnDemand)

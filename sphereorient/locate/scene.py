@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera, nearest_point
+from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.locate.background import LOUD, Background, even_scene, filled, measure_background, without_ball
@@ -16,7 +17,6 @@ from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
-from sphereorient.movies.response import Response
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow

@@ -70,7 +70,7 @@ def crops_of_balls(
         for shot, size_px in zip(shots, sizes_px, strict=True):
             usable = shot.usable and shot.background is not None
             disks.append(find_disks(shot.picture, shot.background, size_px, locating) if usable else [])
-            crops.append([cut_crop(shot.picture, one.u_px, one.v_px, one.radius_px) for one in disks[-1]])
+            crops.append([cut_crop(shot.picture, *one.circle) for one in disks[-1]])
         instants.append(matched_instant(disks, crops, recording.cameras, 2 * min(radius_mm.values())))
         progress("balls", k + 1, 0)
     chosen = linked_matches(instants, scenes, radius_mm)

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import torch
 
+from sphereorient.cameras.response import Response
 from sphereorient.errors import TrackError, error_words, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, whole_hdf5
@@ -24,7 +25,6 @@ from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
-from sphereorient.movies.response import Response
 from sphereorient.pose import CameraView, Fitter, Optics
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.lights.kinds import light_of

@@ -12,6 +12,7 @@ from torch import Tensor
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration.contradictions import with_contradictions
 from sphereorient.calibration.systematic import with_lasting_errors, with_systematic_errors
+from sphereorient.cameras.response import LINEAR
 from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Recording
@@ -20,7 +21,6 @@ from sphereorient.follow.appearance import LOOK_ALIKE
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, in_middle
-from sphereorient.movies.response import LINEAR
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.poses import PoseTable, turned_alone
