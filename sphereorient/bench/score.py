@@ -211,8 +211,7 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats]:
     if rows.shape[0] == 0 or rows.shape[1] < FICTRAC_COLUMNS:
         got = f"{rows.shape[0]} lines of {rows.shape[1]}"
         raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
-    R = rotations(rows[:, FICTRAC["rotation_cam"]])
-    return rows[:, 0].astype(np.int64), R
+    return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]])
 
 
 READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}

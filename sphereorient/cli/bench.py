@@ -22,6 +22,7 @@ from sphereorient.cli.options import (
     tracks_in,
 )
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import write_text, writing
 
 if TYPE_CHECKING:
@@ -297,9 +298,8 @@ def write_scenes(given: _SceneOptions) -> None:
 
     scenes = scenes_of(given.plan())
     with progress_bar(given.quiet, unit="") as advance:
-        for done, scene in enumerate(scenes, start=1):
+        for scene in counted("scenes", scenes, len(scenes), advance):
             write_scene(given.out / scene.name, scene)
-            advance("scenes", done, len(scenes))
     index = [{"name": scene.name, "degradations": dict(scene.degradations), "seed": scene.seed} for scene in scenes]
     write_text(given.out / "scenes.json", json.dumps(index, indent=1) + "\n")
     if not given.quiet:

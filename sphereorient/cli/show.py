@@ -159,7 +159,6 @@ def export(
         camera = next(iter(load_experiment(experiment).cameras.values()))
     with progress_bar(quiet) as advance:
         for ball, path in paths.items():
-            told = partial(advance, f"export {ball}".strip())
-            export_track(loaded[ball], path, to, told, camera)
+            export_track(loaded[ball], path, to, partial(advance, f"export {ball}".strip()), camera)
     for ball, path in paths.items() if not quiet else ():
         typer.echo(f"Wrote {path}: {len(loaded[ball])} frames")

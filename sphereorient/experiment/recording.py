@@ -234,8 +234,7 @@ def open_recording(
     experiment = load_experiment(source)
     paths = {sphere.name: _texture_path(experiment, sphere) for sphere in experiment.spheres} if textured else {}
     loaded = {path: load_map(path) for path in dict.fromkeys(paths.values())}
-    names = _chosen(experiment, cameras)
-    movies = open_movies(experiment, names)
+    movies = open_movies(experiment, _chosen(experiment, cameras))
     frames = timeline(experiment, movies)
     streams = []
     for name, movie in movies.items():

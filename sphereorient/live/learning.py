@@ -227,8 +227,7 @@ def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
         candidates=settings.refine.candidates,
     )
     refine = settings.refine.model_copy(update={"chunks": 1})
-    tracker = BallTracker(found.appearance, begin, refine, centre=found.centre)
-    return OnlineTracker(tracker, found.appearance)
+    return OnlineTracker(BallTracker(found.appearance, begin, refine, centre=found.centre), found.appearance)
 
 
 def _unknown(place: Crops) -> Appearance:

@@ -133,8 +133,7 @@ def _quieter(background: Background, pictures: NDArray[Any], sizes: Sequence[flo
     found = sum(len(find(picture, background)) for picture in pictures)
     if 2 * found >= len(pictures) * len(sizes):
         return background
-    values = pictures[:, loud].astype(np.float32)
-    changed = np.median(np.abs(np.diff(values, axis=0)), axis=0) / CHANGE_SIGMAS
+    changed = np.median(np.abs(np.diff(pictures[:, loud].astype(np.float32), axis=0)), axis=0) / CHANGE_SIGMAS
     noise = background.noise.copy()
     noise[loud] = np.clip(changed, background.typical_noise, noise[loud])
     return replace(background, noise=noise)

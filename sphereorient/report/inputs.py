@@ -107,8 +107,7 @@ def _draw_picture(ax: Any, one: PictureReport) -> None:
         ax.set_aspect("equal")
         ax.invert_yaxis()
     found = one.view.uv_px
-    expected = found - one.residual_px
-    ax.plot(*expected.T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
+    ax.plot(*(found - one.residual_px).T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
     ax.plot(*found.T, "o", ms=4, mfc="none", mew=0.8, color=FOUND, label="found")
     if not one.used.all():
         ax.plot(*found[~one.used].T, "x", ms=8, color=OUTLIER, label="left out")
