@@ -1,4 +1,4 @@
-"""Cameras: their models and files; projection, lines of sight, triangulation."""
+"""Cameras: their models, responses and files; projection, lines of sight, triangulation."""
 
 from sphereorient.cameras.brown import TsaiCamera
 from sphereorient.cameras.camera import (
