@@ -183,7 +183,9 @@ def fixed_ball(
         raise _none_fixed("nothing that changes")
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     inside = (labels == largest).astype(np.uint8)
-    guess = locating.diameter_px or _diameter(inside, shown is not None)
+    filled = np.sqrt(inside.sum() / np.pi)  # radius of a disk of as many pixels, some of which may be hidden
+    around = filled if shown is None else cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1]
+    guess = locating.diameter_px or 2 * float(around)
     change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # limb without texture
     blob = Blob(u_px=float(centres[largest][0]), v_px=float(centres[largest][1]), merit=1.0)
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
@@ -191,11 +193,6 @@ def fixed_ball(
         raise _none_fixed("no circle about what changes")
     scene = _around(middle, scatter, outline, full_scale)
     return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
-
-
-def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
-    around = cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1] if hidden else np.sqrt(inside.sum() / np.pi)
-    return 2 * float(around)
 
 
 def _around(

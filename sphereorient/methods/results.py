@@ -181,6 +181,9 @@ def precise_track(
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
+    segment = chosen.segment.numpy()
+    number, count = np.unique(segment[segment >= 0], return_counts=True)
+    alone = np.isin(segment, number[count == 1])  # in its segment: no other frame confirms its pose
     return replace(
         track,
         position=track.position - move_mm.numpy(),
@@ -188,17 +191,11 @@ def precise_track(
         orientation=smoothed.R_given_path.numpy(),
         orientation_cov=smoothed.cov_given_path_rad2.numpy(),
         **datasets_of(smoothed, experiment.length_unit),
-        segment=chosen.segment.numpy(),
+        segment=segment,
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
-        confidence=np.where(_alone(chosen.segment.numpy()), np.nan, chosen.probability.numpy()),
+        confidence=np.where(alone, np.nan, chosen.probability.numpy()),
     )
-
-
-def _alone(segment: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which frames (N,) are the only ones of their segment: no other one confirms their pose."""
-    number, count = np.unique(segment[segment >= 0], return_counts=True)
-    return np.isin(segment, number[count == 1])
 
 
 def with_errors(

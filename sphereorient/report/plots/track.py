@@ -72,7 +72,8 @@ def track_figure(track: Trajectory) -> Figure:
     panels = figure.subplots(3, 1 if track.held else 2, sharex=True, squeeze=False)
     if not track.held:
         _dots(panels[0, 0], time, track.position)
-        _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
+        sigma = np.sqrt(np.maximum(np.diagonal(track.position_smooth_cov, axis1=1, axis2=2), 0.0))
+        _curves(panels[0, 0], time, track.position_smooth, sigma, part.broken)
         panels[0, 0].set_ylabel(in_length("position, lab (mm)", track.length_unit))
     _angles(panels[0, -1], time, part)
     shown = ("omega_lab", "alpha_lab") if track.held else tuple(RATES)
@@ -174,10 +175,6 @@ def _angles(axes: Axes, time: Floats, part: TrackPart) -> None:
         _curve(axes, time, smooth[:, i], sigma[:, i], part.broken | jumps, i)
     axes.set(ylim=(-185, 185), yticks=range(-180, 181, 90))
     axes.set_ylabel(r"angles $\theta_x$, $\theta_y$, $\theta_z$ (degrees)")
-
-
-def _sigma(cov: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0)))
 
 
 def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_]) -> None:
