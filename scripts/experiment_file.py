@@ -8,6 +8,7 @@ from typing import Any
 
 from sphereorient.experiment import Experiment, Sphere
 from sphereorient.experiment.experiment import MOVIES_OWN, SCHEMA
+from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import write_document
 
@@ -32,7 +33,7 @@ def write_experiment(experiment: Experiment) -> Path:
         "frame_rate": float(experiment.frame_rate_hz) if times is None else None,
         "times": times if times in (None, MOVIES_OWN) else relative(str(times)),
         "exposure": None if experiment.exposure_s is None else float(experiment.exposure_s),
-        **({"sphere": spheres[""]} if "" in spheres else {"spheres": spheres}),
+        **({"sphere": spheres[UNNAMED]} if UNNAMED in spheres else {"spheres": spheres}),
         "cameras": relative(experiment.cameras_path),
         "movies": all_relative(experiment.movie_paths),
         "masks": all_relative(experiment.mask_paths),

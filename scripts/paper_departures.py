@@ -30,10 +30,10 @@ from sphereorient.locate import scene
 from sphereorient.methods import paper
 from sphereorient.methods.settings import load_settings
 from sphereorient.motion import measure
-from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies
 from sphereorient.search import template_bank
 from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory.rotations import distance_deg
 
 STAGES = ("locate_sphere", "propose_orientations")
 # How many stages stay as they are, settings, and a context in which the code is another.

@@ -25,12 +25,12 @@ from sphereorient.experiment import Experiment, open_movies
 from sphereorient.methods.paper import in_the_lab
 from sphereorient.report import plots
 from sphereorient.report.plots import style as look
-from sphereorient.report.plots.track import tait_bryan_deg
 from sphereorient.search import Candidates, TemplateBank, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 from sphereorient.statistics.cameras import camera_distances, without_perspective
 from sphereorient.statistics.summary import Distributions
 from sphereorient.trajectory import Reason, Trajectory
+from sphereorient.trajectory.rotations import tait_bryan
 
 Floats = NDArray[np.float64]
 SIZE_PX = 80  # of the disks that are compared
@@ -397,7 +397,7 @@ def sample_track(example: Example) -> Figure:
     figure = look.new_figure(look.WIDTH_IN, 5.6)
     panels = figure.subplots(3, 1, sharex=True, height_ratios=[1, 1.3, 0.8])
     time_ms = 1e3 * track.time
-    theta = tait_bryan_deg(track.orientation)
+    theta = np.rad2deg(tait_bryan(track.orientation))
     for i, style in enumerate(look.COMPONENTS):
         dots = {"linestyle": "none", "color": style.colour, "marker": style.marker, "markersize": 2.2}
         panels[0].plot(time_ms, track.position[:, i], **dots)

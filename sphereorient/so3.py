@@ -141,8 +141,7 @@ def nearest_rotation(M: Tensor) -> Tensor:
     """
     check_tail("M", M, 3, 3)
     finite = M.isfinite().all(-1).all(-1)[..., None, None]
-    view = torch.eye(3, dtype=M.dtype, device=M.device)
-    M = torch.where(finite, M, view)
+    M = torch.where(finite, M, torch.eye(3, dtype=M.dtype, device=M.device))
     U, S, Vh = torch.linalg.svd(M.detach())
     sign = torch.linalg.det(U @ Vh).sign()[..., None]
     signs = torch.cat([torch.ones_like(S[..., :2]), sign], -1)

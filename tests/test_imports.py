@@ -28,6 +28,19 @@ def test_every_folder_is_a_room_with_tests():
     assert folders | {"errors", "so3"} == set(rooms.ORDER)
 
 
+def test_tests_and_scripts_import_public_names():
+    private = [
+        f"{path.name}: {name.name}"
+        for folder in ("tests", "scripts")
+        for path in sorted((REPO / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("sphereorient")
+        for name in node.names
+        if name.name.startswith("_")
+    ]
+    assert private == []
+
+
 @pytest.mark.parametrize("code", ["import sphereorient", "import sphereorient.cli", "import sphereorient.trajectory"])
 def test_the_front_door_does_not_wait_for_torch(code):
     heavy = "{'torch', 'kornia', 'pytorch_lightning', 'scipy.optimize', 'matplotlib', 'pandas'}"
@@ -56,7 +69,8 @@ def test_a_script_uses_names_that_exist(path):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("sphereorient"):
             module = importlib.import_module(node.module)
             for name in node.names:
-                found = getattr(module, name.name, None) or importlib.import_module(f"{node.module}.{name.name}")
+                there = hasattr(module, name.name)
+                found = getattr(module, name.name) if there else importlib.import_module(f"{node.module}.{name.name}")
                 if inspect.ismodule(found):
                     modules[name.asname or name.name] = found
     for node in ast.walk(tree):

@@ -266,7 +266,7 @@ def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: Asse
         guess = not matched or abs(merits[0] - merits[1]) < settings.repair_margin
         if guess:
             beside = _beside(frames, torch.nonzero(agreed)[:, 0], settings.gap_frames_max)
-            merits = [-_roughest_turn(track, beside) for track in decided]
+            merits = [-roughest_turn(track, beside) for track in decided]
         leader = int(merits[1] > merits[0])
         loser = 1 - leader
         agreed[frames], ambiguous[frames] = True, guess
@@ -316,7 +316,7 @@ def _beside(frames: Tensor, agreed: Tensor, gap_frames_max: int) -> Tensor:
     return torch.cat([before, frames, after])
 
 
-def _roughest_turn(track: Track, frames: Tensor) -> float:
+def roughest_turn(track: Track, frames: Tensor) -> float:
     """Return the largest rotation per frame, rad, of a track between successive ones of some frames."""
     R = track.R_lab_body[frames]
     turn = so3.geodesic_distance(R[:-1], R[1:]) / frames.diff()

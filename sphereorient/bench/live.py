@@ -13,10 +13,8 @@ from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sphereorient import so3
 from sphereorient.bench.score import orientations_at
 from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.experiment.recording import open_recording
@@ -24,7 +22,7 @@ from sphereorient.files.page_server import HOST
 from sphereorient.files.threads import Progress, silent
 from sphereorient.live.shared import SharedFrames
 from sphereorient.live.sources import movie_frames
-from sphereorient.report.frame_warnings import distance_deg
+from sphereorient.trajectory.rotations import distance_deg, rotations
 from sphereorient.trajectory.walk import FICTRAC
 
 BEGIN_S = 120.0  # until the tracker's first line
@@ -217,7 +215,7 @@ def _errors_deg(table: Floats, order: Sequence[int], R_cam_lab: Floats, truth: P
     R = orientations_at(truth, np.array(order)[(table[:, 0].astype(int) - 1) % len(order)])
     begins = np.maximum.accumulate(np.where(table[:, 5] == 1, np.arange(len(table)), 0))
     true = R_cam_lab @ R @ R[begins].transpose(0, 2, 1) @ R_cam_lab.T
-    return distance_deg(so3.exp(torch.from_numpy(table[:, 2:5])).numpy(), true)
+    return distance_deg(rotations(table[:, 2:5]), true)
 
 
 def _memory_mb(process: int) -> list[float]:

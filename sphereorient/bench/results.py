@@ -10,6 +10,7 @@ from pydantic import TypeAdapter
 
 from sphereorient.bench.scenes import BenchSettings
 from sphereorient.errors import BenchError, refusal
+from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.whole_file import write_text
 
 SCHEMA = "sphereorient-robustness/1"
@@ -47,7 +48,7 @@ class SceneResult:
     inside: int  # of these, with the truth inside the 95 % region
     seconds: float
     over_stated: float | None = None  # rms of these frames' errors over their stated sigmas; None: of an older version
-    ball: str = ""  # its name; empty: the only one
+    ball: str = UNNAMED  # its name
     given: int = 0  # frames in which its position is that of another ball
     exchanges: int = 0  # how often the ball changes whose position it is
     hidden: float = 0.0  # share of its pictures that nearer balls hide by more than half

@@ -33,10 +33,10 @@ from sphereorient.files.cache import FOLDER
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
-from sphereorient.report.frame_warnings import distance_deg
 from sphereorient.run.stages import track_movies, with_proposer
 from sphereorient.synth.scene import hidden_shares
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
+from sphereorient.trajectory.rotations import distance_deg
 
 Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sphereorient import so3
 from sphereorient.errors import BenchError, TrackError, refusal
-from sphereorient.report.frame_warnings import distance_deg
+from sphereorient.files.hdf5 import UNNAMED, ball_groups
 from sphereorient.trajectory import Tracks, Trajectory
+from sphereorient.trajectory.rotations import distance_deg, rotation_vectors, rotations
 from sphereorient.trajectory.walk import FICTRAC
 
 Floats = NDArray[np.float64]
@@ -81,7 +81,7 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
         wrong, whole = (np.square(x[have]).sum() for x in (measured - true, true))
         relative[key] = float(np.sqrt(wrong / whole)) if have.any() else np.nan
     R_true, off_mm = truth["orientation"][row], truth["position"][row] - track.position
-    turn = so3.log(torch.from_numpy(R_true @ track.orientation.transpose(0, 2, 1))).numpy()
+    turn = rotation_vectors(R_true @ track.orientation.transpose(0, 2, 1))
     return Score(
         frames=len(track),
         valid=track.valid & np.isfinite(track.orientation).all(axis=(1, 2)) & np.isfinite(track.position).all(axis=1),
@@ -148,7 +148,7 @@ def mahalanobis(error: Floats, covariance: Floats) -> Floats:
     return found
 
 
-def true_orientations(path: Path, time_s: Floats, sphere: str = "") -> Floats:
+def true_orientations(path: Path, time_s: Floats, sphere: str = UNNAMED) -> Floats:
     """Return R_lab_body (N, 3, 3) of truth.h5 at times (N,), s, to half a frame; raise TrackError without a match."""
     truth = _read_truth(path, sphere=sphere)
     return truth["orientation"][_rows(truth["time"], time_s, path)]
@@ -163,7 +163,7 @@ def orientations_at(path: Path, frame: Frames) -> Floats:
     return R[frame]
 
 
-def _read_truth(path: str | Path, *names: str, sphere: str = "", also: Sequence[str] = ()) -> dict[str, Floats]:
+def _read_truth(path: str | Path, *names: str, sphere: str = UNNAMED, also: Sequence[str] = ()) -> dict[str, Floats]:
     """Read what is true of a sphere; `also`: where the file has it."""
     try:
         with h5py.File(path) as file:
@@ -171,7 +171,7 @@ def _read_truth(path: str | Path, *names: str, sphere: str = "", also: Sequence[
             if "spheres" in file and not sphere and not schema.startswith("sphereorient-track"):
                 got, do = f"that of {', '.join(file['spheres'])}"[:200], "score the track of all of them"
                 raise TrackError(refusal(f"truth {path}", expected="the truth of one ball", got=got, do=do))
-            there = file[f"spheres/{sphere}"] if sphere else file
+            there = ball_groups(file)[sphere]
             wanted = ("time", "orientation", *names, *(key for key in also if key in there))
             truth = {key: np.asarray(there[key][()], np.float64) for key in wanted}
     except (OSError, KeyError) as error:
@@ -211,8 +211,7 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats]:
     if rows.shape[0] == 0 or rows.shape[1] < FICTRAC_COLUMNS:
         got = f"{rows.shape[0]} lines of {rows.shape[1]}"
         raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
-    R = so3.exp(torch.from_numpy(np.ascontiguousarray(rows[:, FICTRAC["rotation_cam"]]))).numpy()
-    return rows[:, 0].astype(np.int64), R
+    return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]])
 
 
 READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}
@@ -229,24 +228,29 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
     known = np.isfinite(R).all((1, 2))
     out = np.full(len(R), np.nan)
     if known.any():
-        measured, true = torch.from_numpy(R[known]), torch.from_numpy(R_true[known])
+        measured, true = R[known], R_true[known]
         left, right = _alignment(measured, true, align)
-        out[known] = np.rad2deg(so3.geodesic_distance(left @ measured @ right, true).numpy())
+        out[known] = distance_deg(left @ measured @ right, true)
     return out
 
 
-def _alignment(measured: torch.Tensor, true: torch.Tensor, align: str) -> tuple[torch.Tensor, torch.Tensor]:
+def _alignment(measured: Floats, true: Floats, align: str) -> tuple[Floats, Floats]:
     """Return A and B with the least squared chords, fitted in turn; starting from the first frame's B avoids wrong
     optima.
     """
-    left = right = torch.eye(3, dtype=measured.dtype)
+    left = right = np.eye(3)
     if align == "none":
         return left, right
-    right = measured[0].mT @ true[0]
+    right = measured[0].T @ true[0]
     for _ in range(ITERATIONS if align == "both" else 1):
         if align == "both":
-            left = so3.nearest_rotation((true @ (measured @ right).mT).sum(0))
-        before, right = right, so3.nearest_rotation(((left @ measured).mT @ true).sum(0))
-        if (right - before).abs().max() < CONVERGED:
+            left = _mean(true @ (measured @ right).mT)
+        before, right = right, _mean((left @ measured).mT @ true)
+        if np.abs(right - before).max() < CONVERGED:
             break
     return left, right
+
+
+def _mean(R: Floats) -> Floats:
+    """Return the rotation with the least squared chords to rotations (N, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(R).mean().as_matrix(), np.float64)

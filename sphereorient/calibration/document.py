@@ -122,8 +122,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
     """Read a CSV table with columns x, y, z (lab, mm), u, v (px), in any order, as (n, 5); CameraError if malformed."""
     content = read_whole(path, TABLE_BYTES, "a table", CameraError, "correct the path")
     try:
-        text = content.decode("utf-8-sig")
-        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True))
+        rows = list(csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), skipinitialspace=True))
     except (UnicodeDecodeError, csv.Error) as fault:
         raise camera_error(str(path), "a table", "a file that is not CSV", "save the table as CSV") from fault
     known = [name.strip() for name in rows[0] if name is not None] if rows else []

@@ -23,7 +23,7 @@ from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
-from sphereorient.files.threads import side_by_side
+from sphereorient.files.threads import counted, side_by_side
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
@@ -82,12 +82,8 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     def see(k: int) -> PlateView:
         return see_plate(grey[k], plate, document.pictures[k].path.name, document.pictures[k].clicked_px)
 
-    views: dict[Picture, PlateView] = {}
-    progress("pictures", 0, len(grey))
-    for picture, view in zip(document.pictures, side_by_side(see, range(len(grey))), strict=True):
-        views[picture] = view
-        progress("pictures", len(views), len(grey))
-    return views
+    views = counted("pictures", side_by_side(see, range(len(grey))), len(grey), progress)
+    return dict(zip(document.pictures, views, strict=True))
 
 
 def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Cameras: their models and files; projection, lines of sight, triangulation."""
+"""Cameras: their models, responses and files; projection, lines of sight, triangulation."""
 
 from sphereorient.cameras.brown import TsaiCamera
 from sphereorient.cameras.camera import (
@@ -14,6 +14,6 @@ from sphereorient.cameras.camera import (
     sphere_radius_px,
     triangulate,
 )
-from sphereorient.cameras.ideal import PinholeCamera
 from sphereorient.cameras.io.cameras_yaml import add_model, load_cameras, load_covariance, save_cameras
+from sphereorient.cameras.model import PinholeCamera
 from sphereorient.cameras.port import Port, PortCamera, in_air

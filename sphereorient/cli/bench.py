@@ -16,11 +16,13 @@ from sphereorient.cli.options import (
     Quiet,
     SphereName,
     TrackPath,
+    ball_words,
     cameras_of,
     names_in,
     tracks_in,
 )
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import write_text, writing
 
 if TYPE_CHECKING:
@@ -82,7 +84,7 @@ def score(
             typer.echo(f"ball {name}: {wrong} frames given to another ball, {changes} exchanges")
 
 
-def error_table(found: "Score", ball: str = "") -> "Table":
+def error_table(found: "Score", ball: str | None = None) -> "Table":
     """Return errors of orientation and position, and relative errors of the rates, as a table."""
     from rich.table import Table
 
@@ -296,9 +298,8 @@ def write_scenes(given: _SceneOptions) -> None:
 
     scenes = scenes_of(given.plan())
     with progress_bar(given.quiet, unit="") as advance:
-        for done, scene in enumerate(scenes, start=1):
+        for scene in counted("scenes", scenes, len(scenes), advance):
             write_scene(given.out / scene.name, scene)
-            advance("scenes", done, len(scenes))
     index = [{"name": scene.name, "degradations": dict(scene.degradations), "seed": scene.seed} for scene in scenes]
     write_text(given.out / "scenes.json", json.dumps(index, indent=1) + "\n")
     if not given.quiet:
@@ -319,6 +320,7 @@ def score_result(
 
     from sphereorient.bench.results import WRONG_DEG
     from sphereorient.bench.score import READERS, aligned_errors_deg, orientations_at, true_orientations
+    from sphereorient.files.hdf5 import UNNAMED
 
     found = {}
     if of == "sphereorient":
@@ -326,15 +328,14 @@ def score_result(
             found[name] = track.orientation, true_orientations(truth, track.time, name)
     elif of in READERS:
         frame, R = READERS[of](result)
-        found[""] = R, orientations_at(truth, frame)
+        found[UNNAMED] = R, orientations_at(truth, frame)
     else:
         known = ", ".join(["sphereorient", *READERS])
         raise SettingsError(refusal("--format", expected=known, got=repr(of)[:40], do="choose one"))
     for name, (R, R_true) in found.items():
         errors = aligned_errors_deg(R, R_true, align)
         finite = errors[np.isfinite(errors)]
-        ball = f"ball {name}: " if name else ""
-        typer.echo(f"{ball}{len(finite)} of {len(errors)} frames have an orientation")
+        typer.echo(f"{ball_words(name)}{len(finite)} of {len(errors)} frames have an orientation")
         if len(finite):
             p50, p95, largest = np.percentile(finite, (50, 95, 100))
             wrong = float((finite > WRONG_DEG).mean())

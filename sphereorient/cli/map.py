@@ -13,6 +13,7 @@ from typer import Argument, Option
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, file_of
 from sphereorient.errors import PaintError, refusal
+from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import check_ending
 
 if TYPE_CHECKING:
@@ -72,10 +73,8 @@ def map_(given: _MapOptions) -> None:
             command=command_line(),
         )
         results, files = found if isinstance(found, dict) else {found.paint_of: found}, []
-        advance("figure", 0, len(results))
-        for done, (name, result) in enumerate(results.items(), start=1):
+        for name, result in counted("figure", results.items(), len(results), advance):
             files += _write(result, old, outs[name])
-            advance("figure", done, len(results))
         store.remove()
     if given.quiet:
         return

@@ -91,8 +91,13 @@ def cameras_of(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(names_in(text))
 
 
+def ball_words(name: str) -> str:
+    """Return the beginning of a line about a ball; nothing for an unnamed one."""
+    return f"ball {name}: " if name else ""
+
+
 def file_of(out: Path, ball: str) -> Path:
-    """Return the file of a ball: `out` of the only one without name, else out_NAME."""
+    """Return the file of a ball: `out` of an unnamed one, else out_NAME."""
     return out.with_name(f"{out.stem}_{ball}{out.suffix}") if ball else out
 
 

@@ -43,7 +43,7 @@ def report(given: _ReportOptions) -> None:
 
     chosen = given.chosen("report").statistics
     known = [load_experiment(path) for path in given.experiment or ()]
-    loaded, command = _load(given.tracks, given.sphere), command_line()
+    loaded, command = load_tracks(given.tracks, given.sphere), command_line()
     with progress_bar(given.quiet, unit="") as advance:
         words = write_report(loaded, given.out, experiments=known, settings=chosen, progress=advance, command=command)
     for verdict in words:
@@ -54,7 +54,7 @@ def report(given: _ReportOptions) -> None:
         typer.echo(f"Wrote {given.out / 'index.html'}")
 
 
-def _load(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
+def load_tracks(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
     """Read the tracks; the name of each is the shortest unique end of its path, and the name of its sphere."""
     whole = [path.resolve() for path in paths]
     for path in whole:
@@ -123,7 +123,7 @@ def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
     from sphereorient.report.columns import plain_names
 
     plain = plain_names(tracks, "ball")
-    paths = {name: file_of(out, plain[name] if name else "") for name in tracks}
+    paths = {name: file_of(out, name and plain[name]) for name in tracks}
     for path in paths.values():
         check_writable(path)
     return paths
@@ -159,7 +159,6 @@ def export(
         camera = next(iter(load_experiment(experiment).cameras.values()))
     with progress_bar(quiet) as advance:
         for ball, path in paths.items():
-            told = partial(advance, f"export {ball}".strip())
-            export_track(loaded[ball], path, to, told, camera)
+            export_track(loaded[ball], path, to, partial(advance, f"export {ball}".strip()), camera)
     for ball, path in paths.items() if not quiet else ():
         typer.echo(f"Wrote {path}: {len(loaded[ball])} frames")

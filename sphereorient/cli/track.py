@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume
+from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -48,10 +48,9 @@ def track(given: _TrackOptions) -> None:
         if many:
             name, do = f"--save-learnt {given.save_learnt}", "track them one by one"
             raise SettingsError(refusal(name, expected="one experiment", got="several", do=do))
-    from sphereorient.run import FolderStore, Request, run
+    from sphereorient.run import FolderStore, Request
     from sphereorient.run.many import tracks_of
-    from sphereorient.run.stages import with_proposer
-    from sphereorient.trajectory import Tracks
+    from sphereorient.run.stages import run_tracks, with_proposer
 
     also = ["refine.learn_paint=false"] if given.no_learn_paint else []
     chosen = with_proposer(given.chosen(given.method, *also), given.proposer)
@@ -73,9 +72,9 @@ def track(given: _TrackOptions) -> None:
         _track_side_by_side(requests, given.jobs, given.cluster, given.resume, given.quiet)
         return
     with _kept(requests), progress_bar(given.quiet) as advance:
-        result = run(requests[0], FolderStore(requests[0].parts), resume=given.resume, progress=advance)
+        tracks = run_tracks(requests[0], FolderStore(requests[0].parts), resume=given.resume, progress=advance)
     if not given.quiet:
-        for name, track in Tracks.of(result).items():
+        for name, track in tracks.items():
             _print_summary(track, name)
         typer.echo(f"Wrote {given.out}")
 
@@ -133,8 +132,8 @@ def _print_summary(result: "Trajectory", name: str) -> None:
 
     summary = result.summary()
     echo_lines(f"note: {remark}" for remark in result.provenance.get("remarks", []))
-    ball = f"ball {name}: " if name else ""
-    typer.echo(f"{ball}{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
+    valid = f"{summary['valid']} of {summary['frames']}"
+    typer.echo(f"{ball_words(name)}{valid} frames valid (position and orientation measured)")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")
@@ -162,11 +161,11 @@ def live(given: _LiveOptions) -> None:
     The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a
     ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
     """
+    from sphereorient.live.live import TrackBlocks
     from sphereorient.live.loop import open_live, run_live
     from sphereorient.live.outputs import open_output
     from sphereorient.live.page import LivePage, open_page
     from sphereorient.live.sources import source_of
-    from sphereorient.live.track import TrackBlocks
 
     chosen = given.chosen("precise")
     source, page = source_of(given.source, _tell), None

@@ -10,10 +10,11 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.cameras.checks import check_known
+from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, MovieError, refusal
+from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.yaml_file import read_document, short, validated
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
-from sphereorient.movies.response import Response
 from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"
@@ -27,7 +28,7 @@ FrameNumber = Annotated[int, Field(ge=0)]
 class Sphere:
     """One sphere of an experiment."""
 
-    name: str = ""  # empty: the only one, written as `sphere:`
+    name: str = UNNAMED
     diameter_mm: float | None = None  # None: unknown, lengths are in radii
     texture_path: Path | None = None  # None: to be estimated
     fixed: bool = False  # whether the centre is fixed
@@ -63,14 +64,19 @@ class Experiment:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the spheres; ("",) if the file has `sphere:`."""
+        """Names of the spheres; (UNNAMED,) if the file has `sphere:`."""
         return tuple(sphere.name for sphere in self.spheres)
+
+    @property
+    def alone(self) -> bool:
+        """Whether it has one sphere: no other one hides it, or is taken for it."""
+        return len(self.spheres) == 1
 
     def of(self, name: str) -> "Experiment":
         """Return the experiment of one sphere alone; ExperimentError if it has none of this name."""
-        if name == "":
+        if name == UNNAMED:
             return replace(self, spheres=(self.sphere,))
-        if self.names == ("",):
+        if self.names == (UNNAMED,):
             do = "name the experiment of the track"
             raise refused(f"{self.path}, spheres", f"a ball {name}", "one without name", do)
         check_known([name], self.names, f"{self.path}, spheres", ExperimentError)
@@ -83,7 +89,7 @@ class Experiment:
     @property
     def sphere(self) -> Sphere:
         """The only sphere; ExperimentError if there are several."""
-        if len(self.spheres) > 1:
+        if not self.alone:
             do = "name a file with one of them under `sphere`, or take experiment.of(NAME) in Python"
             raise refused(f"{self.path}, spheres", "one ball", ", ".join(self.names), do)
         return self.spheres[0]
@@ -189,7 +195,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
         texture = None if one.texture is None else path.parent / one.texture
         return Sphere(name=name, diameter_mm=one.diameter, texture_path=texture, fixed=one.fixed)
 
-    spheres = keys.spheres if keys.sphere is None else {"": keys.sphere}
+    spheres = keys.spheres if keys.sphere is None else {UNNAMED: keys.sphere}
     return Experiment(
         name=path.stem if keys.name is None else keys.name,
         path=path,

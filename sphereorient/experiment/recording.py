@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
 from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths, refused
 from sphereorient.experiment.timeline import NONE, Rows, Timeline, timeline
 from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import Grey, Movie, flipped_picture
-from sphereorient.movies.response import Response
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
 Shown = TypeVar("Shown", bound=Grey | OnDemand)
@@ -234,8 +234,7 @@ def open_recording(
     experiment = load_experiment(source)
     paths = {sphere.name: _texture_path(experiment, sphere) for sphere in experiment.spheres} if textured else {}
     loaded = {path: load_map(path) for path in dict.fromkeys(paths.values())}
-    names = _chosen(experiment, cameras)
-    movies = open_movies(experiment, names)
+    movies = open_movies(experiment, _chosen(experiment, cameras))
     frames = timeline(experiment, movies)
     streams = []
     for name, movie in movies.items():

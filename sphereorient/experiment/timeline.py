@@ -155,7 +155,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     chosen = {names[0]: np.arange(len(clocks[names[0]]))}
     taken = clocks[names[0]][None]
     for name in names[1:]:
-        before, own = _paired(np.nanmean(taken, axis=0), clocks[name], PAIR_STEPS * usual_s).T
+        before, own = paired(np.nanmean(taken, axis=0), clocks[name], PAIR_STEPS * usual_s).T
         chosen = {one: np.where(before >= 0, row[before], NONE) for one, row in chosen.items()} | {name: own}
         taken = np.stack([np.where(row >= 0, clocks[one][row], np.nan) for one, row in chosen.items()])
         order = np.argsort(np.nanmean(taken, axis=0), kind="stable")
@@ -177,7 +177,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     return Timeline(number=number, time_s=np.nanmean(taken, axis=0), rows=rows, remarks=tuple(remarks))
 
 
-def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
+def paired(one: Floats, other: Floats, within_s: float) -> Rows:
     """Pair increasing times nearer than `within_s`; return (N, 2) indices in order of time, NONE without a partner."""
     high = np.searchsorted(other, one).clip(max=len(other) - 1)
     low = (high - 1).clip(0)

@@ -12,9 +12,8 @@ from sphereorient.files.whole_file import ROOM, put_aside
 
 # What h5py raises on damaged files, depending on the place of the damage.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
-
-
 SPHERES = "spheres"  # group of those of several balls
+UNNAMED = ""  # name of an only ball: `sphere:` of an experiment, the arrays of a file itself
 
 
 @contextmanager
@@ -44,13 +43,13 @@ def digest(file: h5py.File) -> str:
 
 
 def ball_group(file: h5py.File, name: str) -> h5py.Group:
-    """Return a new group for a ball; the file itself for an only one, whose name is empty."""
+    """Return a new group for a ball; the file itself for an unnamed one."""
     return file.create_group(f"{SPHERES}/{name}") if name else file
 
 
 def ball_groups(file: h5py.File) -> dict[str, h5py.Group]:
     """Return the groups that `ball_group` made, by name."""
-    return dict(file[SPHERES].items()) if SPHERES in file else {"": file}
+    return dict(file[SPHERES].items()) if SPHERES in file else {UNNAMED: file}
 
 
 class GuardedFile(io.FileIO):

@@ -36,8 +36,7 @@ class PageHandler(BaseHTTPRequestHandler):
         try:
             answer = make()
         except SphereOrientError as error:
-            content = json.dumps({"error": str(error)}).encode()
-            self._send(content, "application/json", HTTPStatus.BAD_REQUEST)
+            self._send(json.dumps({"error": str(error)}).encode(), "application/json", HTTPStatus.BAD_REQUEST)
             return
         if answer is None:
             self.send_error(HTTPStatus.NOT_FOUND)

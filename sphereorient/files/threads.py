@@ -20,6 +20,14 @@ def silent(stage: str, done: int, total: int) -> None:
     """Report no progress."""
 
 
+def counted(stage: str, items: Iterable[Item], total: int, progress: Progress) -> Iterator[Item]:
+    """Yield items, and report how many of all are done, before each and at the end."""
+    for done, item in enumerate(items):
+        progress(stage, done, total)
+        yield item
+    progress(stage, total, total)
+
+
 def cores() -> int:
     """Return how many threads compute: one a core, or those that `limit_cores` set."""
     return _limit[-1] if _limit else os.cpu_count() or 1

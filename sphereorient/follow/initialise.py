@@ -184,7 +184,7 @@ class Initialiser:
         if len(outlines) < 2:
             return 1
         proposer = self.proposers[view.name]
-        disks = [crop_disk(picture, one.u_px, one.v_px, one.radius_px, proposer.size_px) for one in outlines]
+        disks = [crop_disk(picture, *one.circle, proposer.size_px) for one in outlines]
         best = proposer.propose(torch.from_numpy(np.stack(disks))).best_score
         return int((best > RIVAL_SCORE * best.max()).sum())
 
@@ -215,7 +215,7 @@ class Initialiser:
         crops: dict[int, list[Tensor]] = {}
         for k, picture, disk in disks:
             one = self.proposers[self.fitter.views[k].name]
-            crop = crop_disk(picture, disk.u_px, disk.v_px, disk.radius_px, one.size_px)
+            crop = crop_disk(picture, *disk.circle, one.size_px)
             crops.setdefault(id(one), []).append(torch.from_numpy(crop))
         proposers = {id(one): one for one in self.proposers.values()}
         found = {each: iter(proposers[each].propose(torch.stack(some)).each()) for each, some in crops.items()}

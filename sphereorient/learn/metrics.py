@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import CheckpointError, ShapeError, refusal
-from sphereorient.files.threads import Progress
+from sphereorient.files.threads import Progress, counted
 from sphereorient.learn.checkpoint import Checkpoint, check_texture, correlator_of
 from sphereorient.learn.network import CANDIDATES, Correlator, find_modes, first_right, smoothed_target
 from sphereorient.learn.pictures import (
@@ -224,8 +224,7 @@ def benchmark_checkpoint(
     each = -(-pictures // count)
     ranks: dict[tuple[str, int], list[Tensor]] = {}
     mixed, taken_s = [], 0.0
-    for k in range(count):
-        progress("evaluate", k, count)
+    for k in counted("evaluate", range(count), count, progress):
         texture, bank = maps.textures[k], network.bank(maps.blurs[k])
         for number, name in enumerate(settings.degradations):
             for level in LEVELS:
@@ -245,7 +244,6 @@ def benchmark_checkpoint(
             find_modes(part, network.grid, CANDIDATES)
         taken_s += time.perf_counter() - began
         mixed.append(Predictions(logits=torch.cat(parts), R_view_body=R))
-    progress("evaluate", count, count)
     predictions = joined(mixed)
     spread_rad = math.radians(checkpoint.settings.training.spread_deg)
     return ProposerBenchmark(

@@ -1,5 +1,6 @@
 """No map at the start: relative orientations, a map learnt meanwhile in a second process, then orientations by it."""
 
+import math
 import multiprocessing
 import signal
 import threading
@@ -17,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
@@ -72,7 +72,8 @@ class MapLearner:
 
     def hand(self, shots: Sequence[Frame], R_lab_body: Tensor) -> None:
         """Hand over a frame, with its orientation, where all cameras see a ball that has turned."""
-        still = self._last is not None and float(so3.geodesic_distance(self._last, R_lab_body)) < HANDED_RAD
+        trace = 0.0 if self._last is None else float((self._last * R_lab_body).sum())  # of the turn since that one
+        still = trace > 1 + 2 * math.cos(HANDED_RAD)
         if self._place is None or still or self._count >= HANDED or not all(shot.usable for shot in shots):
             return
         self._last, self._count = R_lab_body, self._count + 1
@@ -226,8 +227,7 @@ def _follower(found: LiveMap, settings: Settings) -> OnlineTracker:
         candidates=settings.refine.candidates,
     )
     refine = settings.refine.model_copy(update={"chunks": 1})
-    tracker = BallTracker(found.appearance, begin, refine, centre=found.centre)
-    return OnlineTracker(tracker, found.appearance)
+    return OnlineTracker(BallTracker(found.appearance, begin, refine, centre=found.centre), found.appearance)
 
 
 def _unknown(place: Crops) -> Appearance:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from sphereorient.live.live import Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
-from sphereorient.trajectory.walk import arcs, fictrac_rows, rotation_vectors, turned
+from sphereorient.trajectory.rotations import rotation_vectors
+from sphereorient.trajectory.walk import arcs, fictrac_rows, turned
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.page_server import HOST
 from sphereorient.live.feed import Tell
-from sphereorient.live.track import TrackBlocks
+from sphereorient.live.live import TrackBlocks
 from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost

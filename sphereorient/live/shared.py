@@ -131,6 +131,5 @@ def _read(memory: mmap.mmap, path: Path, file_number: int, layout: FrameBytes) -
         (time_s,) = struct.unpack_from("<d", memory, WORD * (HEAD + slot))
         if word(WRITTEN) - number >= slots:  # written over meanwhile
             continue
-        pictures = layout.pictures(content)
-        yield Arrival(number=number, time_s=time_s, pictures=pictures, arrived_s=arrived_s)
+        yield Arrival(number=number, time_s=time_s, pictures=layout.pictures(content), arrived_s=arrived_s)
         number += 1

@@ -78,7 +78,7 @@ def find_disks(
         if merit[best] < LEAST_RIM:
             break
         fit = _fitted(edges, circles[best], settings.edge_tolerance_px)
-        circle = circles[best] if fit is None else np.array([fit.u_px, fit.v_px, fit.radius_px])
+        circle = circles[best] if fit is None else np.array(fit.circle)
         filled = [_full_share(part, background.shown, circle) for part in (full, rest)]
         if fit is not None and filled[0] > LEAST_FULL and filled[1] > LEAST_NEW:
             found.append(fit)

@@ -107,6 +107,11 @@ class Outline:
     stretch: float = math.nan  # by how much it is wider than high, relative
     painted: bool = True  # more than one grey inside
 
+    @property
+    def circle(self) -> tuple[float, float, float]:
+        """Column and row of the middle, and radius, px."""
+        return self.u_px, self.v_px, self.radius_px
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Edges:

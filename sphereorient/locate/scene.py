@@ -1,5 +1,6 @@
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -8,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera, nearest_point
+from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.locate.background import LOUD, Background, even_scene, filled, measure_background, without_ball
@@ -15,7 +17,6 @@ from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
-from sphereorient.movies.response import Response
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
@@ -24,6 +25,8 @@ CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in s
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
+
+DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,17 +105,19 @@ def learn_background(
     measured. `shown` is False where the sphere is hidden.
     """
     sizes = tuple(diameter_px) if isinstance(diameter_px, Sequence) else (diameter_px,)
+    several = len(sizes) > 1
+    find = partial(find_disks if several else _only_disk, diameters_px=sizes, settings=settings)
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
-        return _quieter(background, pictures, sizes, settings)
+        return _quieter(background, pictures, sizes, find)
     first, before = background, 0
-    if len(sizes) > 1:  # where spheres dwell, they are the mean, and the noise that hides them
+    if several:  # where spheres dwell, they are the mean, and the noise that hides them
         even = even_scene(first, max(sizes))
-        covered, _ = _covered(pictures, even, sizes, settings)
+        covered, _ = _covered(pictures, even, find)
         first = filled(first, even, covered, max(sizes))
         background = without_ball(first, pictures, covered)
     for _ in range(ROUNDS):
-        covered, found = _covered(pictures, background, sizes, settings)
+        covered, found = _covered(pictures, background, find)
         background = without_ball(first, pictures, covered)
         if found <= before or found == len(pictures) * len(sizes):
             break
@@ -120,40 +125,33 @@ def learn_background(
     return background
 
 
-def _quieter(
-    background: Background, pictures: NDArray[Any], sizes: Sequence[float], settings: LocateSettings
-) -> Background:
+def _quieter(background: Background, pictures: NDArray[Any], sizes: Sequence[float], find: DiskFinder) -> Background:
     """Limit the noise to the frame-to-frame change if spheres that never leave their pixels are not found otherwise."""
     loud = background.noise > LOUD * background.typical_noise
     if loud.sum() < LOUD_SHARE * np.pi / 4 * min(sizes) ** 2:
         return background
-    found = sum(len(_disks(picture, background, sizes, settings)) for picture in pictures)
+    found = sum(len(find(picture, background)) for picture in pictures)
     if 2 * found >= len(pictures) * len(sizes):
         return background
-    values = pictures[:, loud].astype(np.float32)
-    changed = np.median(np.abs(np.diff(values, axis=0)), axis=0) / CHANGE_SIGMAS
+    changed = np.median(np.abs(np.diff(pictures[:, loud].astype(np.float32), axis=0)), axis=0) / CHANGE_SIGMAS
     noise = background.noise.copy()
     noise[loud] = np.clip(changed, background.typical_noise, noise[loud])
     return replace(background, noise=noise)
 
 
-def _disks(
-    picture: NDArray[Any], background: Background, sizes: Sequence[float], settings: LocateSettings
+def _only_disk(
+    picture: NDArray[Any], background: Background, diameters_px: Sequence[float], settings: LocateSettings
 ) -> list[Outline]:
-    """Return the disk of a single sphere, if it is found, or all that may be spheres."""
-    if len(sizes) > 1:
-        return find_disks(picture, background, sizes, settings)
-    outline, _ = find_ball(picture, background, sizes[0], settings)
+    """Return the disk of a single sphere, if it is found."""
+    outline, _ = find_ball(picture, background, diameters_px[0], settings)
     return [] if outline is None else [outline]
 
 
-def _covered(
-    pictures: NDArray[Any], background: Background, sizes: Sequence[float], settings: LocateSettings
-) -> tuple[NDArray[np.bool_], int]:
+def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -> tuple[NDArray[np.bool_], int]:
     """Return the pixels of all disks found in frames (n, H, W), and their number."""
     covered, found = np.zeros(pictures.shape, bool), 0
     for picture, mask in zip(pictures, covered, strict=True):
-        for disk in _disks(picture, background, sizes, settings):
+        for disk in find(picture, background):
             cover(mask, disk, RIM, True)
             found += 1
     return covered, found
@@ -185,7 +183,9 @@ def fixed_ball(
         raise _none_fixed("nothing that changes")
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     inside = (labels == largest).astype(np.uint8)
-    guess = locating.diameter_px or _diameter(inside, shown is not None)
+    filled = np.sqrt(inside.sum() / np.pi)  # radius of a disk of as many pixels, some of which may be hidden
+    around = filled if shown is None else cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1]
+    guess = locating.diameter_px or 2 * float(around)
     change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # limb without texture
     blob = Blob(u_px=float(centres[largest][0]), v_px=float(centres[largest][1]), merit=1.0)
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
@@ -193,11 +193,6 @@ def fixed_ball(
         raise _none_fixed("no circle about what changes")
     scene = _around(middle, scatter, outline, full_scale)
     return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
-
-
-def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
-    around = cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1] if hidden else np.sqrt(inside.sum() / np.pi)
-    return 2 * float(around)
 
 
 def _around(

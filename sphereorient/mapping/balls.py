@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Instant:
+class Instant:
     """What all cameras see in one frame."""
 
     crops: Sequence[Sequence[Crop]]  # of the disks of C cameras
@@ -56,9 +56,8 @@ def crops_of_balls(
     shows as many spheres as are named, each by itself).
     """
     names, streams = recording.experiment.names, recording.streams
-    first, *others = names
-    if not others:
-        return {first: take_crops(recording, settings, locating, progress)}
+    if recording.experiment.alone:
+        return {names[0]: take_crops(recording, settings, locating, progress)}
     scenes = [find_scenes(recording, stream, settings.background_frames, locating) for stream in streams]
     sizes_px = [[scene[name].diameter_px for name in names] for scene in scenes]
     radius_mm = {name: recording.of(name).experiment.radius_mm for name in names}
@@ -71,33 +70,34 @@ def crops_of_balls(
         for shot, size_px in zip(shots, sizes_px, strict=True):
             usable = shot.usable and shot.background is not None
             disks.append(find_disks(shot.picture, shot.background, size_px, locating) if usable else [])
-            crops.append([cut_crop(shot.picture, one.u_px, one.v_px, one.radius_px) for one in disks[-1]])
-        instants.append(_instant(disks, crops, recording.cameras, 2 * min(radius_mm.values())))
+            crops.append([cut_crop(shot.picture, *one.circle) for one in disks[-1]])
+        instants.append(matched_instant(disks, crops, recording.cameras, 2 * min(radius_mm.values())))
         progress("balls", k + 1, 0)
-    chosen = _linked(instants, scenes, radius_mm)
-    places = [_places(chosen[:, n], instants) for n in range(len(names))]
+    chosen = linked_matches(instants, scenes, radius_mm)
+    places = [linked_places(chosen[:, n], instants) for n in range(len(names))]
     found = {}
     for n, name in enumerate(names):
         views = [CameraView.of(one.name, one.camera, scene[name]) for one, scene in each]
         own_first = [places[n], *(place for m, place in enumerate(places) if m != n)]
-        found[name] = _crops_of(name, chosen[:, n], instants, views, radius_mm, own_first)
+        found[name] = crops_of_ball(name, chosen[:, n], instants, views, radius_mm, own_first)
     return found
 
 
-def _instant(
+def matched_instant(
     disks: Sequence[Sequence[Outline]],
     crops: Sequence[Sequence[Crop]],
     cameras: Mapping[str, Camera],
     diameter_mm: float,
-) -> _Instant:
+) -> Instant:
+    """Match the disks (px) that C cameras see in one frame, with their crops; `diameter_mm` is the smallest ball's."""
     least = min(2, len(cameras))  # a distance by the size of one disk is not enough to know who it is
     matches = [one for one in match_disks(disks, list(cameras.values())) if one.number >= least]
     X = places_of(matches, cameras, diameter_mm).position_lab_mm.numpy() if matches else np.zeros((0, 3))
-    return _Instant(crops=crops, matches=matches, position_lab_mm=X)
+    return Instant(crops=crops, matches=matches, position_lab_mm=X)
 
 
-def _linked(
-    instants: Sequence[_Instant], scenes: Sequence[Mapping[str, CameraScene]], radius_mm: Mapping[str, float]
+def linked_matches(
+    instants: Sequence[Instant], scenes: Sequence[Mapping[str, CameraScene]], radius_mm: Mapping[str, float]
 ) -> NDArray[np.int64]:
     """Return the match of each sphere in each frame, (N, K), by index; -1: none."""
     names = list(radius_mm)
@@ -116,7 +116,7 @@ def _linked(
     return chosen
 
 
-def _first(instants: Sequence[_Instant], count: int) -> int:
+def _first(instants: Sequence[Instant], count: int) -> int:
     """Return the frame in which most cameras see as many spheres as are named, with the fewest other matches."""
     ranks = {}
     for k, at in enumerate(instants):
@@ -136,7 +136,7 @@ def _first(instants: Sequence[_Instant], count: int) -> int:
 
 
 def _misfit(
-    at: _Instant, frame: int, past: Sequence[Sequence[tuple[int, Floats]]], sizes: Floats, radius_mm: Floats
+    at: Instant, frame: int, past: Sequence[Sequence[tuple[int, Floats]]], sizes: Floats, radius_mm: Floats
 ) -> Floats:
     """Return chi2 (K, M) of each sphere at each match: where it is expected, and of what size."""
     cost = np.zeros((len(past), len(at.matches)))
@@ -157,7 +157,7 @@ def _misfit(
     return cost
 
 
-def _places(chosen: NDArray[np.int64], instants: Sequence[_Instant]) -> Floats:
+def linked_places(chosen: NDArray[np.int64], instants: Sequence[Instant]) -> Floats:
     """Return where a sphere is in each frame, (N, 3), mm; between frames in which it is seen on a straight line."""
     seen = np.flatnonzero(chosen >= 0)
     X = np.array([instants[k].position_lab_mm[chosen[k]] for k in seen.tolist()]).reshape(-1, 3)
@@ -165,10 +165,10 @@ def _places(chosen: NDArray[np.int64], instants: Sequence[_Instant]) -> Floats:
     return np.stack([np.interp(every, seen, X[:, axis]) if len(seen) else every * np.nan for axis in range(3)], axis=1)
 
 
-def _crops_of(
+def crops_of_ball(
     name: str,
     chosen: NDArray[np.int64],
-    instants: Sequence[_Instant],
+    instants: Sequence[Instant],
     views: Sequence[CameraView],
     radius_mm: Mapping[str, float],
     places: Sequence[Floats],

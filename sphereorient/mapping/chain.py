@@ -51,12 +51,12 @@ def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
     """
     if len(disks) < 2:
         raise too_few(len(disks))
-    R, pairs = _chained_pairs(disks, settings)
+    R, pairs = chained_pairs(disks, settings)
     check_turned(R, settings)
     cleaned = without_static(disks, R)
     if cleaned is not disks:
         disks = cleaned
-        R, pairs = _chained_pairs(disks, settings)
+        R, pairs = chained_pairs(disks, settings)
     _check_one_ball(disks, R)
     return close_loops(disks, R, pairs, settings)
 
@@ -70,7 +70,7 @@ def check_turned(R_lab_body: Tensor, settings: MapSettings) -> None:
         raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
 
 
-def _chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, RelativeRotations]:
+def chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, RelativeRotations]:
     """Compare neighbours, then, from the resulting orientations, frames further apart."""
     count = len(disks)
     grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), math.radians(settings.turn_max_deg))

@@ -110,7 +110,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
                 one = find_ball(shot.picture, scene.background, scene.diameter_px, locating)
             found.append(one)
             ball = one[0]
-            row.append(None if ball is None else cut_crop(shot.picture, ball.u_px, ball.v_px, ball.radius_px))
+            row.append(None if ball is None else cut_crop(shot.picture, *ball.circle))
             progress(f"{stream.name}: ball", k + 1, 0)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         rows.append(row)
@@ -141,7 +141,7 @@ def _fixed_scene(
     outline, background = fixed_ball(pictures, locating, empty, stream.shown)
     scene = CameraScene(background=background, diameter_px=2 * outline.radius_px, response=stream.response)
     each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
-    seen = torch.tensor([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], dtype=torch.float64)
+    seen = torch.tensor([one.circle for one in each if one is not None], dtype=torch.float64)
     if len(seen) >= OUTLINES_MIN:
         middle = seen.median(0).values
         u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()

@@ -89,8 +89,7 @@ def linear_system(at: Linearisation, height: int) -> LinearSystem:
     root = at.precision.sqrt()
     # Orthonormal rows: the frame's own light is projected out along them.
     rows = (at.design[:, POSE:] * root[:, None]).double()
-    size = rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
-    rows = rows / size
+    rows = rows / rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
     gram = rows @ rows.mT + RIDGE * torch.eye(rows.shape[1], dtype=rows.dtype)
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
     # Near the limb the map is not learnt; it must not move the pose there.

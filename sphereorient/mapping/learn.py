@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
-from sphereorient.files.threads import Progress
+from sphereorient.files.threads import Progress, counted
 from sphereorient.files.whole_file import writing
 from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
@@ -164,10 +164,8 @@ def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -
         return start
     # The outline of the changes is 1 to 2 px off, as are the rotations: correct the position, restart the chain.
     state = start.state
-    for k in range(POSITION_ITERATIONS):
-        progress("place", k, POSITION_ITERATIONS)
+    for k in counted("place", range(POSITION_ITERATIONS), POSITION_ITERATIONS, progress):
         state, _ = iterations.iterate(state, settings, k)
-    progress("place", POSITION_ITERATIONS, POSITION_ITERATIONS)
     known = torch.isfinite(crops.position_lab_mm).all(1)[:, None]
     X = torch.where(known, state.position_lab_mm[0], torch.nan)
     return _from_chain(replace(crops, position_lab_mm=X), settings, progress)
@@ -221,10 +219,8 @@ def _coarse(
     coarse = settings.model_copy(update={"blur_px": whole_px, "height": rows})
     first = iterations.first_map(disks, R_lab_body, rows)
     state = iterations.first_state(crops, frames, R_lab_body, first, settings, extra_px)
-    for k in range(COARSE_ITERATIONS):
-        progress("coarse map", k, COARSE_ITERATIONS)
+    for k in counted("coarse map", range(COARSE_ITERATIONS), COARSE_ITERATIONS, progress):
         state, _ = iterations.iterate(state, coarse, k)
-    progress("coarse map", COARSE_ITERATIONS, COARSE_ITERATIONS)
     return state.R_lab_body, state.position_lab_mm
 
 
@@ -307,7 +303,7 @@ def final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
     texture = look_up(iterations.sharp_map(state), direction).clamp(0, 1)
     weight = look_up(iterations.map_weight(state), direction)
-    seen = _counts(state, direction)
+    seen = times_seen(state, direction)
     unknown = (seen == 0) | (weight <= 0)
     sigma = torch.where(unknown, torch.inf, weight.clamp_min(1e-30).rsqrt())
     return torch.where(unknown, torch.nan, texture).float(), torch.where(unknown, 0, seen), sigma.float()
@@ -350,7 +346,7 @@ def jumps(R_lab_body: Tensor) -> Tensor:
     return torch.nonzero(off > (JUMPS * usual).clamp_min(JUMP_RAD))[:, 0]
 
 
-def _counts(state: State, direction_body: Tensor) -> Tensor:
+def times_seen(state: State, direction_body: Tensor) -> Tensor:
     """Count the pictures that show each direction (..., 3) of the body at a small enough slant."""
     seen = torch.zeros(direction_body.shape[:-1], dtype=torch.int64)
     radius_mm = state.fitter.radius_mm

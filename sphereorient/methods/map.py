@@ -10,6 +10,7 @@ from torch import Tensor
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.provenance import provenance
 from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
@@ -76,7 +77,7 @@ def learn_map(
     old = load_texture(Path(init)) if isinstance(init, str | Path) else init
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         names = recording.experiment.names
-        if old is not None and len(names) > 1:
+        if old is not None and not recording.experiment.alone:
             do = "leave --init out"
             raise ExperimentError(refusal("init", expected="an experiment of one ball", got=f"{len(names)}", do=do))
         maps = {
@@ -87,7 +88,7 @@ def learn_map(
             name: _result(recording.of(name), one, old, settings, command)
             for name, one in shared_maps(maps, progress).items()
         }
-    return results.get("", results)
+    return results.get(UNNAMED, results)
 
 
 def _own(kept: Path | None, name: str) -> Path | None:

@@ -1,4 +1,4 @@
-"""The interface between `run` and a method: the job, the stages, and what the method learnt, with its file.
+"""The interface between `run` and a method: the job, the stages, what the method learnt and measured, with their files.
 
 From what another run learnt, a run measures the same to the last bit.
 """
@@ -14,9 +14,10 @@ import h5py
 import numpy as np
 import torch
 
-from sphereorient.errors import TrackError, error_words, refusal
+from sphereorient.cameras.response import Response
+from sphereorient.errors import Reason, TrackError, error_words, refusal
 from sphereorient.experiment.recording import Recording
-from sphereorient.files.hdf5 import SPHERES, ball_group, ball_groups, digest, whole_hdf5
+from sphereorient.files.hdf5 import DAMAGE, SPHERES, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.files.threads import Progress
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
@@ -24,16 +25,16 @@ from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
-from sphereorient.movies.response import Response
 from sphereorient.pose import CameraView, Fitter, Optics
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
-from sphereorient.pose.poses import Poses
+from sphereorient.pose.poses import POSE_PARTS, Poses
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
+SCHEMA_OF_POSES = "sphereorient-poses/1"
 SCORES, WHETHER = ("score_min", "right_score", "usual_apart_rad"), ("together", "second_ball", "sharper")
 OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn")  # fields that `Learnt` shares with it
 BLURS = ("blur_px", "limb_blur_px", "still_blur_px", "still_limb_blur_px")
@@ -46,6 +47,7 @@ KINDS: dict[str, Callable[[Any], Any]] = {
 }
 TENSORS = ("limb_px", "worn")
 LASTING = ("covariance", "own_rad2", "alone")
+NO_ROTATION = 1e-6  # of an entry of R R^T: the least deviation from the unit matrix
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -284,3 +286,47 @@ def _process(group: h5py.Group) -> ProcessNoise:
         return ProcessPrior(prior=Prior(pole=pole, deviation=deviation), scale=scale)
 
     return ProcessNoise(place=motion("place"), turn=motion("turn"), frame_s=float(group.attrs["frame_s"]))
+
+
+def write_poses(poses: Measured, path: Path) -> None:
+    """Write the poses of each ball in one batch as HDF5, atomically; OutputError if the file cannot be written."""
+    with whole_hdf5(path, "check the space left, then run again with --resume") as file:
+        file.attrs["schema"] = SCHEMA_OF_POSES
+        for ball, of_ball in poses.items():
+            _write_poses(of_ball, ball_group(file, ball))
+        file.attrs["sha256"] = digest(file)
+
+
+def _write_poses(poses: list[Poses], group: h5py.Group) -> None:
+    group["count"] = np.array([len(one) for one in poses])
+    group["use"] = np.stack([one.use.numpy() for one in poses])
+    group["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
+    for name in POSE_PARTS:
+        group[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
+
+
+def read_poses(path: Path) -> Measured | None:
+    """Return what `write_poses` wrote; None if the file is not whole."""
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("schema") != SCHEMA_OF_POSES or file.attrs.get("sha256") != digest(file):
+                return None
+            return {name: _read_poses(group) for name, group in ball_groups(file).items()}
+    except MemoryError:
+        raise
+    except DAMAGE:
+        return None
+
+
+def _read_poses(group: h5py.Group) -> list[Poses]:
+    R = torch.from_numpy(group["R_lab_body"][()])
+    if not bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all()):
+        raise ValueError("no rotations")
+    count, use = group["count"][()].tolist(), torch.from_numpy(group["use"][()])
+    reason = [[Reason(why.decode()) for why in row] for row in group["reason"][()].tolist()]
+    parts = {name: torch.split(torch.from_numpy(group[name][()]), count) for name in POSE_PARTS}
+    return [
+        # Copy: a row would keep the whole array in memory.
+        Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))
+        for k in range(len(count))
+    ]

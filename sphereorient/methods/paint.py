@@ -111,10 +111,10 @@ def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Pa
     """Yield the frames from which the appearance of each paint is estimated.
     Raises ExperimentError: no frame shows a ball that the others mostly leave to all cameras that see it.
     """
-    first = {name: paint.first for paint in paints for name in paint.names}
-    if len(first) == 1:
+    if recording.experiment.alone:
         yield _alone(recording, refine, paints[0])
         return
+    first = {name: paint.first for paint in paints for name in paint.names}
     views = paints[0].first.fitter.views
     frames, places = sample_frames(recording, views, MORE_FRAMES * refine.appearance_frames)
     start = SceneStart(first)

@@ -149,7 +149,7 @@ def _named(tables: Sequence[PoseTable], job: Job, follower: Follower) -> tuple[S
 def _check(job: Job) -> None:
     spheres = job.recording.experiment.spheres
     fixed = [sphere.name for sphere in spheres if sphere.fixed]
-    if fixed and len(spheres) > 1:
+    if fixed and not job.recording.experiment.alone:
         do = "leave `fixed` out, or name it alone under `sphere`"
         raise ExperimentError(refusal(f"spheres.{fixed[0]}", expected="a ball that moves", got="fixed: true", do=do))
 

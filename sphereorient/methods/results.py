@@ -12,6 +12,7 @@ from torch import Tensor
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration.contradictions import with_contradictions
 from sphereorient.calibration.systematic import with_lasting_errors, with_systematic_errors
+from sphereorient.cameras.response import LINEAR
 from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Recording
@@ -20,7 +21,6 @@ from sphereorient.follow.appearance import LOOK_ALIKE
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, in_middle
-from sphereorient.movies.response import LINEAR
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.poses import PoseTable, turned_alone
@@ -181,6 +181,9 @@ def precise_track(
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
+    segment = chosen.segment.numpy()
+    number, count = np.unique(segment[segment >= 0], return_counts=True)
+    alone = np.isin(segment, number[count == 1])  # in its segment: no other frame confirms its pose
     return replace(
         track,
         position=track.position - move_mm.numpy(),
@@ -188,17 +191,11 @@ def precise_track(
         orientation=smoothed.R_given_path.numpy(),
         orientation_cov=smoothed.cov_given_path_rad2.numpy(),
         **datasets_of(smoothed, experiment.length_unit),
-        segment=chosen.segment.numpy(),
+        segment=segment,
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
-        confidence=np.where(_alone(chosen.segment.numpy()), np.nan, chosen.probability.numpy()),
+        confidence=np.where(alone, np.nan, chosen.probability.numpy()),
     )
-
-
-def _alone(segment: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which frames (N,) are the only ones of their segment: no other one confirms their pose."""
-    number, count = np.unique(segment[segment >= 0], return_counts=True)
-    return np.isin(segment, number[count == 1])
 
 
 def with_errors(

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, centre_lab_mm, holds_disk, sphere_radius_px
+from sphereorient.cameras.response import Response
 from sphereorient.files.picture import OnDemand
 from sphereorient.locate import Background, CameraScene
-from sphereorient.movies.response import Response
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 

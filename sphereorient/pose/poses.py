@@ -198,7 +198,8 @@ def pose_tables(
 
 def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
     """Put the poses of one ball in N frames into arrays."""
-    return pose_tables([{"": frames}], [""], cameras)[""]
+    (table,) = pose_tables([{"only": frames}], ["only"], cameras).values()
+    return table
 
 
 def _padded(

@@ -20,10 +20,9 @@ from sphereorient.methods.settings import Settings
 from sphereorient.preflight.finding import FAULT, OK, WARNING, Finding, Severity, judged, warning
 from sphereorient.preflight.in_step import OffsetScan, in_step
 from sphereorient.preflight.sample import MovieSample
-from sphereorient.run import MemoryStore, Request, run
-from sphereorient.run.stages import opened
+from sphereorient.run import MemoryStore, Request
+from sphereorient.run.stages import opened, run_tracks
 from sphereorient.sphere.renderer import rim_directions
-from sphereorient.trajectory import one_track
 
 GOOD_PX = 0.7  # median px between lines of sight: 0.2 to 0.5 for exact cameras; a fault from that of `OUTLINES`
 CLEARER = 0.2  # swapped or mirrored movies are reported if they leave this share of the gap
@@ -68,7 +67,7 @@ def track_stretch(
             settings=settings,
             learnt=dict.fromkeys(experiment.names, replace(learnt, together=False, majority=())),
         )
-        track = one_track(run(request, MemoryStore()))
+        (track,) = run_tracks(request, MemoryStore()).values()
     except SphereOrientError as error:
         measured, _, do = str(error).rpartition("; ")
         finding = judged(TITLE, f"a run stops: {measured}", (True, FAULT, do.rstrip(".")))

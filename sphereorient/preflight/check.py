@@ -63,7 +63,7 @@ def preflight(
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
-        if len(experiment.spheres) > 1:
+        if not experiment.alone:
             scene, found = look_at_scene(recording, settings, progress)
             checked = Preflight(experiment=experiment, timeline=recording.timeline, scene=scene)
             return replace(checked, findings=tuple(_findings(checked, found)))

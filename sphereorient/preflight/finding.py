@@ -26,8 +26,7 @@ class Finding:
 
 def judged(title: str, measured: str, *complaints: tuple[bool, Severity, str]) -> Finding:
     """Return a finding with the first complaint that holds; each is whether it holds, how bad it is, and the advice."""
-    held = (complaint[1:] for complaint in complaints if complaint[0])
-    severity, advice = next(held, (OK, ""))
+    severity, advice = next((complaint[1:] for complaint in complaints if complaint[0]), (OK, ""))
     return Finding(title=title, severity=severity, measured=measured, advice=advice)
 
 

@@ -13,7 +13,7 @@ from sphereorient.cameras import PinholeCamera
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
 from sphereorient.experiment.recording import CameraStream
-from sphereorient.files.threads import Progress, side_by_side, silent
+from sphereorient.files.threads import Progress, counted, side_by_side, silent
 from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import DraftKey
 from sphereorient.locate import LocateSettings
@@ -52,12 +52,8 @@ def look_at(
     `shown` (H, W) is False where something hides the ball of the only movie.
     """
     movies = [open_movie(path) for path in paths]
-    looks = []
-    progress("look", 0, len(movies))
-    for look in side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies))):
-        looks.append(look)
-        progress("look", len(looks), len(movies))
-    return looks
+    looks = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
+    return list(counted("look", looks, len(movies), progress))
 
 
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
@@ -171,5 +167,4 @@ def camera_keys(
         entry |= {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
     told = "known" if known else "assumed: it hardly matters for a ball in its place"
     where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
-    comment = f"field of view {told}; {where}"
-    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=comment)]
+    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=f"field of view {told}; {where}")]

@@ -101,7 +101,7 @@ class MaskMarking(Marking):
             look = self.looks[name]
         if look.outline is None:
             return {"found": False}
-        u, v, radius = look.outline.u_px, look.outline.v_px, look.outline.radius_px
+        u, v, radius = look.outline.circle
         return {"found": True, "u": u, "v": v, "radius": radius, "stays": look.stays, "frame": look.frame}
 
     def rendered(self, name: str) -> Json:

@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient.errors import PaintError
 from sphereorient.experiment import Sphere
 from sphereorient.experiment.recording import Recording, load_map
-from sphereorient.files.threads import Progress
+from sphereorient.files.threads import Progress, counted
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.scene_start import EXPLAINED, SceneFound, SceneStart
@@ -61,11 +61,9 @@ def look_at_scene(
     cameras = next(iter(balls.values())).fitter.views
     frames, places = sample_frames(job.recording, cameras, FRAMES)
     start, found, disks = SceneStart(balls), [], []
-    for k, shots in enumerate(frames):
-        progress("balls", k, len(frames))
+    for shots in counted("balls", frames, len(frames), progress):
         disks.append(_disks(shots, balls))
         found.append(start(shots, list(balls), {}))
-    progress("balls", len(frames), len(frames))
     best = max(range(len(frames)), key=lambda k: sum(len(one) > 0 for one in found[k].values()))
     seen = tuple(
         SceneView(
@@ -101,8 +99,7 @@ def _no_map(ball: Sphere) -> Finding:
 def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
     """Tell maps of two files that show one paint, in any body frames: balls that wear it look alike."""
     pairs = list(combinations(maps, 2))
-    for k, (one, other) in enumerate(pairs):
-        progress("maps", k, len(pairs))
+    for one, other in counted("maps", pairs, len(pairs), progress):
         try:
             alike = compare_maps(maps[one], maps[other]).correlation
         except PaintError:
@@ -110,7 +107,6 @@ def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Findi
         measured = f"both show one paint (correlation {alike:.2f})"
         do = "name one of them for all balls that wear it; else `track` may exchange these balls without a word"
         yield warning(f"paint of {one} and {other}", measured, do)
-    progress("maps", len(pairs), len(pairs))
 
 
 def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:

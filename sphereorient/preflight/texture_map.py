@@ -189,7 +189,7 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
         picture, outline = sample.picture[k], sample.found[k][0]
         assert picture is not None
         assert outline is not None
-        crops.append(crop_disk(picture, outline.u_px, outline.v_px, outline.radius_px, search.size_px))
+        crops.append(crop_disk(picture, *outline.circle, search.size_px))
     disks = torch.from_numpy(np.stack(crops))
     score, mirrored = (search.propose(each).best_score for each in (disks, disks.flip(-1)))
     return TextureMatch(name=sample.name, score=score, mirrored=mirrored)

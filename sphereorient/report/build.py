@@ -10,7 +10,7 @@ from typing import Any
 
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.threads import Progress, silent
+from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.files.whole_file import ROOM, has_mark, unfinished
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text
 from sphereorient.report.frame_warnings import bad_stretches
@@ -58,8 +58,7 @@ def write_report(
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     summary = summarise(list(tracks.values()), settings, around, partial(progress, "numbers"), name)
     rough = [None if (e := known[key]) is None else without_perspective(tracks[key], e.cameras) for key in tracks]
-    distances = camera_distances(list(tracks.values()), rough)
-    of = summary, tracks, distances
+    of = summary, tracks, camera_distances(list(tracks.values()), rough)
     words = verdicts(*of)
     with _folder(out) as aside:
         tables = tables_of(*of)
@@ -138,14 +137,12 @@ def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment
 
 def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:
     drawn = []
-    for k, (name, title, caption, draw) in enumerate(plans):
-        progress("figures", k, len(plans))
+    for name, title, caption, draw in counted("figures", plans, len(plans), progress):
         figure = draw()
         write_figure(figure, folder / name)
         png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
         width = round(120 * figure.get_figwidth())  # on the page, the same for all figures: so is their text
         drawn.append({"name": name, "title": title, "caption": caption, "png": png, "width": width})
-    progress("figures", len(plans), len(plans))
     return drawn
 
 

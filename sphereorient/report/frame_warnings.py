@@ -7,12 +7,11 @@ from itertools import chain, combinations, zip_longest
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sphereorient import so3
 from sphereorient.errors import Flag, Reason
 from sphereorient.trajectory import Trajectory, runs_of
+from sphereorient.trajectory.rotations import distance_deg
 
 FLAG_WORDS = {
     Flag.POSITION_INTERPOLATED: "position interpolated over a gap",
@@ -80,12 +79,6 @@ def frame_warnings(track: Trajectory, k: int) -> list[str]:
     """Return all warnings of frame k as text; empty for a good frame."""
     found = [] if track.valid[k] else ["not valid"]
     return [*found, *flag_words(track, k), *(f"{name}: {why}" for name, why in lost_cameras(track, k).items())]
-
-
-def distance_deg(A: Floats, B: Floats) -> Floats:
-    """Return the angle between orientations (N, 3, 3), (N,), degrees; NaN where either is."""
-    distance = so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
-    return np.asarray(np.rad2deg(distance), np.float64)
 
 
 def stated_error(cov: Floats) -> Floats:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from sphereorient.calibration import Calibrated, PictureReport
 from sphereorient.files.picture import decoded_grey
-from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import BRIGHT_QUANTILE, Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
@@ -108,8 +107,7 @@ def _draw_picture(ax: Any, one: PictureReport) -> None:
         ax.set_aspect("equal")
         ax.invert_yaxis()
     found = one.view.uv_px
-    expected = found - one.residual_px
-    ax.plot(*expected.T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
+    ax.plot(*(found - one.residual_px).T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
     ax.plot(*found.T, "o", ms=4, mfc="none", mew=0.8, color=FOUND, label="found")
     if not one.used.all():
         ax.plot(*found[~one.used].T, "x", ms=8, color=OUTLIER, label="left out")
@@ -149,8 +147,8 @@ def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
             near.set_axis_off()
             whole.set_title(f"{look.name}: no ball was found", fontsize=9)
             continue
-        _outlined(whole, look.outline)
-        _outlined(near, look.outline, near=True)
+        _outlined(whole, look.outline.circle)
+        _outlined(near, look.outline.circle, near=True)
         where = "stays in its place" if look.stays else f"moves; found in {look.found} of {look.looked} frames"
         whole.set_title(f"{look.name}, {Path(look.movie.path).name}: the ball {where}", fontsize=9)
         near.set_title(f"outline found, {2 * look.outline.radius_px:.1f} px across", fontsize=9)
@@ -164,10 +162,10 @@ def _show(ax: Any, picture: NDArray[Any]) -> None:
     ax.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 
-def _outlined(ax: Any, outline: Outline, near: bool = False, **style: Any) -> None:
-    """Draw an outline, `near`: with the ball alone in view."""
-    angle, radius = np.linspace(0, 2 * np.pi, 181), outline.radius_px
-    u, v, style = outline.u_px, outline.v_px, {"lw": 1.4, "color": FOUND} | style
+def _outlined(ax: Any, circle: tuple[float, float, float], near: bool = False, **style: Any) -> None:
+    """Draw an outline: its middle and radius, px; `near`: with the ball alone in view."""
+    angle, style = np.linspace(0, 2 * np.pi, 181), {"lw": 1.4, "color": FOUND} | style
+    u, v, radius = circle
     ax.plot(u + radius * np.cos(angle), v + radius * np.sin(angle), **style)
     if near:
         ax.set(xlim=(u - NEAR * radius, u + NEAR * radius), ylim=(v + NEAR * radius, v - NEAR * radius))
@@ -215,7 +213,7 @@ def _scene_part(part: Any, result: Preflight) -> None:
     for ax, view in zip(part.subplots(1, max(1, len(result.scene)), squeeze=False)[0], result.scene, strict=False):
         _show(ax, view.picture)
         for outline in view.disks:
-            _outlined(ax, outline, lw=1.2)
+            _outlined(ax, outline.circle, lw=1.2)
         for name, (u, v) in view.balls.items():
             ax.text(u, v, name, color=EXPECTED, fontsize=10, ha="center", va="center", clip_on=True)
         ax.set_title(f"{view.name}, frame {view.frame}: disks, and the balls found by their paint", fontsize=9)
@@ -225,7 +223,7 @@ def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: Floats | None, ne
     picture, (outline, reason) = sample.picture[k], sample.found[k]
     _show(ax, np.zeros(sample.stream.movie.frame_shape) if picture is None else picture)
     if outline is not None:
-        _outlined(ax, outline, near, label="outline found")
+        _outlined(ax, outline.circle, near, label="outline found")
     if expected is not None:
         closed = np.concatenate([expected, expected[:1]])
         ax.plot(*closed.T, "--", lw=1.4, color=EXPECTED, label="expected from all cameras and the diameter")

@@ -103,8 +103,7 @@ def _caption(status: int, why: Sequence[str]) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return ", ".join(names[:4]) + more
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str, str]]:

@@ -174,8 +174,7 @@ def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
     """Draw a texture map (H, 2 H), longitude to the right, latitude upwards, degrees, NaN as sand; grey from 0 to 1
     unless `style` (of `imshow`) differs.
     """
-    grey = {} if "norm" in style else {"vmin": 0, "vmax": 1}
-    shown = {"cmap": "gray", "extent": EXTENT} | grey | style
+    shown = {"cmap": "gray", "extent": EXTENT} | ({} if "norm" in style else {"vmin": 0, "vmax": 1}) | style
     drawn = axes.imshow(np.ma.masked_invalid(values.numpy()), **shown)
     axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:], xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])
     axes.set(xlabel="longitude (degrees)", aspect="equal", title=title)

@@ -12,18 +12,21 @@ import torch
 from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import open_recording
+from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.provenance import provenance, sha256
 from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import check_folder, check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
-from sphereorient.methods.kinds import METHODS
 from sphereorient.methods.method import Job, Learnt, Method, load_learnt, one_thread, save_learnt
+from sphereorient.methods.paper import PAPER
+from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Tracks, Trajectory
 
+METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}  # of `track`, by name
 TASK_BATCHES = 16  # at most in one task of a worker; a worker that dies loses less than one batch
 TASKS_A_WORKER = 2  # of a short movie: so that no worker waits long for the last one
 
@@ -37,6 +40,12 @@ class Task:
 
 
 def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory | Tracks:
+    """Track one experiment as `run_tracks`; return the track of an unnamed ball, or the tracks of all by name."""
+    tracks = run_tracks(request, store, resume=resume, progress=progress)
+    return tracks.get(UNNAMED, tracks)
+
+
+def run_tracks(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Tracks:
     """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
     `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
     Raises SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store
@@ -51,7 +60,7 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
                 tasks = todo.send([work.do(task) for task in tasks])
             except StopIteration as end:
                 tracks: Tracks = end.value
-                return tracks.get("", tracks)
+                return tracks
 
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:

@@ -9,26 +9,19 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import h5py
-import numpy as np
-import torch
 from filelock import FileLock, Timeout
 
 from sphereorient import __version__
-from sphereorient.errors import OutputError, Reason, TrackError, error_words, refusal
+from sphereorient.errors import OutputError, TrackError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files, load_experiment
-from sphereorient.files.hdf5 import DAMAGE, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.files.whole_file import is_forced, write_text, writing
 from sphereorient.follow.follower import Batch
-from sphereorient.methods.method import Learnt, load_learnt, save_learnt
+from sphereorient.methods.method import Learnt, Measured, load_learnt, read_poses, save_learnt, write_poses
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
-from sphereorient.pose.poses import POSE_PARTS, Poses
 
-SCHEMA = "sphereorient-poses/1"
 LOCK, PROCESS = "lock", "process"  # files in the folder of a run
 TRACES = re.compile(rf"{LOCK}|{PROCESS}|\..*\.part.*")  # left by a run that was killed at its beginning
-NO_ROTATION = 1e-6  # of an entry of R R^T: the least deviation from the unit matrix
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +105,7 @@ class MemoryStore:
     """Keeps a run in this process."""
 
     known: Mapping[str, Learnt] | None = None  # what was learnt of each ball before the first frame
-    _poses: dict[int, Mapping[str, list[Poses]]] = field(default_factory=dict)
+    _poses: dict[int, Measured] = field(default_factory=dict)
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
@@ -123,11 +116,11 @@ class MemoryStore:
         """Keep what was learnt of each ball."""
         self.known = learnt
 
-    def write(self, batch: Batch, poses: Mapping[str, list[Poses]]) -> None:
+    def write(self, batch: Batch, poses: Measured) -> None:
         """Keep the poses of each ball in one batch."""
         self._poses[batch.first] = poses
 
-    def read(self, batch: Batch) -> Mapping[str, list[Poses]]:
+    def read(self, batch: Batch) -> Measured:
         """Return the poses of each ball in one batch."""
         return self._poses.pop(batch.first)
 
@@ -233,16 +226,12 @@ class FolderStore:
         with writing(force=True):  # over a damaged one, too: the folder is of this run
             save_learnt(learnt, self.folder / "learnt.h5")
 
-    def write(self, batch: Batch, poses: Mapping[str, list[Poses]]) -> None:
+    def write(self, batch: Batch, poses: Measured) -> None:
         """Write the poses of each ball in one batch."""
-        do = "check the space left, then run again with --resume"
-        with writing(force=True), whole_hdf5(self.poses(batch), do) as file:
-            file.attrs["schema"] = SCHEMA
-            for ball, of_ball in poses.items():
-                _write_poses(of_ball, ball_group(file, ball))
-            file.attrs["sha256"] = digest(file)
+        with writing(force=True):
+            write_poses(poses, self.poses(batch))
 
-    def read(self, batch: Batch) -> dict[str, list[Poses]]:
+    def read(self, batch: Batch) -> Measured:
         """Return the poses of each ball in one batch; raise TrackError and remove the file if it is damaged."""
         path = self.poses(batch)
         poses = read_poses(path) if path.is_file() else None
@@ -266,38 +255,3 @@ class FolderStore:
 
 
 Store = MemoryStore | FolderStore
-
-
-def _write_poses(poses: list[Poses], group: h5py.Group) -> None:
-    group["count"] = np.array([len(one) for one in poses])
-    group["use"] = np.stack([one.use.numpy() for one in poses])
-    group["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
-    for name in POSE_PARTS:
-        group[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
-
-
-def read_poses(path: Path) -> dict[str, list[Poses]] | None:
-    """Return what `FolderStore.write` wrote; None if the file is not whole."""
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file):
-                return None
-            return {name: _read_poses(group) for name, group in ball_groups(file).items()}
-    except MemoryError:
-        raise
-    except DAMAGE:
-        return None
-
-
-def _read_poses(group: h5py.Group) -> list[Poses]:
-    R = torch.from_numpy(group["R_lab_body"][()])
-    if not bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all()):
-        raise ValueError("no rotations")
-    count, use = group["count"][()].tolist(), torch.from_numpy(group["use"][()])
-    reason = [[Reason(why.decode()) for why in row] for row in group["reason"][()].tolist()]
-    parts = {name: torch.split(torch.from_numpy(group[name][()]), count) for name in POSE_PARTS}
-    return [
-        # Copy: a row would keep the whole array in memory.
-        Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))
-        for k in range(len(count))
-    ]

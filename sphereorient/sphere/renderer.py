@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, Rays
-from sphereorient.cameras.ideal import TelecentricCamera
+from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.errors import CameraError, SettingsError, check_tail, refusal, tensor_of
 from sphereorient.so3 import check_rotations
 from sphereorient.sphere.texture import as_texture, reduced_texture

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.so3 import geodesic_distance
 from sphereorient.statistics.bootstrap import Floats
 from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory.rotations import distance_rad
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,7 +40,7 @@ def camera_distances(
         for pair in combinations(sorted(own), 2):
             for parts, of in ((apart, own), (rough, other or {})):
                 if set(pair) <= set(of):
-                    apart_rad = geodesic_distance(*(torch.from_numpy(of[name]) for name in pair)).numpy()
+                    apart_rad = distance_rad(*(of[name] for name in pair))
                     parts.setdefault(pair, []).append(apart_rad[np.isfinite(apart_rad)])  # frames with both
     return [_pooled(pair, np.concatenate(parts), rough.get(pair), bins) for pair, parts in apart.items()]
 

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
 
-from sphereorient import so3
 from sphereorient.motion import rotvec_between
 from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_counts, segment_sums
 from sphereorient.statistics.lags import Pairs
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.trajectory.rotations import tait_bryan
 
 ALIKE = 0.3  # largest residual of a row against the rotations, relative to the row
 DRAWS = 20_000  # of the null distribution; its 5 % point is then known to 0.2 %
@@ -169,7 +168,7 @@ class EulerDensity:
 
 def euler_densities(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> list[EulerDensity]:
     """Return PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
-    theta = so3.to_tait_bryan(torch.from_numpy(ensemble.R_lab_body)).numpy()
+    theta = tait_bryan(ensemble.R_lab_body)
     out = []
     for i, name in enumerate(("theta_x", "theta_y", "theta_z")):
         half = np.pi / 2 if i == 1 else np.pi

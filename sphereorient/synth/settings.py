@@ -3,6 +3,7 @@ from typing import Literal, Self
 from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.hdf5 import UNNAMED
 
 
 class SynthSettings(BaseModel, frozen=True, extra="forbid"):
@@ -38,8 +39,8 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
 
     @property
     def worn(self) -> dict[str, int]:
-        """Number of the paint that each ball wears, by its name; the name of an only ball is empty."""
-        names = "abcdefgh"[: self.balls] if self.balls > 1 else ("",)
+        """Number of the paint that each ball wears, by its name."""
+        names = "abcdefgh"[: self.balls] if self.balls > 1 else (UNNAMED,)
         return {name: k % self.paints for k, name in enumerate(names)}
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.hdf5 import ball_group, whole_hdf5
+from sphereorient.files.hdf5 import UNNAMED, ball_group, whole_hdf5
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
@@ -264,7 +264,7 @@ def experiment_document(settings: SynthSettings, cameras: Iterable[str], suffix:
         "name": settings.name,
         "frame_rate": settings.frame_rate,
         **exposure,
-        **({"sphere": spheres[""]} if "" in spheres else {"spheres": spheres}),
+        **({"sphere": spheres[UNNAMED]} if UNNAMED in spheres else {"spheres": spheres}),
         "cameras": "cameras.yaml",
         "backgrounds": {name: f"empty_{name}.png" for name in names},
         "movies": {name: f"{name}{suffix}" for name in names},

@@ -1,4 +1,4 @@
-"""The result of a measurement: trajectories, their file, reasons and flags."""
+"""The result of a measurement: trajectories, their file, rotations as arrays, reasons and flags."""
 
 from sphereorient.errors import Flag, Reason
 from sphereorient.trajectory.datasets import runs_of

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import Flag, OutputError, Reason, ShapeError, TrackError, refusal
-from sphereorient.files.hdf5 import DAMAGE, SPHERES, whole_hdf5
+from sphereorient.files.hdf5 import DAMAGE, SPHERES, UNNAMED, whole_hdf5
 from sphereorient.trajectory import datasets, journal
 from sphereorient.trajectory.datasets import in_length, reasons_of, stored, stored_fields
 
@@ -144,7 +144,7 @@ class Trajectory:
     experiment: str
     provenance: Mapping[str, Any]  # versions, command, sha256 of inputs; JSON types
     length_unit: str = "mm"  # or radii, of a sphere of unknown diameter
-    sphere: str = ""  # name of the sphere; empty: the only one
+    sphere: str = UNNAMED  # name of the sphere
 
     def __post_init__(self) -> None:
         frames = np.size(self.time)
@@ -374,7 +374,7 @@ class Tracks(Mapping[str, Trajectory]):
             return self
         if name not in self:
             known = ", ".join(each or "one ball without name" for each in self)
-            do = "leave --sphere out" if "" in self else "name one of these"
+            do = "leave --sphere out" if UNNAMED in self else "name one of these"
             raise TrackError(refusal("--sphere", expected=known, got=repr(name)[:60], do=do))
         return type(self)({name: self[name]})
 
@@ -449,7 +449,7 @@ def read_track(group: h5py.Group) -> Trajectory:
         frame_rate=float(group.attrs["frame_rate"]),
         provenance=json.loads(group.attrs["provenance"]),
         length_unit=str(group.attrs.get("length_unit", "mm")),
-        sphere=str(group.attrs.get("sphere", "")),
+        sphere=str(group.attrs.get("sphere", UNNAMED)),
         **parts,
     )
 

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
-from sphereorient import so3
 from sphereorient.trajectory.datasets import runs_of
+from sphereorient.trajectory.rotations import rotation_vectors
 
 Floats = NDArray[np.float64]
 # The columns of FicTrac's table, in order, and how many numbers each has. Source: FicTrac's doc/data_header.txt.
@@ -98,12 +97,3 @@ def fictrac_rows(
     for name in ("turn_cam", "turn_lab", "direction", "speed"):
         rows[start, FICTRAC[name]] = 0.0
     return rows
-
-
-def rotation_vectors(R: Floats) -> Floats:
-    """Return the rotation vectors (N, 3), rad, of rotations (N, 3, 3); NaN of NaN."""
-    known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
-    some = R if known.all() else np.where(known[:, None, None], R, np.eye(3))
-    turn: Floats = so3.log(torch.from_numpy(some)).numpy()
-    turn[~known] = np.nan
-    return turn

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, Fused, assemble_path, assemble_paths, fuse
-from sphereorient.assemble.two_cameras import Track, _roughest_turn
+from sphereorient.assemble.two_cameras import Track, roughest_turn
 from sphereorient.errors import ExperimentError, ShapeError
 from sphereorient.trajectory import Flag
 
@@ -274,7 +274,7 @@ def test_what_lies_between_two_stretches_splits_them(between):
 def test_continuity_counts_a_turn_over_a_hole_by_the_frame():
     R = turning(6, 10.0)
     track = Track(R_lab_body=R, score=torch.ones(6, dtype=torch.float64))
-    over_a_hole = _roughest_turn(track, torch.tensor([0, 1, 5]))
+    over_a_hole = roughest_turn(track, torch.tensor([0, 1, 5]))
     assert over_a_hole == pytest.approx(math.radians(10.0), rel=0.01)
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
-from sphereorient.cameras.ideal import TelecentricCamera
+from sphereorient.cameras.model import TelecentricCamera
 
 SIZE = (650, 480)
 ROTVEC = (0.3, -0.2, 0.5)

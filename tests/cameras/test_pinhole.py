@@ -9,8 +9,7 @@ import torch
 from camera_examples import f64, pinhole, whole_picture
 from conftest import assert_close
 
-from sphereorient.cameras.ideal import focal_of_field
-from sphereorient.cameras.model import middle_of_picture
+from sphereorient.cameras.model import focal_of_field, middle_of_picture
 from sphereorient.errors import CameraError
 
 

@@ -12,6 +12,7 @@ from experiment_examples import FULL, HEIGHT, SHORT, WIDTH, make_folder, save_mo
 from experiment_file import write_experiment
 from PIL import Image
 
+from sphereorient.cameras.response import Response
 from sphereorient.errors import CameraError, ExperimentError, MovieError, OutputError
 from sphereorient.experiment import (
     Experiment,
@@ -22,7 +23,6 @@ from sphereorient.experiment import (
     recording,
 )
 from sphereorient.experiment.experiment import outside_paths
-from sphereorient.movies.response import Response
 from sphereorient.sphere import load_texture
 
 

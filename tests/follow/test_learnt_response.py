@@ -10,9 +10,9 @@ import yaml
 from PIL import Image
 from run_examples import off_deg
 
+from sphereorient.cameras.response import Response
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.methods.method import load_learnt, save_learnt
-from sphereorient.movies.response import Response
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
 from sphereorient.synth import SynthSettings, write_synthetic_experiment

@@ -14,11 +14,11 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.tracker import Tracker
 from sphereorient.locate import screened_frames
 from sphereorient.methods import precise
-from sphereorient.methods.method import Job, load_learnt, one_thread
+from sphereorient.methods.method import Job, load_learnt, one_thread, read_poses
 from sphereorient.methods.settings import load_settings
 from sphereorient.pose.poses import no_pose
 from sphereorient.run.stages import run
-from sphereorient.run.store import FolderStore, MemoryStore, Request, read_poses
+from sphereorient.run.store import FolderStore, MemoryStore, Request
 from sphereorient.trajectory import Reason, Tracks
 
 pytestmark = pytest.mark.slow

@@ -21,11 +21,10 @@ from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.experiment.recording import open_recording
 from sphereorient.live.lines import JsonLines
-from sphereorient.live.live import measured
+from sphereorient.live.live import REMARK, TrackBlocks, measured
 from sphereorient.live.loop import open_live
 from sphereorient.live.outputs import TrackOutput
 from sphereorient.live.sources import movie_frames
-from sphereorient.live.track import REMARK, TrackBlocks
 from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Flag, Reason, Trajectory, journal
 from sphereorient.trajectory.datasets import stored_fields

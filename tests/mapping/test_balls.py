@@ -13,7 +13,7 @@ from sphereorient.errors import PaintError
 from sphereorient.locate import CameraScene
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.position import assigned
-from sphereorient.mapping.balls import FARTHEST, FREE, _crops_of, _instant, _linked, _places
+from sphereorient.mapping.balls import FARTHEST, FREE, crops_of_ball, linked_matches, linked_places, matched_instant
 from sphereorient.mapping.disks import Crop
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.synth import SynthSettings
@@ -82,17 +82,17 @@ def seen():
                 own.append(Outline(u_px=u, v_px=v, radius_px=26.0, rms_px=2 * NOISE_PX, coverage=0.3))
             disks.append([own[n] for n in rng.permutation(len(own))])
         crops = [[Crop(grey=np.full((2, 2), n), top=0, left=0) for n in range(len(row))] for row in disks]
-        instants.append(_instant(disks, crops, cameras, 2 * RADIUS_MM))
+        instants.append(matched_instant(disks, crops, cameras, 2 * RADIUS_MM))
     scenes = [dict.fromkeys(NAMES, SimpleNamespace(diameter_px=52.0)) for _ in views]
     return instants, scenes, views
 
 
 def test_each_ball_stays_the_same_one_though_they_pass_before_each_other(seen):
     instants, scenes, _ = seen
-    chosen = _linked(instants, scenes, dict.fromkeys(NAMES, RADIUS_MM))
+    chosen = linked_matches(instants, scenes, dict.fromkeys(NAMES, RADIUS_MM))
     taken = set()
     for n in range(len(NAMES)):
-        X = _places(chosen[:, n], instants)
+        X = linked_places(chosen[:, n], instants)
         away = {name: np.linalg.norm(X - path.numpy(), axis=1) for name, path in paths().items()}
         here = min(away, key=lambda name, far=away: float(np.median(far[name])))
         taken.add(here)
@@ -104,12 +104,12 @@ def test_each_ball_stays_the_same_one_though_they_pass_before_each_other(seen):
 def test_a_disk_that_another_one_touches_is_not_used_though_that_one_is_not_seen(seen):
     instants, scenes, views = seen
     radii = dict.fromkeys(NAMES, RADIUS_MM)
-    chosen = _linked(instants, scenes, radii)
-    places = [_places(chosen[:, n], instants) for n in range(3)]
+    chosen = linked_matches(instants, scenes, radii)
+    places = [linked_places(chosen[:, n], instants) for n in range(3)]
     touched = 0
     for n, name in enumerate(NAMES):
         order = [places[n], *(place for m, place in enumerate(places) if m != n)]
-        found = _crops_of(name, chosen[:, n], instants, views, radii, order)
+        found = crops_of_ball(name, chosen[:, n], instants, views, radii, order)
         for c, view in enumerate(views):
             middle, radius = (
                 torch.stack(parts)
@@ -129,5 +129,6 @@ def test_a_disk_that_another_one_touches_is_not_used_though_that_one_is_not_seen
 
 def test_more_balls_named_than_seen_are_told(seen):
     instants, scenes, _ = seen
+    six = [dict.fromkeys("abcdef", one["a"]) for one in scenes]
     with pytest.raises(PaintError, match="expected 6 balls in a frame"):
-        _linked(instants, [dict.fromkeys("abcdef", one["a"]) for one in scenes], dict.fromkeys("abcdef", RADIUS_MM))
+        linked_matches(instants, six, dict.fromkeys("abcdef", RADIUS_MM))

@@ -10,7 +10,7 @@ from renders import SIZE, disks_of_pictures, error_deg, pictures, turning
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
-from sphereorient.mapping.chain import _chained_pairs, chained, close_loops, find_chain
+from sphereorient.mapping.chain import chained, chained_pairs, close_loops, find_chain
 from sphereorient.mapping.disks import without_static
 from sphereorient.mapping.pairs import RelativeRotations, solve_graph
 from sphereorient.mapping.settings import MapSettings
@@ -92,8 +92,8 @@ def test_a_pattern_of_the_sensor_does_not_pull_turns_towards_zero():
     R = tumbling(90, 4.0)
     dirt = 60 * torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     disks = disks_of_pictures(pictures(R, 1, "dots") + dirt)
-    rough, _ = _chained_pairs(disks, MapSettings())
-    found, pairs = _chained_pairs(without_static(disks, rough), MapSettings())
+    rough, _ = chained_pairs(disks, MapSettings())
+    found, pairs = chained_pairs(without_static(disks, rough), MapSettings())
     neighbours = pairs.where(pairs.second - pairs.first == 1)
     true = so3.log(R[1:] @ R[:-1].mT)
     assert float((so3.log(neighbours.R_ji) * true).sum() / true.square().sum()) > 0.94

@@ -23,7 +23,7 @@ from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
 from sphereorient.mapping.compare import fibonacci_directions
-from sphereorient.mapping.learn import SHOWN_MIN, _counts, interpolated
+from sphereorient.mapping.learn import SHOWN_MIN, interpolated, times_seen
 from sphereorient.so3 import exp
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
@@ -119,7 +119,7 @@ def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
         towards = middles[c] - (X[k] + 1.5 * normal)
         expected += (normal * towards).sum(-1) / towards.norm(dim=-1) > SHOWN_MIN
     assert len(expected.unique()) > 2
-    torch.testing.assert_close(_counts(state, direction), expected)
+    torch.testing.assert_close(times_seen(state, direction), expected)
 
 
 @pytest.mark.slow

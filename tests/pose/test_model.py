@@ -28,7 +28,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera
-from sphereorient.cameras.ideal import TelecentricCamera
+from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.pose.model import SphereView
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
 from sphereorient.pose.view import sphere_view

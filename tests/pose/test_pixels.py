@@ -13,7 +13,7 @@ from conftest import assert_close
 from refine_examples import LOOKS, camera_of, f64, scene_of
 
 from sphereorient.cameras import Camera
-from sphereorient.cameras.ideal import TelecentricCamera
+from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.pose.pixels import VECTOR, LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked, whole_vectors
 
 WIDTH, HEIGHT = 60, 44

@@ -22,8 +22,8 @@ from refine_examples import (
 )
 
 from sphereorient import so3
+from sphereorient.cameras.response import Response
 from sphereorient.locate import CameraScene
-from sphereorient.movies.response import Response
 from sphereorient.pose import compiled
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fit import NEAR_RAD

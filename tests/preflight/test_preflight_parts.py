@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from sphereorient.calibration.comparison import gaps_between
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, holds_disk, triangulate
-from sphereorient.cameras.ideal import TelecentricCamera
+from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.experiment.recording import pictures_of
 from sphereorient.locate import Background, sightings_of
 from sphereorient.locate.outline import Outline

@@ -209,9 +209,9 @@ def test_half_a_report_never_stands_under_its_name(place, report, tmp_path, monk
 
 
 def test_names_of_tracks_are_as_short_as_they_can_be(place):
-    from sphereorient.cli.show import _load
+    from sphereorient.cli.show import load_tracks
 
-    names = _load([place / "a/track.h5", place / "b/track.h5", place / "precise.h5"], None)
+    names = load_tracks([place / "a/track.h5", place / "b/track.h5", place / "precise.h5"], None)
     assert list(names) == ["a/track.h5", "b/track.h5", "precise.h5"]
     assert replace(names["precise.h5"]).method == "precise"
 

@@ -14,10 +14,10 @@ from excerpt_examples import EXCERPT
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.files.hdf5 import digest
 from sphereorient.follow.follower import Batch
+from sphereorient.methods.method import read_poses
 from sphereorient.methods.settings import load_settings
 from sphereorient.pose.poses import Poses, blank_parts
 from sphereorient.run import FolderStore, Request
-from sphereorient.run.store import read_poses
 from sphereorient.trajectory import Reason
 
 BATCH = Batch(first=0, last=3, lengths=(3,))

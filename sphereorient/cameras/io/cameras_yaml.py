@@ -10,8 +10,7 @@ from scipy.linalg import block_diag
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera, TsaiCamera
 from sphereorient.cameras.camera import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error, check_known, named
-from sphereorient.cameras.ideal import PinholeCamera, TelecentricCamera
-from sphereorient.cameras.model import CameraModel, Key
+from sphereorient.cameras.model import CameraModel, Key, PinholeCamera, TelecentricCamera
 from sphereorient.cameras.parameters import parameter_names
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError

@@ -6,9 +6,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from sphereorient.cameras.response import Response
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.movies.response import Response
 from sphereorient.pose.camera_view import Optics, widest_px
 from sphereorient.pose.lasting import response_exponents
 from sphereorient.pose.model import SphereModel

@@ -6,17 +6,16 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from sphereorient import so3
 from sphereorient.report.plots import style as look
 from sphereorient.trajectory import Trajectory, runs_of
 from sphereorient.trajectory.datasets import in_length
+from sphereorient.trajectory.rotations import tait_bryan, tait_bryan_sigma
 
 Floats = NDArray[np.float64]
 
@@ -73,7 +72,8 @@ def track_figure(track: Trajectory) -> Figure:
     panels = figure.subplots(3, 1 if track.held else 2, sharex=True, squeeze=False)
     if not track.held:
         _dots(panels[0, 0], time, track.position)
-        _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
+        sigma = np.sqrt(np.maximum(np.diagonal(track.position_smooth_cov, axis1=1, axis2=2), 0.0))
+        _curves(panels[0, 0], time, track.position_smooth, sigma, part.broken)
         panels[0, 0].set_ylabel(in_length("position, lab (mm)", track.length_unit))
     _angles(panels[0, -1], time, part)
     shown = ("omega_lab", "alpha_lab") if track.held else tuple(RATES)
@@ -167,34 +167,14 @@ def _cut(values: Floats, broken: NDArray[np.bool_]) -> Floats:
 
 def _angles(axes: Axes, time: Floats, part: TrackPart) -> None:
     track = part.track
-    smooth = tait_bryan_deg(track.orientation_smooth)
-    sigma = _sigma_deg(track.orientation_smooth, track.orientation_smooth_cov)
-    _dots(axes, time, tait_bryan_deg(track.orientation))
+    smooth = np.rad2deg(tait_bryan(track.orientation_smooth))
+    sigma = np.rad2deg(tait_bryan_sigma(track.orientation_smooth, track.orientation_smooth_cov))
+    _dots(axes, time, np.rad2deg(tait_bryan(track.orientation)))
     for i in range(3):
         jumps = np.abs(np.diff(smooth[:, i])) > WRAP_DEG
         _curve(axes, time, smooth[:, i], sigma[:, i], part.broken | jumps, i)
     axes.set(ylim=(-185, 185), yticks=range(-180, 181, 90))
     axes.set_ylabel(r"angles $\theta_x$, $\theta_y$, $\theta_z$ (degrees)")
-
-
-def tait_bryan_deg(R_lab_body: Floats) -> Floats:
-    """Return theta_x, theta_y, theta_z (N, 3), degrees, of orientations (N, 3, 3); NaN where these are."""
-    theta_rad = so3.to_tait_bryan(torch.from_numpy(R_lab_body)).numpy()
-    known = np.isfinite(R_lab_body.reshape(-1, 9)).all(1, keepdims=True)  # of NaN it makes theta_z = 0, as at a pole
-    return np.where(known, np.rad2deg(theta_rad), np.nan)
-
-
-def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
-    """Return the sigmas of the angles (N, 3), degrees; NaN near the poles. Source: docs/errata.md E3."""
-    theta = np.deg2rad(tait_bryan_deg(R_lab_body))
-    there, out = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02), np.full_like(theta, np.nan)
-    inverse = np.linalg.inv(so3.rate_matrix_lab(torch.from_numpy(theta[there])).numpy())
-    out[there] = np.rad2deg(_sigma(inverse @ cov_lab_rad2[there] @ inverse.swapaxes(1, 2)))
-    return out
-
-
-def _sigma(cov: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0)))
 
 
 def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sphereorient.movies.response import LINEAR, Response
+from sphereorient.cameras.response import LINEAR, Response
 
 GREY = np.arange(256, dtype=np.uint8)
 
