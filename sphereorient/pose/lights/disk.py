@@ -1,5 +1,6 @@
 """Light as maps over the disk of each camera: sums of functions, and glints of lamps that the surface mirrors."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -114,26 +115,34 @@ def glints_at(glints: Tensor, across: Tensor) -> Tensor:
 
 def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     """Estimate what the surface mirrors, (C, G, G), see `Light`, from what B * C disks, those of `use` (B, C), leave
-    in the same cell of the disk, but for its limb. `known` (C, G, G) is the one that the residuals hold. By how much a
-    cell's mean is drawn to 0 follows from the scatter over the disks: of a mat ball all are.
+    in the same cell of the disk, but for its limb; each disk's pose and own light may change with it, else they keep
+    what they took of it. `known` (C, G, G) is the one that the residuals hold. By how much a cell is drawn to 0
+    follows from the scatter over the disks: of a mat ball all are.
     Source: empirical Bayes, James and Stein 1961.
     """
     cameras, cells = use.shape[1], GLINTS**2
     column, row = ((at.view.across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
-    precision = (at.weight / at.variance * (at.view.coverage > WHOLE) * use.reshape(-1, 1)).double()
-    sums = precision.new_zeros(2, len(precision), cells)
-    sums[0].scatter_add_(1, row * GLINTS + column, precision)
-    sums[1].scatter_add_(1, row * GLINTS + column, precision * at.residual)
-    weight, pull = (by_pose(part, cameras) for part in sums)  # (B, C, cells)
+    precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
+    inside = precision * (at.view.coverage > WHOLE)
+    others = at.design.double()
+    parts = torch.cat([inside[:, None], (inside * at.residual)[:, None], inside[:, None] * others], dim=1)
+    sums = parts.new_zeros(*parts.shape[:2], cells)
+    sums.scatter_add_(2, (row * GLINTS + column)[:, None].expand(parts.shape), parts)
+    weight, pull = (by_pose(sums[:, k], cameras) for k in range(2))  # (B, C, cells)
     whole = weight.sum(0).clamp_min(1e-30)
     mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
-    off, mean = pull - weight * mean, known.reshape(mean.shape) + mean
-    error2 = off.square().sum(0) / whole.square() * number / (number - 1)
-    told = number > 1
-    signal2 = torch.where(told, mean.square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
-    signal2 = signal2.clamp_min(0.0)[:, None]
-    share = torch.where(told, signal2 / (signal2 + error2), 0.0).nan_to_num()
-    return (share * mean).reshape(known.shape).float()
+    error2 = (pull - weight * mean).square().sum(0) / whole.square() * number / (number - 1)
+    told, now = number > 1, known.reshape(cameras, cells).double()
+    signal2 = torch.where(told, (now + mean).square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
+    drawn = torch.where(told, whole * error2 / signal2.clamp_min(1e-12)[:, None], math.inf).nan_to_num(posinf=1e30)
+    weighted = others * precision[:, None]
+    own = inverse_damped(weighted @ others.mT)
+    taken = by_pose(sums[:, 2:].mT @ own, cameras)
+    mixed = torch.einsum("bcip,bcpj->cij", taken, by_pose(sums[:, 2:], cameras))
+    left = by_pose((weighted @ at.residual.double()[..., None])[..., 0], cameras)
+    force = pull.sum(0) - torch.einsum("bcip,bcp->ci", taken, left) - drawn * now
+    found: Tensor = now + torch.linalg.solve(torch.diag_embed(weight.sum(0) + drawn) - mixed, force)
+    return found.reshape(known.shape).float()
 
 
 def light_columns(view: SphereView) -> Tensor:
