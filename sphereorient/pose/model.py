@@ -18,7 +18,7 @@ from sphereorient.sphere.view import polynomials
 UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
 LEAN_ORDER, LEAN_EVERY = 3, 4  # of the polynomials of the light's slope; n-th place suffices for it
-SHADOW, BRIGHT = 0.3, 0.9  # share of the bright light, a quantile over the disk, below which the limb is in shadow
+SHADOW, BRIGHT = 0.05, 0.9  # share of the bright light, a quantile over the disk, below which the limb is in shadow
 IN_SIGHT = 0.99  # coverage of a pixel that the limb does not cut
 DARKEST = 0.05  # of the brightest light of white paint: the logarithm of less has no use
 
