@@ -11,6 +11,7 @@ from sphereorient.movies.video import VideoMovie
 
 READERS: dict[str, Callable[[Path], Movie]] = {
     **dict.fromkeys((".mkv", ".avi", ".mp4", ".mov"), VideoMovie),
+    **dict.fromkeys(PICTURES, SequenceMovie),
     ".npy": NpyMovie,
     ".cine": CineMovie,
     **dict.fromkeys((".tif", ".tiff"), TiffMovie),
@@ -21,7 +22,7 @@ READERS: dict[str, Callable[[Path], Movie]] = {
 def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
     Videos: .mkv, .avi, .mp4, .mov (any codec of FFmpeg), .cine. Stacks of uint8 or uint16: .tif, .tiff, .npy (N, H, W),
-    .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: a folder, or a pattern with * or %05d.
+    .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: one, a folder, a pattern with * or %05d.
     Raises MovieError: missing, of another suffix, unreadable, or empty.
     """
     path = Path(path)
@@ -31,9 +32,6 @@ def open_movie(path: Path | str) -> Movie:
     if not _is(file, Path.is_file):
         raise refused(path, "a movie file", "no such file", "correct the path")
     suffix = file.suffix.lower()
-    if suffix in PICTURES and suffix not in READERS:
-        do = f"name all of them: their folder, or a pattern such as '*{file.suffix}'"
-        raise refused(path, "a movie", "one picture", do)
     reader = READERS.get(suffix)
     if reader is None:
         expected = f"a movie of type {' '.join(READERS)} or a folder of pictures"
