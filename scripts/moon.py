@@ -117,7 +117,8 @@ def row(name: str, experiment: Path, at: Ephemeris, folder: Path, settings: list
     try:
         program("track", experiment, "--out", track, "-q", "--force", *changes)
     except SystemExit as told:
-        return f"| {name} | {at.phase:.0f} | | | | | refused: {told} |"
+        why = str(told).partition(";")[0].removeprefix("sphereorient: ")
+        return f"| {name} | {at.phase:.0f} | | | | | refused: {why} |"
     found = Trajectory.load(track)
     R, C = found.orientation[0], found.orientation_cov[0]
     place = found.position[0]

@@ -232,7 +232,7 @@ def still_ball(
     size_px = locating.diameter_px or measured_size_px(pictures, scene, locating, LARGEST)
     outline = find_ball(pictures[0], scene, size_px, locating)[0] if size_px else None
     if outline is None:
-        do = "check that it shows one ball with some of its surroundings, or set locate.diameter_px"
+        do = "leave a tenth of its radius around the ball, or set locate.diameter_px"
         raise ExperimentError(refusal("movies", expected="a photograph of a ball", got="nothing round", do=do))
     around = _around(middle, noise, outline, scene.full_scale)
     return outline, replace(around, mean=around.mean if empty is None else empty, shown=shown)
