@@ -42,8 +42,8 @@ class CameraScene:
 
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
     """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
-    experiment, photograph = recording.experiment, len(stream) == len(recording.streams) == 1
-    if settings.diameter_px is None and (photograph or (experiment.fixed and experiment.diameter_mm is None)):
+    experiment = recording.experiment
+    if settings.diameter_px is None and (recording.photograph or (experiment.fixed and experiment.diameter_mm is None)):
         return None
     return settings.diameter_px or expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
 

@@ -11,7 +11,6 @@ from sphereorient.movies.video import VideoMovie
 
 READERS: dict[str, Callable[[Path], Movie]] = {
     **dict.fromkeys((".mkv", ".avi", ".mp4", ".mov"), VideoMovie),
-    **dict.fromkeys(PICTURES, SequenceMovie),
     ".npy": NpyMovie,
     ".cine": CineMovie,
     **dict.fromkeys((".tif", ".tiff"), TiffMovie),
@@ -32,7 +31,7 @@ def open_movie(path: Path | str) -> Movie:
     if not _is(file, Path.is_file):
         raise refused(path, "a movie file", "no such file", "correct the path")
     suffix = file.suffix.lower()
-    reader = READERS.get(suffix)
+    reader = READERS.get(suffix, SequenceMovie if suffix in PICTURES else None)
     if reader is None:
         expected = f"a movie of type {' '.join(READERS)} or a folder of pictures"
         do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
@@ -42,7 +41,7 @@ def open_movie(path: Path | str) -> Movie:
 
 def is_movie(path: Path) -> bool:
     """Return whether a file is a movie by the suffix of its name."""
-    return path.suffix.lower() in READERS and _is(path, Path.is_file)
+    return path.suffix.lower() in (*READERS, *PICTURES) and _is(path, Path.is_file)
 
 
 def movie_files(path: Path | str) -> list[Path]:
