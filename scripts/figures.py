@@ -94,6 +94,7 @@ FIGURES: dict[str, Figure] = {
     "photographs-maps": Figure(pages=("map.md",), command="photographs.py --moves --counts 12 30 --sets 3"),
     "fly": Figure(pages=("map.md",), command="real_fictrac.py"),
     "dots": Figure(pages=("photographs.md",), command="real_spindoe.py"),
+    "moon": Figure(pages=("moon.md",), command=f"moon.py {SHARED}/real/moon", tables=("moon",)),
     "statistics": Figure(pages=("statistics.md",), command="ensemble_coverage.py"),
     "tests": Figure(pages=("statistics.md",), command="statistics_tests.py"),
     "long-report": Figure(pages=("report.md",), command="bench_report.py out/long-report"),

@@ -12,9 +12,9 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet
-from sphereorient.errors import ExperimentError, SettingsError, SphereOrientError, refusal
-from sphereorient.files.whole_file import check_ending, relative_path, write_text
-from sphereorient.files.yaml_file import DraftKey, draft_yaml, given, open_keys, read_yaml
+from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError, refusal
+from sphereorient.files.whole_file import TEXT_BYTES, check_ending, has_mark, read_text, relative_path, write_text
+from sphereorient.files.yaml_file import DraftKey, draft_yaml, flow, given, open_keys, read_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,12 +24,13 @@ if TYPE_CHECKING:
 
 YAML = (".yaml", ".yml")
 HEAD = "Made by `sphereorient init`. Remove # before the keys to use; paths are relative to this file."
-VFOV_DEG = 30.0  # of a camera of which nothing is known: its ball is far, and nearly the same for any field of view
 
 
 @dataclass(frozen=True, kw_only=True)
 class _InitOptions:
-    movies: Annotated[list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies, one a camera.")] = None
+    movies: Annotated[
+        list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies or photographs, one a camera.")
+    ] = None
     out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
     plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
     from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: take over movie, view, masks.")] = None
@@ -40,6 +41,7 @@ class _InitOptions:
     vfov: Annotated[
         float | None, Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees.")
     ] = None
+    sphere_map: Annotated[Path | None, Option(help="The ball's texture map, where there is one.")] = None
     quiet: Quiet = False
 
 
@@ -50,15 +52,21 @@ def init(given: _InitOptions) -> None:
     if len(chosen) != 1:
         got, do = f"{len(chosen)} of them", "name movies, or --plate FOLDER, or --from-fictrac config.txt"
         raise SettingsError(refusal("init", expected="one source", got=got, do=do))
+    changes = list(given.set_ or [])
     target = given.out or Path("calibration.yaml" if given.plate else "experiment.yaml")
     check_ending(target, "--out", YAML)
     check_writable(target)
+    if given.sphere_map is not None and not given.plate:
+        from sphereorient.sphere import load_texture
+
+        load_texture(given.sphere_map)
+        changes.append(f"sphere.texture={flow(relative_path(given.sphere_map, target.parent))}")
     if given.plate:
-        _calibration(given.plate, target, given.set_ or [], given.quiet)
+        _calibration(given.plate, target, changes, given.quiet)
     elif given.from_fictrac:
-        _fictrac(given.from_fictrac, target, given.set_ or [], given.quiet)
+        _fictrac(given.from_fictrac, target, changes, given.quiet)
     else:
-        _experiment(given.movies or [], target, given.set_ or [], given.vfov, given.quiet)
+        _experiment(given.movies or [], target, changes, given.vfov, given.quiet)
 
 
 @app.command()
@@ -87,30 +95,33 @@ def mark(
 
 def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: float | None, quiet: bool) -> None:
     from sphereorient.experiment.experiment import MAX_CAMERAS
-    from sphereorient.preflight.first_look import camera_keys
+    from sphereorient.preflight.first_look import camera_keys, field_key
 
     if len(movies) > MAX_CAMERAS:
         do = "name those of one ball; track others as experiments of their own"
         raise SettingsError(refusal("MOVIE", expected=f"one to {MAX_CAMERAS} movies", got=f"{len(movies)}", do=do))
     cameras = target.parent / "cameras.yaml"
-    alone = len(movies) == 1 and not cameras.exists()
+    drafted = has_mark(cameras) and HEAD in read_text(cameras, TEXT_BYTES, "cameras", CameraError, "remove it")
+    alone = len(movies) == 1 and (drafted or not cameras.exists())
     looks = _looked(movies, target, quiet)
     missing = _write_experiment(looks, target, changes)
     if alone:
-        _write_cameras(cameras, camera_keys(looks[0], vfov or VFOV_DEG, known=vfov is not None))
+        (field,) = _asked([field_key(looks[0], vfov)])
+        _write_cameras(cameras, camera_keys(looks[0], field))
+        missing += open_keys([field])
     if quiet:
         return
     echo_lines(_found(look) for look in looks)
     if len({len(look.movie) for look in looks}) > 1:
         typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
-    _end(target, missing, _next(target, cameras), [cameras] if alone else [])
+    _end(target, missing, _next(target, cameras, looks), [cameras] if alone else [])
 
 
 def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
     from sphereorient.preflight.fictrac import read_fictrac_config
-    from sphereorient.preflight.first_look import camera_keys
+    from sphereorient.preflight.first_look import camera_keys, field_key
     from sphereorient.preflight.mark_masks import drawn_mask
 
     said = read_fictrac_config(config)
@@ -130,10 +141,10 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
     known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
     missing = _write_experiment([look], target, [*known, *changes], {look.name: mask.name} if hidden else None)
     R_cam_lab = said.R_animal_cam.mT.tolist()  # the lab is the animal's frame
-    _write_cameras(cameras, camera_keys(look, said.vfov_deg, R_cam_lab, known=True))
+    _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab))
     if not quiet:
         typer.echo(_found(look))
-        _end(target, missing, _next(target, cameras), made)
+        _end(target, missing, _next(target, cameras, [look]), made)
 
 
 def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:
@@ -211,19 +222,26 @@ def _found(look: "FirstLook") -> str:
         told += f", {look.rate_hz:.6g} Hz"
     if look.diameter_px is None:
         return f"{told}; no ball was found: light, or more than one thing that moves?"
-    where = "stays in its place" if look.stays else f"moves, found in {look.found} of {look.looked} frames"
+    where = (
+        "one picture"
+        if len(look.movie) == 1
+        else "stays in its place"
+        if look.stays
+        else f"moves, found in {look.found} of {look.looked} frames"
+    )
     return f"{told}; ball of {look.diameter_px:.0f} px, {where}"
 
 
-def _next(target: Path, cameras: Path) -> list[str]:
+def _next(target: Path, cameras: Path, looks: "Sequence[FirstLook]") -> list[str]:
     """Return the commands that come next."""
     calibrate = [
         "sphereorient init --plate FOLDER  # pictures of a calibration plate",
         f"sphereorient calibrate calibration.yaml --out {cameras}",
     ]
+    photographs = all(len(look.movie) == 1 for look in looks)  # no map is learnt from one picture
     return [
         *([] if cameras.exists() else calibrate),
-        f"sphereorient map {target} --out {target.parent / 'texture.png'}",
+        *([] if photographs else [f"sphereorient map {target} --out {target.parent / 'texture.png'}"]),
         f"sphereorient check {target}",
         f"sphereorient track {target} --out {target.parent / 'track.h5'}",
         f"sphereorient report {target.parent / 'track.h5'} --experiment {target} --out {target.parent / 'report'}",
@@ -234,5 +252,6 @@ def _end(target: Path, missing: Sequence[DraftKey], after: Sequence[str], made: 
     picture = target.with_suffix(".png")
     typer.echo(f"Wrote {', '.join(map(str, [target, *made, *([picture] if picture.exists() else [])]))}")
     for key in missing:
-        typer.echo(f"write in {target.name}: {key.name}, {key.comment}")
+        file = "cameras.yaml" if key.name.startswith("cameras.") else target.name
+        typer.echo(f"write in {file}: {key.name}, {key.comment}")
     echo_lines(["next:", *(f"  {line}" for line in after)])

@@ -198,6 +198,11 @@ class Recording:
         return {stream.name: stream.camera for stream in self.streams}
 
     @property
+    def photograph(self) -> bool:
+        """Whether one picture of one camera is all there is: it tells the size of the ball."""
+        return len(self.streams) == len(self.timeline.number) == 1
+
+    @property
     def frames(self) -> range:
         """Frame numbers of the experiment."""
         number = self.timeline.number

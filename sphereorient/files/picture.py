@@ -16,6 +16,8 @@ from tifffile import TiffFile, TiffFileError
 from sphereorient.files.whole_file import put_aside
 
 TIFF_SIZE = (256, 257)  # the tags of width and height
+EXIF, FOCAL_35MM, EXIF_SIZE = 0x8769, 0xA405, (0xA002, 0xA003)  # the block of tags, and tags in it
+FILM_MM = 43.27  # diagonal of 35 mm film
 FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # the warning where warnings are errors
@@ -79,6 +81,23 @@ def decoded_grey(content: bytes) -> NDArray[Any] | None:
     """Return the grey values of a picture file, (H, W), in its own depth; None where decoding fails."""
     picture = decoded(content, GREY)
     return None if picture is None or picture.ndim != 2 else np.asarray(picture)
+
+
+def vertical_field_deg(path: Path) -> float | None:
+    """Return the field of view, top to bottom, of a photograph by its EXIF tags; None where they do not tell it: no
+    focal length for 35 mm film, or a picture that was cut or scaled since. CIPA DC-008: that length is for equal
+    diagonals, 43.27 mm.
+    """
+    try:
+        with Image.open(path, formats=FORMATS) as picture:
+            tags = picture.getexif().get_ifd(EXIF)
+            focal_mm = float(tags.get(FOCAL_35MM, 0))
+            if focal_mm <= 0 or picture.size != tuple(int(tags.get(tag, 0)) for tag in EXIF_SIZE):
+                return None
+            slope = FILM_MM / 2 / focal_mm * picture.height / math.hypot(*picture.size)
+    except (*BOMBS, *FAULTS):
+        return None
+    return math.degrees(2 * math.atan(slope))
 
 
 def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:

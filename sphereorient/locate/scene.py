@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera, nearest_point
+from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
@@ -25,6 +27,8 @@ CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in s
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
+BORDER = 0.03  # of the shorter side: the border of a photograph shows what is around the sphere
+LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
 
@@ -39,11 +43,12 @@ class CameraScene:
     response: Response | None = None  # of the camera; None: not known, grey levels count as light
 
 
-def known_diameter_px(recording: Recording, name: str, settings: LocateSettings) -> float | None:
+def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
     """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
-    if settings.diameter_px is None and recording.experiment.fixed and recording.experiment.diameter_mm is None:
+    experiment = recording.experiment
+    if settings.diameter_px is None and (recording.photograph or (experiment.fixed and experiment.diameter_mm is None)):
         return None
-    return settings.diameter_px or expected_diameter_px(name, recording.cameras, recording.experiment.diameter_mm)
+    return settings.diameter_px or expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
 
 
 def find_scenes(
@@ -53,14 +58,22 @@ def find_scenes(
     background, expected diameters of their own.
 
     Raises:
-        ExperimentError: a sphere declared fixed does not rotate in one place.
+        CameraError: a single telecentric camera, whose pictures do not tell the depth.
+        ExperimentError: a sphere declared fixed does not rotate in one place, or none in a photograph.
         SettingsError: unknown diameter.
     """
+    if len(recording.streams) == 1 and isinstance(stream.camera, TelecentricCamera):
+        expected, got = "a camera whose pictures tell the depth", "a single telecentric one"
+        do = "write model: pinhole, f_px: 1000 times the ball's diameter in px: a ball that is far, at a vague depth"
+        raise camera_error(f"camera {stream.name}", expected, got, do)
     each = {name: recording.of(name) for name in recording.experiment.names}
-    sizes = {name: known_diameter_px(one, stream.name, settings) for name, one in each.items()}
+    sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
     empty, background = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None
-    if all(one.experiment.fixed for one in each.values()) and (empty is None or None in sizes.values()):
-        outline, guess = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
+    photograph = len(stream) == len(each) == 1
+    in_place = photograph or all(one.experiment.fixed for one in each.values())
+    if in_place and (empty is None or None in sizes.values()):
+        find = still_ball if photograph else fixed_ball
+        outline, guess = find(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
         background = guess if empty is None else None
     known = {name: px for name, px in sizes.items() if px is not None}  # by now each is known
@@ -193,6 +206,54 @@ def fixed_ball(
         raise _none_fixed("no circle about what changes")
     scene = _around(middle, scatter, outline, full_scale)
     return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
+
+
+def still_ball(
+    pictures: NDArray[Any],
+    locating: LocateSettings,
+    empty: NDArray[np.float32] | None = None,
+    shown: NDArray[np.bool_] | None = None,
+) -> tuple[Outline, Background]:
+    """Find the sphere in a photograph, (1, H, W), of which it may fill the most, by the grey level of its border.
+    Return its outline, and the background as in `fixed_ball`, which has the other arguments, too.
+
+    Raises:
+        ExperimentError: nothing round differs from the border.
+    """
+    middle = pictures[0].astype(np.float32)
+    wide = max(2, round(BORDER * min(middle.shape)))
+    border = np.ones(middle.shape, bool)
+    border[wide:-wide, wide:-wide] = False
+    border = border & shown if shown is not None and (border & shown).any() else border
+    scene = measure_background(pictures, np.full_like(middle, np.median(middle[border])))
+    even = np.full_like(middle, 1.4826 * np.median(np.abs(middle[border] - scene.mean[0, 0])))
+    noise = np.maximum(even, 0.3 * scene.full_scale / 255)
+    scene = replace(scene, mean=scene.mean if empty is None else empty, noise=noise, shown=shown)
+    size_px = locating.diameter_px or measured_size_px(pictures, scene, locating, LARGEST)
+    outline = find_ball(pictures[0], scene, size_px, locating)[0] if size_px else None
+    if outline is None:
+        do = "leave a tenth of its radius around the ball, or set locate.diameter_px"
+        raise ExperimentError(refusal("movies", expected="a photograph of a ball", got="nothing round", do=do))
+    around = _around(middle, noise, outline, scene.full_scale)
+    return outline, replace(around, mean=around.mean if empty is None else empty, shown=shown)
+
+
+def measured_size_px(
+    pictures: Sequence[NDArray[Any]] | NDArray[Any], background: Background, settings: LocateSettings, largest: float
+) -> float | None:
+    """Return the diameter, px, whose outlines in pictures (H, W) have the best coverage; None without outlines.
+    `largest`: that is tried first, of the picture's shorter side.
+    """
+    searched = largest * min(background.mean.shape)
+    best, size = 0.0, None
+    while searched > SMALLEST_PX:
+        outlines = [find_ball(picture, background, searched, settings)[0] for picture in pictures]
+        seen = [outline for outline in outlines if outline is not None]
+        merit = sum(outline.coverage for outline in seen)
+        if merit > 1.05 * best:  # circles through paint are smaller than the outline: of equals, take the larger
+            best, size = merit, 2 * float(np.median([outline.radius_px for outline in seen]))
+        searched /= SIZES
+    return size
 
 
 def _around(

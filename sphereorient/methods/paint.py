@@ -90,7 +90,7 @@ def open_paints(job: Job, progress: Progress) -> list[Paint]:
         tables, searches = [], []
         for names in (kinds := alike(recording)):
             own = recording.of(names[0])
-            known = [known_diameter_px(own, stream.name, settings.locate) for stream in recording.streams]
+            known = [known_diameter_px(own, stream, settings.locate) for stream in recording.streams]
             sizes = [px or views.result()[names[0]].diameter_px for px, views in zip(known, opening, strict=True)]
             cameras = [stream.camera for stream in recording.streams]
             search = BlurMatchedSearch(own.texture, settings, list(zip(cameras, sizes, strict=True)))

@@ -21,7 +21,7 @@ READERS: dict[str, Callable[[Path], Movie]] = {
 def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
     Videos: .mkv, .avi, .mp4, .mov (any codec of FFmpeg), .cine. Stacks of uint8 or uint16: .tif, .tiff, .npy (N, H, W),
-    .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: a folder, or a pattern with * or %05d.
+    .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: one, a folder, a pattern with * or %05d.
     Raises MovieError: missing, of another suffix, unreadable, or empty.
     """
     path = Path(path)
@@ -31,10 +31,7 @@ def open_movie(path: Path | str) -> Movie:
     if not _is(file, Path.is_file):
         raise refused(path, "a movie file", "no such file", "correct the path")
     suffix = file.suffix.lower()
-    if suffix in PICTURES and suffix not in READERS:
-        do = f"name all of them: their folder, or a pattern such as '*{file.suffix}'"
-        raise refused(path, "a movie", "one picture", do)
-    reader = READERS.get(suffix)
+    reader = READERS.get(suffix, SequenceMovie if suffix in PICTURES else None)
     if reader is None:
         expected = f"a movie of type {' '.join(READERS)} or a folder of pictures"
         do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
@@ -44,7 +41,7 @@ def open_movie(path: Path | str) -> Movie:
 
 def is_movie(path: Path) -> bool:
     """Return whether a file is a movie by the suffix of its name."""
-    return path.suffix.lower() in READERS and _is(path, Path.is_file)
+    return path.suffix.lower() in (*READERS, *PICTURES) and _is(path, Path.is_file)
 
 
 def movie_files(path: Path | str) -> list[Path]:

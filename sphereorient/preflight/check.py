@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import given_scene, open_recording
+from sphereorient.experiment.recording import Recording, given_scene, open_recording
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.files.threads import Progress, silent
 from sphereorient.locate import expected_diameter_px
@@ -70,7 +70,7 @@ def preflight(
         image, unseen = None, None
         if experiment.texture_path is not None and experiment.texture_path.exists():
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
-        sizes, wrong_sizes = _expected_sizes(experiment, settings)
+        sizes, wrong_sizes = _expected_sizes(recording, settings)
         progress("frames", 0, len(recording.streams))
         refine = settings.refine.model_copy(update=BRIEF)
         planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
@@ -147,11 +147,12 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
 
 
-def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:
+def _expected_sizes(recording: Recording, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:
     """Return the expected diameter in each camera, px, None if unknown, and findings for impossible ones."""
+    experiment, unknown = recording.experiment, settings.locate.diameter_px is None and not recording.photograph
     sizes: dict[str, float | None] = dict.fromkeys(experiment.cameras, settings.locate.diameter_px)
     findings = []
-    if settings.locate.diameter_px is None and experiment.diameter_mm is not None:
+    if unknown and experiment.diameter_mm is not None:
         for name in experiment.cameras:
             try:
                 sizes[name] = expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)

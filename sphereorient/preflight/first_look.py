@@ -1,5 +1,6 @@
 """A first look at movies of which nothing is known, and their experiment.yaml, which asks for what was not measured."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,18 +11,20 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras import PinholeCamera
-from sphereorient.cameras.model import middle_of_picture
+from sphereorient.cameras.model import focal_of_field, middle_of_picture
 from sphereorient.errors import ExperimentError, MovieError
 from sphereorient.experiment.recording import CameraStream
+from sphereorient.files.picture import vertical_field_deg
 from sphereorient.files.threads import Progress, counted, side_by_side, silent
 from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import DraftKey
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import fixed_ball
-from sphereorient.movies import Movie, open_movie
+from sphereorient.locate.scene import fixed_ball, still_ball
+from sphereorient.movies import Movie, movie_files, open_movie
 from sphereorient.preflight.sample import sample_movie
 
+WIDE_DEG = 30.0  # field of view that is the example
 STAYS = 0.15  # of the radius: a ball whose outlines scatter by less stays in its place
 SEEN = 0.4  # share of the frames in which a ball that moves is found at least
 PICTURES = 40  # all over the movie, for a ball that stays
@@ -43,6 +46,7 @@ class FirstLook:
     frame: int  # one in which the ball was found, where there is one
     picture: NDArray[Any]  # (H, W), of it
     outline: Outline | None  # of the ball in it
+    vfov_deg: float | None = None  # field of view, by the tags of a photograph
 
 
 def look_at(
@@ -59,6 +63,7 @@ def look_at(
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
     """Look at the movie of a camera; `shown` (H, W) is False where something hides the ball."""
     settings, stream = LocateSettings(), _stream(name, movie, shown)
+    find = still_ball if len(movie) == 1 else fixed_ball
     sample = sample_movie(stream, None, settings)
     outlines = [outline for _, outline in sample.balls]
     with_ball = [k for k, (outline, _) in enumerate(sample.found) if outline is not None]
@@ -73,11 +78,12 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
         stays = bool(np.median(np.hypot(*(places - np.median(places, axis=0)).T)) < STAYS * radius_px)
     if stays or not seen:
         try:
-            outline, _ = fixed_ball(stream.spread(PICTURES), settings, shown=shown)
+            outline, _ = find(stream.spread(PICTURES), settings, shown=shown)
             seen, stays = True, True
             radius_px = outline.radius_px
         except (ExperimentError, MovieError):
             stays = None
+    photograph = movie_files(movie.path)[0] if len(movie) == 1 else None
     rate_hz = None if movie.times_s is None or len(movie) < 2 else 1 / float(np.median(np.diff(movie.times_s)))
     return FirstLook(
         name=name,
@@ -90,6 +96,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
         frame=int(sample.row[k]),
         picture=picture,
         outline=outline if seen else None,
+        vfov_deg=vertical_field_deg(photograph) if photograph else None,
     )
 
 
@@ -135,6 +142,8 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
 
 
 def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
+    if all(len(one.movie) == 1 for one in looks):
+        return DraftKey(name="frame_rate", value=1.0, comment="Hz; any, of one picture")
     rate = looks[0].rate_hz
     if rate is not None and all(one.rate_hz for one in looks):
         return DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
@@ -145,26 +154,41 @@ def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
 def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
     stays = all(one.stays for one in looks)
     sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
+    photograph = len(looks) == len(looks[0].movie) == 1
     unknown = "; null where it is not known: lengths are then in radii" if len(looks) == 1 and stays else ""
     size = f"mm{unknown} ({sizes or 'no ball was found'})"
     fixed = f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies"
+    if len(looks[0].movie) == 1:
+        stays, fixed = False, "whether the ball only turns, in its place: no matter, in one picture"
     return [
-        DraftKey(name="sphere.diameter", comment=size, example=18.0, asked=True),
+        DraftKey(name="sphere.diameter", value=None if photograph else ..., comment=size, example=18.0, asked=True),
         DraftKey(name="sphere.texture", value="texture.png", comment="`sphereorient map` learns it from the movies"),
         DraftKey(name="sphere.fixed", value=stays, comment=fixed),
     ]
 
 
-def camera_keys(
-    look: FirstLook, vfov_deg: float, R: Sequence[Sequence[float]] | None = None, *, known: bool
-) -> list[DraftKey]:
-    """Return the keys of cameras.yaml for one camera of which at most the field of view is known.
+def field_key(look: FirstLook, vfov_deg: float | None) -> DraftKey:
+    """Return the field of view of a single camera as a key to ask for, with what a wrong one does to this ball."""
+    known, height = vfov_deg or look.vfov_deg, look.movie.frame_shape[0]
+    focal_px = focal_of_field(height, WIDE_DEG)
+    limb_deg = math.degrees(math.atan((look.diameter_px or height / 2) / 2 / focal_px))
+    wrong = f"{WIDE_DEG:g} in place of 1 moves paint at this ball's limb by {limb_deg:.0f} degrees"
+    comment = f"field of view, degrees, top to bottom of the picture: 2 atan(height of the sensor / 2 f); {wrong}"
+    name = f"cameras.{look.name}.vfov_deg"
+    return DraftKey(name=name, value=known or ..., comment=comment, example=WIDE_DEG, asked=True)
+
+
+def camera_keys(look: FirstLook, field: DraftKey, R: Sequence[Sequence[float]] | None = None) -> list[DraftKey]:
+    """Return the keys of cameras.yaml for one camera of which at most the field of view, `field_key`, is known.
     R: R_cam_lab, where the lab is not the camera's own frame.
     """
     height, width = look.movie.frame_shape
-    entry: dict[str, Any] = {"model": "pinhole", "image_size": [width, height], "vfov_deg": vfov_deg}
+    entry: dict[str, Any] = {"model": "pinhole", "image_size": [width, height]}
+    told = f"WRITE THIS: vfov_deg: N, {field.comment}"
+    if field.value is not ...:
+        entry["vfov_deg"] = field.value
+        told = "field of view by the EXIF tags" if field.value == look.vfov_deg else "field of view as given"
     if R is not None:
         entry |= {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
-    told = "known" if known else "assumed: it hardly matters for a ball in its place"
     where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
-    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=f"field of view {told}; {where}")]
+    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=f"{told}; {where}")]

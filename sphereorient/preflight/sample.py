@@ -1,6 +1,7 @@
 """The sampled frames of the check, and the ball in them."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
-from sphereorient.errors import MovieError, Reason, refusal
+from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
@@ -25,13 +26,13 @@ from sphereorient.locate import (
 )
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.outline import Outline
+from sphereorient.locate.scene import SMALLEST_PX, measured_size_px, still_ball
 
 SPREAD = 25  # frames all over the movie: enough for a background
 EVERY = 3  # of these, each third one is read with the next frame, for motion and repeated frames
 FEW = 0.2  # share of the frames; if the ball is found in fewer, other sizes are tried
+LARGEST = 0.9  # of the picture's shorter side: the first diameter tried
 BALLS = 12  # frames in which a ball of unknown size is searched
-SIZES = 1.4  # ratio of the diameters tried; the outline's tolerance covers it
-SMALLEST_PX = 30.0  # of these diameters: paint on a smaller ball is not read
 
 Grey = NDArray[Any]
 
@@ -111,19 +112,23 @@ def sample_movie(
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
 
     def at_size(size_px: float) -> MovieSample:
-        if empty is None and fixed:
+        if empty is None and (fixed or len(stream) == 1):
             background = replace(_surroundings(some), shown=stream.shown)
+            if len(stream) == 1:
+                with suppress(ExperimentError):  # no ball is reported by the checks
+                    background = still_ball(some, settings, shown=stream.shown)[1]
         else:
             background = learn_background(some, size_px, settings, empty, stream.shown)
         look: dict[str, Any] = {"stream": stream, "frame": frame, "picture": picture, "background": background}
         return _searched(MovieSample(**look, diameter_px=size_px, expected_px=diameter_px), settings)
 
-    largest_px = 0.9 * min(stream.movie.frame_shape)
+    largest_px = LARGEST * min(stream.movie.frame_shape)
     first = at_size(diameter_px if diameter_px is not None and diameter_px >= SMALLEST_PX else largest_px / 4)
     if diameter_px is not None and len(first.balls) > FEW * len(shown):
         return first
     # The size is unknown or wrong: take whatever is as round as a ball.
-    size_px = _measured_size_px(shown, first.background, settings)
+    chosen = [shown[k] for k in spread_frames(range(len(shown)), BALLS)]
+    size_px = measured_size_px(chosen, first.background, settings, LARGEST)
     return first if size_px is None else at_size(size_px)
 
 
@@ -157,18 +162,3 @@ def _surroundings(pictures: Grey) -> Background:
     middle = np.full(measured.mean.shape, np.median(measured.mean), np.float32)
     noise = np.full(middle.shape, measured.typical_noise, np.float32)
     return Background(mean=middle, noise=noise, full_scale=measured.full_scale)
-
-
-def _measured_size_px(pictures: Sequence[Grey], background: Background, settings: LocateSettings) -> float | None:
-    """Return the diameter, px, whose outlines have the best coverage; None without outlines."""
-    largest = 0.9 * min(background.mean.shape)
-    chosen = [pictures[k] for k in spread_frames(range(len(pictures)), BALLS)]
-    best, size = 0.0, None
-    while largest > SMALLEST_PX:
-        outlines = [find_ball(picture, background, largest, settings)[0] for picture in chosen]
-        seen = [outline for outline in outlines if outline is not None]
-        merit = sum(outline.coverage for outline in seen)
-        if merit > 1.05 * best:  # circles through paint are smaller than the outline: of equals, take the larger
-            best, size = merit, 2 * float(np.median([outline.radius_px for outline in seen]))
-        largest /= SIZES
-    return size
