@@ -1,5 +1,6 @@
 """From the stages' results to the trajectory, one function for each method."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Recording
 from sphereorient.follow import Appearance
 from sphereorient.follow.appearance import LOOK_ALIKE
+from sphereorient.follow.appearance.map_odds import pose_log_odds
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, in_middle
@@ -191,14 +193,28 @@ def precise_track(
         segment=chosen.segment.numpy(),
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
-        confidence=np.where(_alone(chosen.segment.numpy()), np.nan, chosen.probability.numpy()),
+        confidence=chosen.probability.numpy(),
     )
 
 
-def _alone(segment: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which frames (N,) are the only ones of their segment: no other one confirms their pose."""
-    number, count = np.unique(segment[segment >= 0], return_counts=True)
-    return np.isin(segment, number[count == 1])
+def with_map_odds(chosen: Chosen, table: PoseTable, map_log_odds: float | None, least: float) -> Chosen:
+    """Return choices whose probability holds the odds of the map. Where a frame is the only one of its segment no other
+    one confirms its pose: there also those against the next pose by the scores, and NaN where the map's are not known.
+    Less than `least` is ambiguous.
+    """
+    number, count = np.unique(chosen.segment[chosen.present].numpy(), return_counts=True)
+    alone = torch.from_numpy(np.isin(chosen.segment.numpy(), number[count == 1])) & chosen.present
+    against = torch.full_like(chosen.probability, torch.nan if map_log_odds is None else math.exp(-map_log_odds))
+    confidence = torch.where(
+        alone | torch.isfinite(against), 1 / (1 / chosen.probability + against), chosen.probability
+    )
+    for n in torch.nonzero(alone)[:, 0].tolist():
+        score, others = table.score[n][:, table.use[n]], table.mask[n].clone()
+        others[chosen.choice[n]] = False
+        rivals = pose_log_odds(score[chosen.choice[n]], score[others]).sum(-1)
+        confidence[n] = 1 / (1 + against[n] + torch.exp(-rivals).sum())
+    ambiguous = torch.where(confidence < least, int(Flag.AMBIGUOUS), 0)
+    return replace(chosen, probability=confidence, flags=chosen.flags | ambiguous)
 
 
 def with_errors(

@@ -19,54 +19,57 @@ from sphereorient.pose.fitter import LEAST_LEFT
 from sphereorient.pose.poses import Poses
 
 FEW = 8  # frames; more of them tell by their own wrong poses, see `explained`
-ORIENTATIONS = 1000.0  # independent views of one paint
-CHANCE = (0.15, 0.85)  # least and greatest score that a wrong map is taken to reach
-LEAST_ODDS = 10.0  # of the map
-BEYOND_PX = 3.0  # of the limb that is mirrored with the disk
+VIEWS = 50.0  # independent ones of a paint: so odds are right for 191 stills of balls with other maps
+CHANCE, BEYOND_CHANCE = 0.25, 0.85  # least and greatest score that the best pose of a wrong map is taken to have
+LEAST_ODDS = 4.0  # of the map; 191 right ones: 5 or more
+SURE_ODDS = 20.0  # of the mirror image, to name it
+MOST = math.log(1e6)  # log odds that are told; the model is no better
+RIM_PX = 3.0  # beyond the limb, mirrored with the disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapOdds:
     """Scores of a map in n pictures of each of C cameras; made by `map_odds`."""
 
-    score: Tensor  # (n, C), 1 less the share of the variance that the best pose leaves; NaN: no disk to look at
-    mirrored: Tensor  # (n, C), the same of the mirrored picture
+    score: Tensor  # (n, C), of the best pose; NaN: no disk to look at
+    mirrored: Tensor  # (n, C), of the best pose in the mirrored picture
 
     @property
     def log_odds(self) -> Tensor:
-        """Logarithm of the odds (C,) of the map against its mirror image, which explains as much as any wrong one."""
-        likelier = log_odds(self.score, self.mirrored, CHANCE[1]) - log_odds(self.mirrored, self.score)
+        """Logarithm of the odds (C,) of the map against a wrong one, which explains as much as its mirror image."""
+        likelier = pose_log_odds(self.score, self.mirrored, BEYOND_CHANCE) - pose_log_odds(self.mirrored, self.score)
         return likelier.nan_to_num(0.0).sum(0)
 
-    def check(self, cameras: Sequence[str]) -> None:
-        """Raise ExperimentError where the map's mirror image is likelier, or chance explains as much."""
-        least, found = math.log(LEAST_ODDS), self.log_odds
-        scores = zip(cameras, self.score.nanmedian(0).values, self.mirrored.nanmedian(0).values, strict=True)
-        got = ", ".join(
-            f"{_percent(one)} of {name}, {_percent(other)} of its mirror image" for name, one, other in scores
+    def check(self, cameras: Sequence[str], *, found: bool) -> None:
+        """Raise ExperimentError where the map's mirror image is likelier, or, if poses were `found`, chance explains
+        as much.
+        """
+        odds, scores = self.log_odds, [_percent(one) for one in (self.score, self.mirrored)]
+        both = zip(cameras, *scores, strict=True)
+        got = "a map that explains " + ", ".join(
+            f"{one} of {name}, {other} of its mirror image" for name, one, other in both
         )
-        wrong = [name for name, one in zip(cameras, found.tolist(), strict=True) if one < -least]
-        if wrong:
-            got = f"a map that explains {got}: odds of {_odds(-found.min())} that it is mirrored"
+        if wrong := [name for name, one in zip(cameras, odds.tolist(), strict=True) if one < -math.log(SURE_ODDS)]:
+            got += f": odds of {_told(-odds.min())} that it is mirrored"
             flip = ", ".join(f"{name}: horizontal" for name in wrong)
-            do = f"write flip: {{{flip}}}, or mirror the map (`sphere.texture`) left to right"
+            do = f"write flip: {{{flip}}}, remove one that is there, or mirror the map left to right"
             raise ExperimentError(refusal("movies", expected="pictures that are not mirrored", got=got, do=do))
-        if float(found.sum()) < least:
-            got = f"one that explains {got}: odds of {_odds(found.sum())} against chance"
-            expected = "a map that explains the pictures"
+        if found and float(odds.sum()) < math.log(LEAST_ODDS):
+            got += f": odds of {_told(odds.sum())} against chance"
+            expected = f"a map with odds of {LEAST_ODDS:.0f} to 1"
             raise ExperimentError(refusal("movies", expected=expected, got=got, do=LOOK_ALIKE))
 
 
-def log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor:
-    """Return the logarithm of the odds (...) that a pose is right against another one that is right or by chance, at
-    least 0, by their scores; by chance no score is above `greatest`.
-    The best of N independent views of a wrong map leaves the share V of the variance with V ** (-n / 2) = N, of n
-    independent pixels; a pose that leaves U has the odds (V / U) ** (n / 2) = N ** (log U / log V - 1).
+def pose_log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor:
+    """Return the logarithm of the odds (...), 1 to 1 at least, of a pose against another one, by their scores; a wrong
+    pose has a score of `greatest` at most.
+    The best of N independent views of a wrong map leaves the share V of the variance, with V ** (-n / 2) = N of n
+    independent pixels. A pose that leaves U has the odds (V / U) ** (n / 2) = N ** (log U / log V - 1).
     """
-    left = (1 - score).clamp(LEAST_LEFT, 1 - CHANCE[0]).log() / (1 - other.clamp(CHANCE[0], greatest)).clamp_min(
-        LEAST_LEFT
-    ).log()
-    return math.log(ORIENTATIONS) * (left - 1).clamp_min(0.0)
+    gain, chance = (
+        -(1 - one.clamp(CHANCE, most)).clamp_min(LEAST_LEFT).log() for one, most in ((score, 1.0), (other, greatest))
+    )
+    return math.log(VIEWS) * (gain / chance - 1).clamp_min(0.0)
 
 
 def map_odds(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]) -> MapOdds:
@@ -116,16 +119,18 @@ def _best_score(alone: Initialiser, picture: Picture, disk: Outline) -> float:
 
 def _mirrored(picture: Picture, disk: Outline) -> tuple[Picture, Outline]:
     """Return a picture (H, W) whose disk is mirrored left to right, and the outline there, half a pixel off at most."""
-    v, u = np.indices(picture.shape)
-    turned = round(2 * disk.u_px) - u[0]
-    inside = np.hypot(u - disk.u_px, v - disk.v_px) < disk.radius_px + BEYOND_PX
-    other = picture[:, turned.clip(0, picture.shape[1] - 1)]
+    height, width = picture.shape
+    v, u = np.arange(height)[:, None], np.arange(width)
+    inside = np.hypot(u - disk.u_px, v - disk.v_px) < disk.radius_px + RIM_PX
+    other = picture[:, (round(2 * disk.u_px) - u).clip(0, width - 1)]
     return np.where(inside, other, picture), replace(disk, u_px=round(2 * disk.u_px) - disk.u_px)
 
 
-def _percent(score: Tensor) -> str:
-    return f"{100 * float(score.nan_to_num(0.0).clamp_min(0.0)):.0f} %"
+def _percent(score: Tensor) -> list[str]:
+    median = score.nanmedian(0).values.nan_to_num(0.0).clamp_min(0.0)
+    return [f"{100 * one:.0f} %" for one in median.tolist()]
 
 
-def _odds(log_odds: Tensor) -> str:
-    return f"{math.exp(min(float(log_odds), 30.0)):.2g} to 1"
+def _told(log_odds: Tensor) -> str:
+    odds = math.exp(min(float(log_odds), MOST))
+    return f"{odds:,.0f} to 1" if odds > LEAST_ODDS else f"{odds:.1f} to 1"
