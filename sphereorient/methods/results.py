@@ -46,6 +46,10 @@ CODED = (
     "grey levels of {name} are not proportional to the light: {found} was learnt; "
     "write `response:` where it is known (docs/movies.md)"
 )
+RUNAWAY = (
+    "nearly every orientation explains each of {pictures} frames looked at equally well: method paper expects black and "
+    "white paint in even light; try `--method precise`"
+)
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
 
@@ -241,9 +245,11 @@ def missed_text(track: Trajectory) -> list[str]:
     for name, lost in track.summary()["lost"].items():
         pictures = len(track) - lost.pop(Reason.MISSING, 0)
         usual = next(iter(lost), None)
-        if usual not in MISSED or sum(lost.values()) < pictures:
+        if usual not in (*MISSED, Reason.RUNAWAY) or sum(lost.values()) < pictures:
             continue
         text = f"no ball found in {pictures} frames looked at"
+        if usual == Reason.RUNAWAY:
+            text = RUNAWAY.format(pictures=pictures)
         if usual == Reason.LOW_SCORE:
             text = f"no pose of the map explains any of {pictures} frames looked at"
             text += "" if track.valid.any() else f"; {LOOK_ALIKE}"

@@ -52,7 +52,7 @@ class MapOdds:
         if wrong := [name for name, one in zip(cameras, odds.tolist(), strict=True) if one < -math.log(SURE_ODDS)]:
             got += f": odds of {_told(-odds.min())} that it is mirrored"
             flip = ", ".join(f"{name}: horizontal" for name in wrong)
-            do = f"write flip: {{{flip}}}, remove one that is there, or mirror the map left to right"
+            do = f"write flip: {{{flip}}}, remove one that is there, or correct a map that is mirrored or upside down"
             raise ExperimentError(refusal("movies", expected="pictures that are not mirrored", got=got, do=do))
         if found and float(odds.sum()) < math.log(LEAST_ODDS):
             got += f": odds of {_told(odds.sum())} against chance"
