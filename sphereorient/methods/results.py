@@ -47,8 +47,8 @@ CODED = (
     "write `response:` where it is known (docs/movies.md)"
 )
 RUNAWAY = (
-    "nearly every orientation explains each of {pictures} frames looked at equally well: method paper expects black and "
-    "white paint in even light; try `--method precise`"
+    "nearly every orientation explains each of {pictures} frames looked at equally well: method paper expects black "
+    "and white paint in even light; try `--method precise`"
 )
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)

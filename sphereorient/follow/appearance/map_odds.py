@@ -23,7 +23,7 @@ VIEWS = 50.0  # independent ones of a paint: so odds are right for 191 stills of
 CHANCE, BEYOND_CHANCE = 0.25, 0.85  # least and greatest score that the best pose of a wrong map is taken to have
 LEAST_ODDS = 4.0  # of the map; 191 right ones: 5 or more
 SURE_ODDS = 20.0  # of the mirror image, to name it
-MOST = math.log(1e6)  # log odds that are told; the model is no better
+MOST = math.log(1e6)  # log odds of one picture; the model is no better
 RIM_PX = 3.0  # beyond the limb, mirrored with the disk
 
 
@@ -69,7 +69,8 @@ def pose_log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor
     gain, chance = (
         -(1 - one.clamp(CHANCE, most)).clamp_min(LEAST_LEFT).log() for one, most in ((score, 1.0), (other, greatest))
     )
-    return math.log(VIEWS) * (gain / chance - 1).clamp_min(0.0)
+    odds: Tensor = math.log(VIEWS) * (gain / chance - 1)
+    return odds.clamp(0.0, MOST)
 
 
 def map_odds(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]) -> MapOdds:
