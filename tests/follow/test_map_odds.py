@@ -153,7 +153,7 @@ def chosen_alone(odds_of_map, *others):
 )
 def test_the_confidence_of_a_frame_alone_weighs_the_map_and_its_other_poses(odds_of_map, others, confidence):
     found = chosen_alone(math.log(odds_of_map), *others)
-    assert float(found.probability[0]) == pytest.approx(confidence, abs=1e-6)
+    assert float(found.probability[0]) == pytest.approx(confidence, abs=1e-5)
     assert bool(found.flags[0] & Flag.AMBIGUOUS) == (confidence < 0.9 - 1e-9)
 
 

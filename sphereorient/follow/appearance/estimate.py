@@ -111,7 +111,7 @@ def _chosen(
     search, found = find_poses(search, frames) if among is None else (search, list(among.found))
     log_odds = None
     if len(frames) <= FEW:
-        odds = map_odds(search, frames, found)
+        odds = map_odds(search, frames, found, only=among is None)
         odds.check([view.name for view in search.fitter.views], found=bool(proven(found)))
         log_odds = float(odds.log_odds.sum())
     sample = agreeing_poses(search, frames, found) if among is None else proven_poses(found)

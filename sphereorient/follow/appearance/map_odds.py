@@ -73,43 +73,37 @@ def pose_log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor
     return odds.clamp(0.0, MOST)
 
 
-def map_odds(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]) -> MapOdds:
+def map_odds(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses], *, only: bool) -> MapOdds:
     """Compare what the map explains of n x C pictures at their best poses with what it explains when they are mirrored.
-    A disk without a pose is looked at where its outline is.
+    `only`: of an only ball the outline says where several cameras see it, since one that is mirrored spoils the pose of
+    all; without a pose it always does.
     """
-    views = search.fitter.views
+    views, radius_mm = search.fitter.views, search.fitter.radius_mm
     alone = [replace(search, fitter=search.fitter.of(k), known=None, least=0.0) for k in range(len(views))]
 
-    def compared(pair: tuple[Sequence[Frame], Poses]) -> list[tuple[float, float]]:
-        return [_compared(search, one, k, *pair) for k, one in enumerate(alone)]
+    def compared(shots: Sequence[Frame], poses: Poses, k: int) -> tuple[float, float]:
+        if not shots[k].usable:
+            return math.nan, math.nan
+        view, picture = views[k], shots[k].picture
+        posed, several = len(poses) > 0 and bool(poses.use[k]), len(views) > 1
+        disk = search.outline(picture, view)[0] if not posed or (only and several) else None
+        if posed and disk is None:
+            X = poses.position_lab_mm[:1]
+            (u, v), size = view.camera.project(X)[0].tolist(), float(view.radius_px(X, radius_mm))
+            disk = Outline(u_px=u, v_px=v, radius_px=size, rms_px=PLACE_SHARE * size, coverage=1.0)
+        if disk is None:
+            return math.nan, math.nan
+        score = float(poses.score[0, k]) if posed else -1.0
+        if not posed or several:
+            score = max(score, _best_score(alone[k], picture, disk))
+        return score, _best_score(alone[k], *_mirrored(picture, disk))
 
-    rows = list(side_by_side(compared, zip(frames, found, strict=True)))
+    def of_frame(pair: tuple[Sequence[Frame], Poses]) -> list[tuple[float, float]]:
+        return [compared(*pair, k) for k in range(len(views))]
+
+    rows = list(side_by_side(of_frame, zip(frames, found, strict=True)))
     score, mirrored = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(views), 2).unbind(-1)
     return MapOdds(score=score, mirrored=mirrored)
-
-
-def _compared(
-    search: Initialiser, alone: Initialiser, k: int, shots: Sequence[Frame], poses: Poses
-) -> tuple[float, float]:
-    """Return the scores of camera `k`, of its picture and of the mirrored one."""
-    view, shot = search.fitter.views[k], shots[k]
-    if not shot.usable:
-        return math.nan, math.nan
-    seen = len(poses) > 0 and bool(poses.use[k])
-    if seen:
-        X = poses.position_lab_mm[:1]
-        (u, v), radius_px = view.camera.project(X)[0].tolist(), float(view.radius_px(X, search.fitter.radius_mm))
-        disk: Outline | None = Outline(
-            u_px=u, v_px=v, radius_px=radius_px, rms_px=PLACE_SHARE * radius_px, coverage=1.0
-        )
-    else:
-        disk, _ = search.outline(shot.picture, view)
-    if disk is None:
-        return math.nan, math.nan
-    score = float(poses.score[0, k]) if seen else -1.0
-    if not seen or len(shots) > 1:
-        score = max(score, _best_score(alone, shot.picture, disk))
-    return score, _best_score(alone, *_mirrored(shot.picture, disk))
 
 
 def _best_score(alone: Initialiser, picture: Picture, disk: Outline) -> float:
@@ -134,4 +128,6 @@ def _percent(score: Tensor) -> list[str]:
 
 def _told(log_odds: Tensor) -> str:
     odds = math.exp(min(float(log_odds), MOST))
-    return f"{odds:,.0f} to 1" if odds > LEAST_ODDS else f"{odds:.1f} to 1"
+    if odds < LEAST_ODDS:
+        return f"{odds:.1f} to 1"
+    return f"{'over ' if log_odds >= MOST else ''}{odds:,.0f} to 1"
