@@ -115,9 +115,9 @@ class Smaller:
     def __init__(self, proposer: Proposer, size_px: int) -> None:
         self._proposer, self.size_px = proposer, size_px
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose for (F, S, S) disks."""
-        return self._proposer.propose(resized(disks, self._proposer.size_px))
+        return self._proposer.propose(resized(disks, self._proposer.size_px), least)
 
 
 class Remembering:
@@ -128,10 +128,10 @@ class Remembering:
         self._asked: Tensor | None = None
         self._answer = Candidates.none(())
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose for (F, S, S) disks."""
         if disks is not self._asked:
-            self._answer, self._asked = self._proposer.propose(disks), disks
+            self._answer, self._asked = self._proposer.propose(disks, least), disks
         return self._answer
 
 

@@ -49,6 +49,7 @@ class Initialiser:
     candidates: int  # proposals of each camera that are fitted
     score_min: float = 0.0  # where no picture is explained this well, other outlines are tried
     finalists: int = 2  # poses that are fitted to all detail
+    least: float | None = None  # score of proposals; None: as the proposer's settings say
     # What was found in pictures looked at before, by id, whatever the fitter; None: none of them is looked at again.
     known: dict[tuple[int, Hashable], tuple[Picture, Any]] | None = None
 
@@ -218,7 +219,9 @@ class Initialiser:
             crop = crop_disk(picture, *disk.circle, one.size_px)
             crops.setdefault(id(one), []).append(torch.from_numpy(crop))
         proposers = {id(one): one for one in self.proposers.values()}
-        found = {each: iter(proposers[each].propose(torch.stack(some)).each()) for each, some in crops.items()}
+        found = {
+            each: iter(proposers[each].propose(torch.stack(some), self.least).each()) for each, some in crops.items()
+        }
         rows = []
         for k, _, disk in disks:
             view = self.fitter.views[k]

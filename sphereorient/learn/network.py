@@ -231,8 +231,8 @@ class LearnedProposer(DiskSearch):
             self._bank = correlator.bank(map_blurs(texture.float()[None], correlator.settings.nodes)[0])
 
     @torch.inference_mode()
-    def propose(self, disks: Tensor) -> Candidates:
-        """Propose orientations in the view frames of disks, with `score_of` their probability.
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
+        """Propose orientations in the view frames of disks, with `score_of` their probability; `least` is of templates.
         A uniform disk has no proposals (`LOW_SCORE`); raise ShapeError for disks of another size.
         """
         check_disks(disks, self.size_px, self.size_px)

@@ -36,11 +36,11 @@ from sphereorient.trajectory import Trajectory
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
 SCHEMA_OF_POSES = "sphereorient-poses/1"
 SCORES, WHETHER = ("score_min", "right_score", "usual_apart_rad"), ("together", "second_ball", "sharper")
-OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn")  # fields that `Learnt` shares with it
+OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn", "map_log_odds")  # fields that `Learnt` shares with it
 BLURS = ("blur_px", "limb_blur_px", "still_blur_px", "still_limb_blur_px")
 # Fields that are attributes of the file, and their types; tensors are datasets.
 KINDS: dict[str, Callable[[Any], Any]] = {
-    **dict.fromkeys((*SCORES, *BLURS, "most_hidden", "widest_px", "acceleration_rad_s2"), float),
+    **dict.fromkeys((*SCORES, *BLURS, "most_hidden", "widest_px", "acceleration_rad_s2", "map_log_odds"), float),
     **dict.fromkeys(WHETHER, bool),
     "instants": int,
     "majority": lambda cameras: tuple(map(int, cameras)),
@@ -73,6 +73,7 @@ class Learnt:
     second_ball: bool = False
     sharper: bool = False
     worn: torch.Tensor | None = None  # see `Appearance`
+    map_log_odds: float | None = None  # see `Appearance`
     process: ProcessNoise | None = None  # None: no track yet, or too short a one
     acceleration_rad_s2: float | None = None  # that the path was chosen with
 

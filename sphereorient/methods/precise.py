@@ -109,6 +109,7 @@ def joined(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Trajecto
     # The mean variance over the axes: false candidates are degrees away.
     variance = table.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).mean(-1)
     chosen: Chosen = PathLayer(2, settings=path)(table.R_lab_body, -table.nll, clock, variance, table.mask)
+    chosen = results.with_map_odds(chosen, table, appearance.map_log_odds, path.probability_min)
     picked = table.rows(chosen.choice)
     poses = motion.MeasuredPoses(
         time_s=clock,

@@ -1,5 +1,6 @@
 """From the stages' results to the trajectory, one function for each method."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,6 +19,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import Recording
 from sphereorient.follow import Appearance
 from sphereorient.follow.appearance import LOOK_ALIKE
+from sphereorient.follow.appearance.map_odds import pose_log_odds
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of, in_middle
@@ -43,6 +45,10 @@ WORN = (
 CODED = (
     "grey levels of {name} are not proportional to the light: {found} was learnt; "
     "write `response:` where it is known (docs/movies.md)"
+)
+RUNAWAY = (
+    "nearly every orientation explains each of {pictures} frames looked at equally well: method paper expects black "
+    "and white paint in even light; try `--method precise`"
 )
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
@@ -181,9 +187,6 @@ def precise_track(
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
-    segment = chosen.segment.numpy()
-    number, count = np.unique(segment[segment >= 0], return_counts=True)
-    alone = np.isin(segment, number[count == 1])  # in its segment: no other frame confirms its pose
     return replace(
         track,
         position=track.position - move_mm.numpy(),
@@ -191,11 +194,31 @@ def precise_track(
         orientation=smoothed.R_given_path.numpy(),
         orientation_cov=smoothed.cov_given_path_rad2.numpy(),
         **datasets_of(smoothed, experiment.length_unit),
-        segment=segment,
+        segment=chosen.segment.numpy(),
         flags=track.flags | flags.numpy().astype(np.uint32),
         provenance=told,
-        confidence=np.where(alone, np.nan, chosen.probability.numpy()),
+        confidence=chosen.probability.numpy(),
     )
+
+
+def with_map_odds(chosen: Chosen, table: PoseTable, map_log_odds: float | None, least: float) -> Chosen:
+    """Return choices whose probability holds the odds of the map. Where a frame is the only one of its segment no other
+    one confirms its pose: there also those against the next pose by the scores, and NaN where the map's are not known.
+    Less than `least` is ambiguous.
+    """
+    number, count = np.unique(chosen.segment[chosen.present].numpy(), return_counts=True)
+    alone = torch.from_numpy(np.isin(chosen.segment.numpy(), number[count == 1])) & chosen.present
+    against = torch.full_like(chosen.probability, torch.nan if map_log_odds is None else math.exp(-map_log_odds))
+    confidence = torch.where(
+        alone | torch.isfinite(against), 1 / (1 / chosen.probability + against), chosen.probability
+    )
+    for n in torch.nonzero(alone)[:, 0].tolist():
+        score, others = table.score[n][:, table.use[n]], table.mask[n].clone()
+        others[chosen.choice[n]] = False
+        rivals = pose_log_odds(score[chosen.choice[n]], score[others]).sum(-1)
+        confidence[n] = 1 / (1 + against[n] + torch.exp(-rivals).sum())
+    ambiguous = torch.where(confidence < least, int(Flag.AMBIGUOUS), 0)
+    return replace(chosen, probability=confidence, flags=chosen.flags | ambiguous)
 
 
 def with_errors(
@@ -222,9 +245,11 @@ def missed_text(track: Trajectory) -> list[str]:
     for name, lost in track.summary()["lost"].items():
         pictures = len(track) - lost.pop(Reason.MISSING, 0)
         usual = next(iter(lost), None)
-        if usual not in MISSED or sum(lost.values()) < pictures:
+        if usual not in (*MISSED, Reason.RUNAWAY) or sum(lost.values()) < pictures:
             continue
         text = f"no ball found in {pictures} frames looked at"
+        if usual == Reason.RUNAWAY:
+            text = RUNAWAY.format(pictures=pictures)
         if usual == Reason.LOW_SCORE:
             text = f"no pose of the map explains any of {pictures} frames looked at"
             text += "" if track.valid.any() else f"; {LOOK_ALIKE}"

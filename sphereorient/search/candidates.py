@@ -118,8 +118,10 @@ class Proposer(Protocol):
     def size_px(self) -> int:
         """Side of the disks, px."""
 
-    def propose(self, disks: Tensor) -> Candidates:
-        """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk."""
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
+        """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk. `least`: in
+        place of `score_min` of templates.
+        """
 
     def likeness(self, disks: Tensor) -> Tensor:
         """Return how much disks (F, S, S) look like the ball in its best orientation, (F,); cheaper than `propose`."""
@@ -138,7 +140,7 @@ class DiskSearch(nn.Module, ABC):
     size_px: int
 
     @abstractmethod
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
 
     def likeness(self, disks: Tensor) -> Tensor:
@@ -166,12 +168,12 @@ class FallbackProposer:
         self._first, self._second, self._sure = first, second, sure
         self.size_px = first.size_px
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
-        first = self._first.propose(disks)
+        first = self._first.propose(disks, least)
         found, doubt = first.each(), torch.nonzero(first.best_score < self._sure)[:, 0].tolist()
         if doubt:
-            more = self._second.propose(resized(disks[doubt], self._second.size_px))
+            more = self._second.propose(resized(disks[doubt], self._second.size_px), least)
             for f, other in zip(doubt, more.each(), strict=True):
                 found[f] = interleaved(other, found[f])
         return Candidates.joined(found)

@@ -80,17 +80,18 @@ class GreySearch(DiskSearch):
         scale = 127.0 / DEVIATIONS * math.sqrt(self._pixels)
         return (torch._int_mm(steps, self.bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
         The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
-        the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
+        the paint explains. A disk below `least` (None: `score_min`) has no proposal (`LOW_SCORE`).
         Raises ShapeError (the disks are of another size).
         """
         check_disks(disks, self.size_px, self.size_px)
         found = ((some, *self.search(some)) for some in torch.split(disks, PRODUCT))
         each = (one for some in found for one in zip(*some, strict=True))
-        most = self._settings.peaks
-        return Candidates.joined([self._refined(disk, self.templates[at[peak][:most]]) for disk, at, peak in each])
+        most, least = self._settings.peaks, self._settings.score_min if least is None else least
+        rows = (self._refined(disk, self.templates[at[peak][:most]], least) for disk, at, peak in each)
+        return Candidates.joined(list(rows))
 
     def likeness(self, disks: Tensor) -> Tensor:
         """Return the correlation of disks (F, S, S) with the template most like each, (F,)."""
@@ -109,14 +110,14 @@ class GreySearch(DiskSearch):
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
         return torch.cat([to_int8(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
 
-    def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
+    def _refined(self, disk: Tensor, starts: Tensor, least: float) -> Candidates:
         """Refine the peaks of one disk; return its proposals, best first."""
         settings = self._settings
         R, score = refine_rotation(self._rough, disk, starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]
         R, score = refine_rotation(self._fine, disk, R, settings.fine_steps)
         chosen = self._distinct(R, score)
-        chosen = chosen[score[chosen] >= settings.score_min]
+        chosen = chosen[score[chosen] >= least]
         return Candidates.of_disk(so3.nearest_rotation(R[chosen].double()), score[chosen].double())
 
     def _distinct(self, R: Tensor, score: Tensor) -> Tensor:

@@ -178,16 +178,18 @@ class TemplateBank(DiskSearch):
         T: Tensor = 0.5 + half @ self.bank.T / (2 * STEPS * half.shape[-1])
         return T.reshape(*paint.shape[:-2], len(self.bank))
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose the best orientation of each group for disks (F, S, S) float32, whose outlines touch the borders.
-        A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `score_min` (`LOW_SCORE`).
+        A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `least`, None: `score_min`
+        (`LOW_SCORE`).
 
         Raises:
             ShapeError: the disks are of another size.
         """
         check_disks(disks, self.size_px, self.size_px)
         batches = torch.split(self.paint(disks), BATCH) if len(disks) else ()
-        return Candidates.joined([self._proposals(paint) for paint in batches])
+        least = self._settings.score_min if least is None else least
+        return Candidates.joined([self._proposals(paint, least) for paint in batches])
 
     def groups(self, T: Tensor) -> Tensor:
         """Return the group (F, K) int64 of each possible orientation by T (F, K), 0 about the best; -1: not possible.
@@ -205,7 +207,7 @@ class TemplateBank(DiskSearch):
             left = left & ~member
         return group
 
-    def _proposals(self, paint: Tensor) -> Candidates:
+    def _proposals(self, paint: Tensor, least: float) -> Candidates:
         """Return the candidates of some disks, best first."""
         frames, most = len(paint), self._settings.groups_max
         group = self.groups(self.score(paint))
@@ -225,7 +227,7 @@ class TemplateBank(DiskSearch):
         order = T.argsort(dim=-1, descending=True, stable=True)
         T, views = T.gather(-1, order), views.gather(1, order[..., None, None].expand_as(views))
         # Two groups may reach one rotation: keep the better of those within two fine steps.
-        kept = (self._settings.score_min <= T) & distinct(views, 2 * math.radians(self._settings.fine_step_deg))
+        kept = (least <= T) & distinct(views, 2 * math.radians(self._settings.fine_step_deg))
         states = zip(runaway.tolist(), kept.any(-1).tolist(), strict=True)
         return Candidates(
             offset=F.pad(kept.sum(-1).cumsum(0), (1, 0)),

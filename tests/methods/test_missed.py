@@ -33,6 +33,12 @@ def test_a_map_that_fits_no_frame_of_any_camera_is_told_once_with_what_may_look_
     assert "another map" in text
 
 
+def test_frames_that_nearly_every_orientation_explains_are_told_with_the_other_method():
+    (text,) = told([Reason.RUNAWAY] * FRAMES, [Reason.RUNAWAY] * FRAMES)
+    assert text.startswith("cam1, cam2: nearly every orientation")
+    assert "precise" in text
+
+
 def test_where_another_camera_measures_the_map_is_not_doubted():
     (text,) = told(ALL, [Reason.LOW_SCORE] * FRAMES)
     assert "no pose of the map" in text

@@ -36,7 +36,7 @@ class Planted:
     def __init__(self, answers: dict[int, list[tuple[float, float]]], size_px: int = 4) -> None:
         self.answers, self.size_px, self.asked = answers, size_px, []
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         assert disks.shape[1:] == (self.size_px, self.size_px)
         keys = [round(float(disk[0, 0])) for disk in disks]
         self.asked += keys

@@ -14,6 +14,7 @@ from sphereorient.follow.appearance.light import (
     lit_in_the_lab,
     without_occluders,
 )
+from sphereorient.follow.appearance.map_odds import FEW, map_odds
 from sphereorient.follow.appearance.presence import (
     NO_BETTER,
     explained,
@@ -55,7 +56,7 @@ def estimate_appearance(
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
-    search, found, sample = _chosen(for_blur(first), frames, among)
+    search, found, sample, odds = _chosen(for_blur(first), frames, among)
     given = settings.blur_px is not None
     others = None if among is None else among.neighbours.of(sample.frame)
     pictures = [[shot.picture for shot in frames[k]] for k in sample.frame]
@@ -97,17 +98,24 @@ def estimate_appearance(
         sharper=sharper,
         second_ball=second_ball(search, sure, len(frames)),
         worn=worn,
+        map_log_odds=odds,
     )
 
 
 def _chosen(
     search: Initialiser, frames: Sequence[Sequence[Frame]], among: Among | None
-) -> tuple[Initialiser, list[Poses], ProvenPoses]:
-    """Return the search, the poses of all frames, and those of them that are studied."""
-    if among is not None:
-        return search, list(among.found), proven_poses(among.found)
-    search, found = find_poses(search, frames)
-    return search, found, agreeing_poses(search, frames, found)
+) -> tuple[Initialiser, list[Poses], ProvenPoses, float | None]:
+    """Return the search, the poses of all frames, those of them that are studied, and the map's log odds, None where
+    there are more than a few frames.
+    """
+    search, found = find_poses(search, frames) if among is None else (search, list(among.found))
+    log_odds = None
+    if len(frames) <= FEW:
+        odds = map_odds(search, frames, found, only=among is None)
+        odds.check([view.name for view in search.fitter.views], found=bool(proven(found)))
+        log_odds = float(odds.log_odds.sum())
+    sample = agreeing_poses(search, frames, found) if among is None else proven_poses(found)
+    return search, found, sample, log_odds
 
 
 def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:

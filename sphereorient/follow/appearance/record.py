@@ -38,6 +38,7 @@ class Appearance:
     majority: tuple[int, ...] = ()  # if not, the cameras that do, more than half of all; empty: none
     second_ball: bool = False  # whether another sphere with this texture is in view
     sharper: bool = False  # whether the pictures are clearly sharper than the exposure allows
+    map_log_odds: float | None = None  # that the map is right, by the pictures of a few frames; None: of many frames
     worn: Tensor | None = None  # where the paint differs from the map and is not used, see `worn_cells`; None: nowhere
 
     def of(self, *cameras: int) -> "Appearance":

@@ -101,14 +101,14 @@ class DotSearch(DiskSearch):
         self._weight = view.normal_view[:, 2].square() * rim_share(size)[view.inside]
         self._radius = math.radians(table.radius_deg) * CORE
 
-    def propose(self, disks: Tensor) -> Candidates:
+    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose attitudes; see `GreySearch.propose`.
 
         Returns:
             Candidates, best first; the score is 1 where all dark is dots and all dots are visible, 1/2 where a ball
             without dots would explain as much.
         """
-        found = self._search.propose(disks)
+        found = self._search.propose(disks, least)
         score, order = torch.zeros_like(found.score), torch.arange(len(found.score))
         for f, disk in enumerate(disks):
             rows = slice(int(found.offset[f]), int(found.offset[f + 1]))
