@@ -39,7 +39,7 @@ class Response:
         return "srgb" if self.srgb else "linear" if self.linear else f"gamma {self.gamma:.3g}"
 
 
-LINEAR = Response()
+LINEAR, SRGB = Response(), Response(srgb=True)
 
 
 @lru_cache(maxsize=16)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
-from sphereorient.cameras.response import Response
+from sphereorient.cameras.response import SRGB, Response
 from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
 from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths, refused
 from sphereorient.experiment.timeline import NONE, Rows, Timeline, timeline
@@ -226,6 +226,7 @@ class Recording:
         return replace(self, timeline=grid, streams=streams), place
 
 
+TAKEN_FOR_CODED = "a photograph, taken for gamma-coded; write response: linear if its grey levels are the light"
 NO_MAP = TextureMap(grey=torch.empty(0, 0))
 
 
@@ -241,6 +242,9 @@ def open_recording(
     loaded = {path: load_map(path) for path in dict.fromkeys(paths.values())}
     movies = open_movies(experiment, _chosen(experiment, cameras))
     frames = timeline(experiment, movies)
+    photographs = [name for name, movie in movies.items() if movie.photographs and len(movie) == 1]
+    coded = [name for name in photographs if name not in experiment.response]
+    experiment = replace(experiment, response=dict.fromkeys(coded, SRGB) | experiment.response)
     streams = []
     for name, movie in movies.items():
         shown = given_mask(experiment, name, movie.frame_shape)
@@ -254,6 +258,7 @@ def open_recording(
         if one.unseen is not None
     ]
     remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
+    remarks += [f"{movies[name].path}: {TAKEN_FOR_CODED}" for name in coded]
     yield Recording(
         experiment=experiment,
         streams=streams,

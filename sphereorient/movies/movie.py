@@ -29,6 +29,7 @@ class Movie:
     dtype: np.dtype[Any]  # uint8, or uint16 where the file holds more than 8 bits; values are not rescaled
     times_s: NDArray[np.float64] | None = None  # (N,), s, exact time stamps of the file; None: none, or rounded (MKV)
     played_hz: float | None = None  # rate at which players show it; that of the recording only of an ordinary camera
+    photographs: bool = False  # whether these are picture files of 8 bits, as ordinary cameras write them
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
 
     def __init__(self, path: Path, form: str, count: int, frame_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
@@ -109,6 +110,7 @@ class FlippedMovie(Movie):
         super().__init__(movie.path, movie.format, len(movie), movie.frame_shape, movie.dtype)
         self.times_s, self.played_hz = movie.times_s, movie.played_hz
         self.remarks = (*movie.remarks, f"flipped on reading: {how}")
+        self.photographs = movie.photographs
         self._movie, self._how = movie, how
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:

@@ -41,6 +41,7 @@ class SequenceMovie(Movie):
         suffix = self._files[0].suffix.lower()
         form = f"{len(numbers)} pictures, {suffix[1:]}"
         super().__init__(path, form, count, (picture.shape[0], picture.shape[1]), picture.dtype)
+        self.photographs = self.dtype == np.uint8 and suffix not in TIFF
         self.remarks = (
             *_number_remarks(numbers, step, count),
             *([COLOUR_REMARK] if colour else []),

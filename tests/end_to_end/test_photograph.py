@@ -19,6 +19,7 @@ from sphereorient import so3
 from sphereorient.cameras import load_cameras
 from sphereorient.cli import app
 from sphereorient.errors import CameraError, ExperimentError
+from sphereorient.experiment.recording import open_recording
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.scene import still_ball
 from sphereorient.movies import open_movie
@@ -62,6 +63,31 @@ def test_a_photograph_is_tracked_from_init_on(still, tmp_path):
     delta = so3.log(torch.from_numpy(track.orientation).double() @ truth.mT)[0].numpy()
     assert np.degrees(np.linalg.norm(delta)) < WITHIN_DEG
     assert delta @ np.linalg.solve(track.orientation_cov[0], delta) < SIGMAS**2
+
+
+@pytest.mark.parametrize(
+    ("suffix", "count", "given", "expected"),
+    [
+        (".png", 1, "", "srgb"),
+        (".jpg", 1, "", "srgb"),
+        (".png", 1, "response: linear\n", "linear"),
+        (".tif", 1, "", "None"),
+        (".png", 2, "", "None"),
+    ],
+)
+def test_one_picture_of_an_ordinary_camera_is_taken_for_gamma_coded(still, tmp_path, suffix, count, given, expected):
+    grey = cv2.imread(str(photograph(still)), cv2.IMREAD_GRAYSCALE)
+    (tmp_path / "movie").mkdir()
+    for k in range(count):
+        cv2.imwrite(str(tmp_path / "movie" / f"{k}{suffix}"), grey)
+    for name in ("cameras.yaml", "texture.png"):
+        shutil.copy(still / name, tmp_path)
+    keys = "cameras: cameras.yaml\nmovies: {cam1: movie}\nframe_rate: 1.0\n"
+    keys += "sphere: {diameter: 18.0, texture: texture.png}\n"
+    (tmp_path / "experiment.yaml").write_text(f"schema: sphereorient-experiment/1\n{keys}{given}")
+    with open_recording(tmp_path / "experiment.yaml") as recording:
+        assert str(recording.streams[0].response) == expected
+        assert any("gamma-coded; write" in remark for remark in recording.remarks) == (expected == "srgb")
 
 
 @pytest.mark.parametrize("share", [0.4, 0.7, 0.9])
