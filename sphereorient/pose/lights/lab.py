@@ -23,7 +23,8 @@ from sphereorient.pose.model import (
 )
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import learn_stray, noise_curves, residuals
+from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves, residuals
+from sphereorient.so3 import inverse_damped
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import polynomials
@@ -165,8 +166,8 @@ def lab_lights(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, first: LabLight | None = None
 ) -> Iterator[LabLight]:
     """Yield the light and the noise of the fits of B * C disks, those of `use` (B, C) bool, estimated half-way and at
-    the end. Gauss-Newton at the fits' poses from the first light, None: an even one as bright as that of the model; the
-    light of each frame may differ a little, as its tints do in the fit.
+    the end. Gauss-Newton from the first light, None: an even one as bright as that of the model; each frame's light may
+    differ a little, as its tints do in the fit, and its pose may change: a light at given poses favours them.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
     used = use.reshape(-1, 1)
@@ -175,7 +176,7 @@ def lab_lights(
     light, rounds = (_flat(model.light, at.view, pixels, use), ROUNDS) if first is None else (first, AGAIN)
     light = replace(light, stray=learn_stray(at, pixels, use, light.stray))
     for done in range(1, rounds + 1):
-        light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
+        light = _better(light, at, pixels, used, bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
         if done in (rounds // 2, rounds):
@@ -218,17 +219,18 @@ def _flat(known: Light, view: SphereView, pixels: Pixels, use: Tensor) -> LabLig
 
 
 def _better(
-    light: LabLight, view: SphereView, pixels: Pixels, precision: Tensor, bases: tuple[Tensor, Tensor, Tensor]
+    light: LabLight, at: Residuals, pixels: Pixels, used: Tensor, bases: tuple[Tensor, Tensor, Tensor]
 ) -> LabLight:
-    """Return the light after one step of Gauss-Newton; precision (L, P)."""
-    unit = float(light.difference[0])
+    """Return the light after one step of Gauss-Newton; `used` (L, 1) bool."""
+    unit, view, precision = float(light.difference[0]), at.view, (at.weight / at.variance).where(used, 0.0)
+    cameras = len(light.gain)
     tied = torch.tensor([TINT[0]] + [TINT[1]] * 2 + [TINT[2]] * 3 + [unit * SHADE[0]] + [unit * SHADE[1]] * 2)
     unknown = [getattr(light, name) for name in UNKNOWN]
     now, sizes = torch.cat(unknown).double(), [len(part) for part in unknown]
     normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
     difference, black, gloss, through, mirrored = light.shown(view, pixels)
     shown, ground = light.at(view, pixels)
-    cover = view.coverage * light.gain.repeat(len(gloss) // len(light.gain))[:, None]
+    cover = view.coverage * light.gain.repeat(len(gloss) // cameras)[:, None]
     learnt = view.coverage * (view.paint * shown + ground)
     left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
     tints = polynomials(view.across, 2)
@@ -236,27 +238,39 @@ def _better(
     counts = (precision > 0).any(1)
     factor = torch.zeros(len(left), len(now) + 1, dtype=torch.float64)
 
-    def of_disk(k: int) -> tuple[int, Tensor, Tensor]:
+    def of_disk(k: int) -> tuple[Tensor, Tensor, Tensor]:
         over_normal, over_mirror, over_depth = (basis[k] for basis in bases)
         scattered = (cover[k] * through[k]) * over_normal
         columns = [view.paint[k] * scattered, scattered, (cover[k] * mirrored[k]) * over_mirror]
         columns += [(cover[k] * part) * over_depth for part in (view.paint[k] * difference[k] + black[k], gloss[k])]
-        whole = torch.cat([*columns, left[k : k + 1]])
-        weighted, own_weighted = whole * precision[k], own[k] * precision[k]
-        sums, mixed = (weighted @ whole.T).double(), (own_weighted @ whole.T).double()
-        taken = torch.linalg.solve((own_weighted @ own[k].T).double() + tied.double().pow(-2).diag(), mixed)
-        return k, sums - mixed.T @ taken, taken[0]
+        whole, others = torch.cat([*columns, left[k : k + 1]]), torch.cat([own[k], at.design[k, :6]])
+        weighted, own_weighted = whole * precision[k], others * precision[k]
+        return (weighted @ whole.T).double(), (own_weighted @ whole.T).double(), (own_weighted @ others.T).double()
 
-    # A few disks at a time: the columns of all would fill the memory.
-    for k, sums, own_part in side_by_side(of_disk, counts.nonzero()[:, 0].tolist()):
-        factor[k] = own_part
+    def of_pose(b: int) -> tuple[int, Tensor, Tensor]:
+        """The cameras of a pose share it, and each has a light of its own."""
+        tints, count = len(tied), cameras * len(tied)
+        sums, mixed = torch.zeros(len(now) + 1, len(now) + 1).double(), torch.zeros(count + 6, len(now) + 1).double()
+        others = torch.cat([tied.double().pow(-2).repeat(cameras), torch.zeros(6)]).diag()
+        for c in range(cameras):
+            place = torch.cat([torch.arange(tints) + c * tints, torch.arange(6) + count])
+            more, more_mixed, more_others = of_disk(b * cameras + c)
+            sums += more
+            mixed[place] += more_mixed
+            others[place[:, None], place] += more_others
+        taken = inverse_damped(others) @ mixed
+        return b, sums - mixed.T @ taken, taken[:count:tints]
+
+    # A few poses at a time: the columns of all would fill the memory.
+    for b, sums, own_part in side_by_side(of_pose, by_pose(counts, cameras).any(1).nonzero()[:, 0].tolist()):
+        factor[b * cameras : (b + 1) * cameras] = own_part
         normal += sums[:-1, :-1]
         right += sums[:-1, -1]
     expected, deviation = _beforehand(unit)
     known = deviation.double() ** -2
     step = torch.linalg.solve(normal + known.diag(), right + known * (expected - now))
     # What all frames of a camera share of their own factor is the camera's gain.
-    own_factor, cameras = factor[:, -1] - factor[:, :-1] @ step, len(light.gain)
+    own_factor = factor[:, -1] - factor[:, :-1] @ step
     shared = by_pose(own_factor, cameras).sum(0) / by_pose(counts, cameras).sum(0).clamp_min(1)
     gain = light.gain * (1.0 + shared).float()
     return replace(light, gain=gain, **dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True)))
