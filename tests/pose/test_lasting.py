@@ -30,7 +30,6 @@ from sphereorient import so3
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.lasting import Lasting, lasting_errors, limb_wider_px, of_left_out
-from sphereorient.pose.lights.disk import no_glints
 from sphereorient.pose.poses import FittedPoses, PoseStart
 
 COUNT, SIGMA = 24, 4.0
@@ -55,8 +54,7 @@ def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, 
     fit = fitted(RIG, "patches", pixels, X, R, SIGMA)
     model, use = model_of(RIG.table("patches"), SIGMA), torch.ones(count, 2, dtype=torch.bool)
     for _ in range(2):
-        light = model.light.learnt(pixels, fit, use, model)
-        model = replace(model, light=light if glints else replace(light, glints=no_glints(2)))
+        model = replace(model, light=model.light.learnt(pixels, fit, use, model, glints=glints))
         begin = PoseStart(fit.position_lab_mm, fit.R_lab_body, use)
         fit = refined(pixels, begin, model, 3)
     found = lasting_errors(pixels, fit, use, model)

@@ -253,6 +253,8 @@ def _better(
         sums, mixed = torch.zeros(len(now) + 1, len(now) + 1).double(), torch.zeros(count + 6, len(now) + 1).double()
         others = torch.cat([tied.double().pow(-2).repeat(cameras), torch.zeros(6)]).diag()
         for c in range(cameras):
+            if not bool(counts[b * cameras + c]):
+                continue
             place = torch.cat([torch.arange(tints) + c * tints, torch.arange(6) + count])
             more, more_mixed, more_others = of_disk(b * cameras + c)
             sums += more
