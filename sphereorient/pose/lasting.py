@@ -17,6 +17,7 @@ from sphereorient.so3 import inverse_damped, solve_damped
 
 TILES = 4  # along each axis of the disk: errors of light are wide
 DARKEST = 0.5  # grey levels; darker places tell no power of their light
+LIMB_PX = 0.04  # standard deviation of the limb's place over 23 movies of one camera (scripts/stated_errors.py)
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
 
 
@@ -81,9 +82,12 @@ def lasting_errors(
 
     together = of_left_out(*_joined(normal, right, ridge))[:6, :6]
     own = by_each([0, 1, 2, *range(6, 6 + others)], 3)
-    # One camera does not tell the place of its limb from the distance.
-    alone = by_each([k for k in range(6 + others) if k != limb], 6)
-    return Lasting(covariance=together, own_rad2=own, alone=alone)
+    # One camera does not tell the place of its limb from the distance: what is known of it is its spread over movies.
+    free = [k for k in range(6 + others) if k != limb]
+    alone = by_each(free, 6)
+    whole = normal.sum(1) + ridge
+    by_limb = solve_damped(whole[:, free][..., free], whole[:, free, limb])[:, :6]
+    return Lasting(covariance=together, own_rad2=own, alone=alone + LIMB_PX**2 * by_limb[:, :, None] * by_limb[:, None])
 
 
 def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> float:
