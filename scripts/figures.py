@@ -67,6 +67,11 @@ FIGURES: dict[str, Figure] = {
         command=f"accuracy.py {SHARED}/experiment {SHARED}/tank {SHARED}/gloss --benchmark out/robustness/results.json",
         tables=("accuracy", "stated"),
     ),
+    "stated-parts": Figure(
+        pages=("accuracy.md",),
+        command=f"stated_errors.py {SHARED} --stills 100",
+        tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
+    ),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls"),
     "reliability": Figure(pages=("robustness.md",), command="reliability.py"),

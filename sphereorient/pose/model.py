@@ -17,7 +17,8 @@ from sphereorient.sphere.view import polynomials
 
 UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
-LEAN_ORDER, LEAN_EVERY = 3, 4  # of the polynomials of the light's slope; n-th place suffices for it
+LEAN_ORDER = 3  # of the polynomials of the light's slope
+EVERY = 4  # n-th place suffices for numbers of a whole disk: they are in order of distance from its middle
 SHADOW, BRIGHT = 0.05, 0.9  # share of the bright light, a quantile over the disk, below which the limb is in shadow
 IN_SIGHT = 0.99  # coverage of a pixel that the limb does not cut
 DARKEST = 0.05  # of the brightest light of white paint: the logarithm of less has no use
@@ -102,7 +103,7 @@ class Light(ABC):
 
     def with_lean(self, view: SphereView, pixels: Pixels, use: Tensor) -> Self:
         """Return the light with its slopes and shadows as B * C disks, those of `use` (B, C) bool, show them."""
-        cameras, some = use.shape[1], slice(None, None, LEAN_EVERY)
+        cameras, some = use.shape[1], slice(None, None, EVERY)
         parts = (self.at(view, pixels)[0], view.coverage, view.across)
         difference, coverage, across = (part[..., some].double().nan_to_num() for part in parts)
         size = difference.abs().amax(1, keepdim=True).clamp_min(1e-6)

@@ -10,7 +10,16 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from sphereorient.pose.model import IN_SIGHT, SphereModel, SphereView, even_light, leaning, scene_beside, stray_basis
+from sphereorient.pose.model import (
+    EVERY,
+    IN_SIGHT,
+    SphereModel,
+    SphereView,
+    even_light,
+    leaning,
+    scene_beside,
+    stray_basis,
+)
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.view import sphere_view
@@ -21,7 +30,6 @@ TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfi
 KNOWN = 0.3  # least share of a disk that shows known paint
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 SMOOTH = 4  # order of the light and reflections that a disk without paint shows; as those of a first fit
-EVERY = 4  # n-th place suffices for numbers of a whole disk: they are in order of distance from its middle
 OUTLIERS = 4.0  # times the variance of the disk, beyond which a square counts alike
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it

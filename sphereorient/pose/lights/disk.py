@@ -7,7 +7,16 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sphereorient.pose.model import Light, LightTables, SphereModel, SphereView, by_pose, even_light, scene_beside
+from sphereorient.pose.model import (
+    IN_SIGHT,
+    Light,
+    LightTables,
+    SphereModel,
+    SphereView,
+    by_pose,
+    even_light,
+    scene_beside,
+)
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import Residuals, fitted_residuals, learn_stray, noise_curves
@@ -17,7 +26,6 @@ from sphereorient.sphere.view import polynomials
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
 GLINTS = 32  # cells across the disk
-WHOLE = 0.99  # coverage of a pixel that the limb does not cut
 RIDGE = 1e-5  # of light maps, relative to the diagonal
 
 
@@ -123,7 +131,7 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     cameras, cells = use.shape[1], GLINTS**2
     column, row = ((at.view.across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
     precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
-    inside = precision * (at.view.coverage > WHOLE)
+    inside = precision * (at.view.coverage > IN_SIGHT)
     others = at.design.double()
     parts = torch.cat([inside[:, None], (inside * at.residual)[:, None], inside[:, None] * others], dim=1)
     sums = parts.new_zeros(*parts.shape[:2], cells)
