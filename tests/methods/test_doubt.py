@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -17,13 +19,13 @@ from sphereorient.trajectory import Flag, Trajectory
 TURNED = 20  # frame
 
 
-def tracked(monkeypatch, change):
-    """The excerpt, with its measured poses changed before they are joined."""
+def tracked(monkeypatch, change, **known):
+    """The excerpt, with its measured poses changed before they are joined, and what is known of its pictures."""
     joined = precise.joined
 
     def changed(job, appearance, table):
         change(table)
-        return joined(job, appearance, table)
+        return joined(job, replace(appearance, **known), table)
 
     monkeypatch.setattr(precise, "joined", changed)
     return run(Request(experiment=EXCERPT, settings=load_settings(None, SHORT)), MemoryStore())
@@ -42,15 +44,17 @@ def test_a_pose_that_the_frames_before_and_after_contradict_is_marked(monkeypatc
 
 
 @pytest.mark.slow
-def test_a_frame_alone_in_its_segment_has_no_confidence(monkeypatch):
+@pytest.mark.parametrize("log_odds", [None, 0.0, 14.0])
+def test_a_frame_alone_in_its_segment_has_the_confidence_of_its_map(monkeypatch, log_odds):
     def lose(table):
         lost = np.r_[0:TURNED, TURNED + 1 : len(table)]
         table.mask[lost], table.use[lost] = False, False
 
-    track = tracked(monkeypatch, lose)
+    track = tracked(monkeypatch, lose, map_log_odds=log_odds)
     assert track.valid.sum() == 1
     assert track.valid[TURNED]
-    assert np.isnan(track.confidence[TURNED])
+    expected = np.nan if log_odds is None else 1 / (1 + np.exp(-log_odds))
+    assert track.confidence[TURNED] == pytest.approx(expected, abs=1e-3, nan_ok=True)
 
 
 def test_a_track_tells_that_its_score_is_evidence_for_paint(tmp_path):
