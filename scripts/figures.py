@@ -69,8 +69,8 @@ FIGURES: dict[str, Figure] = {
     ),
     "stated-parts": Figure(
         pages=("accuracy.md",),
-        command=f"stated_errors.py {SHARED} --stills 100",
-        tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
+        command=f"stated_errors.py {SHARED} --only sets movies both",
+        tables=("stated-sets", "stated-one", "stated-two"),
     ),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls"),
