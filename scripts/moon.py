@@ -28,7 +28,7 @@ from sphereorient.errors import SphereOrientError
 from sphereorient.preflight.first_look import look_at
 from sphereorient.trajectory import Trajectory
 
-MOON_MM = 3474.8  # diameter of the Moon, km: the unit of length is free
+MOON_MM = 3474.8  # diameter of the Moon; here a mm stands for a km
 HEAD = (
     "| picture | phase, degrees | latitude, longitude | error, degrees | stated | over sigma | |\n" + 7 * "|---" + "|"
 )

@@ -215,6 +215,16 @@ static void rotation_by(const double *turn, double *to) {
             to[i * 3 + j] = (i == j) + a * cross[i * 3 + j] + b * (turn[i] * turn[j] - (i == j ? angle2 : 0));
 }
 
+/* The standard deviation of a disk's aperture, radii, of a sphere at a position. */
+static float blur_of(const Task *t, const double *position, int64_t k) {
+    double distance2 = 0;
+    for (int c = 0; c < 3; c++) {
+        const float to_centre = (float)(position[c] - (double)t->origin[(k * 3 + c) * t->origins]);
+        distance2 += (double)to_centre * to_centre;
+    }
+    return t->blur_px * (t->pitch_mm[k] + t->pitch_rad[k] * (float)sqrt(distance2)) / t->radius_mm;
+}
+
 /* Render a block of places at one instant, added to the disk with the instant's share; as `sphere_view`. */
 static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int64_t instant, int64_t from, int n) {
     const float share = t->shares[instant];
@@ -228,15 +238,12 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
     }
     const float *d[3], *origin = t->origin + k * 3 * t->origins, *axes = t->axes + k * 6;
     float R[3][3], centre[3], radius = t->radius_mm;
-    double distance2 = 0;
     for (int c = 0; c < 3; c++) {
-        const double first = position[c] - (double)origin[c * t->origins];
-        centre[c] = (float)first;
-        distance2 += (double)centre[c] * centre[c];
+        centre[c] = (float)(position[c] - (double)origin[c * t->origins]);
         d[c] = t->direction + (k * 3 + c) * t->places + from;
         for (int b = 0; b < 3; b++) R[c][b] = (float)turned[c * 3 + b];
     }
-    const float blur = t->blur_px * (t->pitch_mm[k] + t->pitch_rad[k] * (float)sqrt(distance2)) / radius;
+    const float blur = blur_of(t, position, k);
     float nearest[BLOCK], q0[BLOCK], edge[BLOCK], out[3][BLOCK], sight_b[3][BLOCK], out_b[3][BLOCK];
     float shape[EDGE_COLUMNS][BLOCK], q[BLOCK], seen[BLOCK], at[BLOCK], depth[BLOCK], normal[3][BLOCK];
     float value[BLOCK], radial[BLOCK], flat[3][BLOCK], turn[3][BLOCK], hidden[BLOCK];
@@ -484,13 +491,7 @@ static void lit_columns(const Task *t, const Disk *at, int64_t from, int n, floa
 /* Move the paint towards the light, as `leaning`. */
 static void lean(const Task *t, const Disk *at, const Sums *of, int64_t k) {
     const float *slope = t->lean + (k % t->cameras) * 2 * SLOPES, *axes = t->axes + k * 6;
-    double distance2 = 0;
-    for (int c = 0; c < 3; c++) {
-        const double to_centre = of->position[c] - (double)t->origin[(k * 3 + c) * t->origins];
-        distance2 += to_centre * to_centre;
-    }
-    const float blur_mm = t->blur_px * (t->pitch_mm[k] + t->pitch_rad[k] * (float)sqrt(distance2));
-    const float by = blur_mm * blur_mm / t->radius_mm;
+    const float blur = blur_of(t, of->position, k), by = t->radius_mm * blur * blur;
     float powers[TINTS][BLOCK];
     for (int64_t from = 0; from < t->places; from += BLOCK) {
         const int n = (int)(t->places - from < BLOCK ? t->places - from : BLOCK);

@@ -15,7 +15,6 @@ from sphereorient.pose.model import (
     IN_SIGHT,
     SphereModel,
     SphereView,
-    even_light,
     leaning,
     scene_beside,
     stray_basis,
@@ -209,7 +208,7 @@ def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Te
     beside = at.inside & ~pixels.clipped & (at.view.coverage < NO_SPHERE) & use.reshape(-1, 1)
     beside[:, : pixels.inner] = False
     cameras = use.shape[1]
-    found: Tensor = even_light(cameras)["stray"]
+    found = torch.zeros_like(known)
     stray_known = scene_beside(at.view, pixels, known) - pixels.behind  # less what the sphere's edge adds
     for camera in range(cameras):
         own = slice(camera, None, cameras)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from sphereorient import so3
 
 Floats = NDArray[np.float64]
-AT_POLE = 0.02  # cosine of theta_y below which the other two angles are not told apart
+AT_POLE = 0.02  # |cos theta_y| below which theta_x and theta_z turn about nearly the same axis
 
 
 def rotation_vectors(R: Floats) -> Floats:
