@@ -213,7 +213,7 @@ def _quadrature(instants: int) -> tuple[Tensor, Tensor]:
 
 @cache
 def _edge_table() -> Tensor:
-    """Return how the limb cuts an aperture at `EDGES` distances from -EDGE_MOST to EDGE_MOST, (n, 12) float32."""
+    """Return how the limb cuts an aperture at `EDGES` distances from -EDGE_MOST to EDGE_MOST, (n, 16) float32."""
     edge = torch.linspace(-EDGE_MOST, EDGE_MOST, EDGES, dtype=torch.float64)
     coverage, density, pull, variance = limb_shape(edge)
     z, moves = rim_shape(coverage[None], density[None])

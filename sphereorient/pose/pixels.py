@@ -19,7 +19,7 @@ VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 # Parts of `Pixels`, the places along their last axis.
 ALONG_PLACES = ("grey", "behind", "inside", "clipped", "direction")
 OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  # and those with an entry for each disk
-INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
+INNER = 0.67  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,12 +10,12 @@
 
 #define BLOCK 256
 #define LANES 16
-#define NODES 4       /* most look-ups of a pixel */
+#define NODES 6       /* most look-ups of a pixel */
 #define TINTS 15      /* monomials up to order 4 */
 #define SLOPES 10     /* the same up to order 3, of the light's slope */
 #define COLUMNS 36    /* 6 of the pose, and most coefficients of a frame's own light */
 #define HARMONICS 9
-#define EDGE_COLUMNS 12
+#define EDGE_COLUMNS (4 + 2 * NODES)
 #define EVERY 4       /* n-th place suffices for numbers of a whole disk: they are in order of distance */
 #define TWO_PI 6.283185307179586
 
@@ -296,7 +296,7 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
     const int nodes = outer ? NODES : 2;
     const float each = 1.0f / (float)nodes, side = (float)t->paint.side;
     for (int node = 0; node < nodes; node++) {
-        const float *moves = outer ? shape[8 + node] : shape[3], sign = node ? 1.0f : -1.0f;
+        const float *moves = outer ? shape[4 + NODES + node] : shape[3], sign = node ? 1.0f : -1.0f;
         if (outer)
             for (int i = 0; i < n; i++) at[i] = seen[i] + seen[i] * (q0[i] + blur * shape[4 + node][i] - seen[i]);
         else

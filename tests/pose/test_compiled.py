@@ -23,7 +23,7 @@ from refine_examples import (
 from sphereorient import so3
 from sphereorient.files.compiled import built_for
 from sphereorient.pose import compiled, fit
-from sphereorient.pose.lights.lab import lab_lights
+from sphereorient.pose.lights.lab import lab_light
 from sphereorient.pose.model import FIRST, LATER, SphereModel
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
 from sphereorient.sphere.texture import map_directions
@@ -64,7 +64,7 @@ def unseen_model(pixels) -> SphereModel:
 def learnt(pixels, *, lab: bool = False) -> SphereModel:
     model = model_of()
     given = pixels, compiled.refine(pixels, begin(), model, 6), torch.ones(10, 2, dtype=torch.bool), model
-    light = list(lab_lights(*given))[-1] if lab else model.light.learnt(*given)
+    light = lab_light(*given) if lab else model.light.learnt(*given)
     stray = torch.tensor([[3.0, 1, -1, 0.5, 0, 0, 0, 0.2, 0], [0.0] * 9])
     return model_of(light=replace(light, stray=stray), shading=LATER, limb_px=torch.tensor([0.02, -0.01]))
 

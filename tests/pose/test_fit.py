@@ -337,7 +337,7 @@ def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
     # They disagree by as much as they say.
     apart = (fit.own_turn[:, 0] - fit.own_turn[:, 1])[..., None]
     root = torch.linalg.cholesky(fit.own_covariance.sum(1))
-    assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
+    assert 0.65 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
 def test_what_a_camera_would_do_alone_is_what_it_fits_alone():

@@ -34,7 +34,7 @@ from sphereorient.pose.lights.lab import (
     directions,
     harmonics,
     knot_shares,
-    lab_lights,
+    lab_light,
 )
 from sphereorient.pose.model import FIRST, LATER, SphereModel, even_light, scene_beside, stray_basis
 from sphereorient.pose.pixels import Pixels
@@ -86,12 +86,6 @@ def test_knots_make_functions_that_are_linear_between_them():
 
 
 # --- a planted light
-
-
-def lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
-    """The last estimate."""
-    *_, light = lab_lights(pixels, fit, use, model)
-    return light
 
 
 def planted(cameras: int) -> LabLight:
@@ -149,7 +143,7 @@ def test_a_planted_light_is_found_again(cameras):
     # A slope over all frames of few cameras is nearly what their own light may have: its prior share stays unknown.
     for got, expected in zip(light.at(view, pixels), planted(cameras).at(view, pixels), strict=True):
         error = (got - expected)[within]
-        assert error.square().mean().sqrt() < 7.0
+        assert error.square().mean().sqrt() < 2.5
     at = residuals(pixels, X, R, None, replace(model, light=light, shading=LATER))
     assert float(at.residual[at.inside].square().mean()) == pytest.approx(SIGMA**2, rel=0.05)
     at = torch.tensor([1.0, 80.0, 80.0**2, 80.0**3])
@@ -321,8 +315,7 @@ def of_maps(rig: Rig, pixels: Pixels, X: Tensor, R: Tensor) -> tuple[Fitter, Fit
 def test_a_light_that_both_cameras_see_is_learnt_in_the_lab():
     rig, pixels, X, R, _ = pictures()
     maps, fit, use = of_maps(rig, pixels, X, R)
-    lit, again, rivals = lit_in_the_lab(maps, pixels, fit, use, preferred=True)
-    assert rivals is None
+    lit, again, _ = lit_in_the_lab(maps, pixels, fit, use)
     assert isinstance(lit.light, LabLight)
     first = fitter_of(rig)
     smooth = first.with_light_of(pixels, fit, use, glints=False)
@@ -343,24 +336,14 @@ def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
 def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
     rig, pixels, X, R, _ = pictures()
     maps, fit, use = of_maps(rig, pixels, X, R)
-    for name in ("ALIKE", "CHANGED"):
-        monkeypatch.setattr(kinds, name, math.inf)  # neither explains clearly more
-    lit, kept, rivals = lit_in_the_lab(maps, pixels, fit, use)
-    assert lit is maps
-    assert kept is fit
+    monkeypatch.setattr(kinds, "ALIKE", math.inf)
+    lit, _, rivals = lit_in_the_lab(maps, pixels, fit, use)
+    assert isinstance(lit.light, LabLight)
     one, other, held = rivals
     assert held.shape == (6, 2)
     assert not one.R_lab_body.equal(other.R_lab_body)
     off = [so3.geodesic_distance(part.R_lab_body, R[1::2]).max() for part in (one, other)]
     assert max(off) < 0.01
-
-
-def test_one_light_of_two_cameras_must_leave_clearly_less(monkeypatch):
-    rig, pixels, X, R, _ = pictures()
-    maps, fit, use = of_maps(rig, pixels, X, R)
-    monkeypatch.setattr(kinds, "CHANGED", 0.9)  # no light leaves a tenth
-    assert lit_in_the_lab(maps, pixels, fit, use)[0] is maps
-    assert isinstance(lit_in_the_lab(maps, pixels, fit, use, preferred=True)[0].light, LabLight)
 
 
 def test_few_poses_stay_with_maps():

@@ -51,7 +51,7 @@ def estimate_appearance(
     """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
     `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
     the motion while the shutter is open counts as blur. `among`: of several balls, with poses that are known; then
-    cameras that see another ball do not disagree, and one light in the lab counts where it explains about as much.
+    cameras that see another ball do not disagree.
 
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
@@ -76,8 +76,7 @@ def estimate_appearance(
         studied, sharper = with_motion(studied, search, sample.frame, following, others)
     check_white(studied.fitter)
     moves = studied.fitter.instants > 1
-    # One camera hardly tells light that goes with the disk from a turn: the light of fewer freedoms.
-    studied, rivals = lit_in_the_lab(studied, preferred=among is not None or len(studied.fitter.views) == 1)
+    studied, rivals = lit_in_the_lab(studied)
     studied = without_occluders(studied)
     score_min = _score_min(studied, still.right_score if moves else studied.right_score, best, wrong)
     sure = [frames[k] for k in proven(found)] if among is None else []

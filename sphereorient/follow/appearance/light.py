@@ -134,13 +134,11 @@ def check_white(fitter: Fitter) -> None:
         raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
 
 
-def lit_in_the_lab(studied: Studied, *, preferred: bool) -> tuple[Studied, Rivals]:
-    """Let light be a function of directions in the lab where that explains more, or, if `preferred`, about as much;
-    return also the fits of two models that explain as much as each other.
+def lit_in_the_lab(studied: Studied) -> tuple[Studied, Rivals]:
+    """Let light be a function of directions in the lab unless that explains less; return also the fits of two models
+    that explain about as much as each other.
     """
-    fitter, fit, rivals = kinds.lit_in_the_lab(
-        studied.fitter, studied.pixels, studied.fit, studied.use, preferred=preferred
-    )
+    fitter, fit, rivals = kinds.lit_in_the_lab(studied.fitter, studied.pixels, studied.fit, studied.use)
     return replace(studied, fitter=fitter, fit=fit), rivals
 
 

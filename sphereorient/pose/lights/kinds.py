@@ -1,6 +1,5 @@
 """Which light a movie has: one in the lab where that explains the pictures better than maps of each disk."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -9,17 +8,15 @@ from torch import Tensor
 
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lights.disk import DiskLight
-from sphereorient.pose.lights.lab import LabLight, lab_lights
+from sphereorient.pose.lights.lab import LabLight, lab_light
 from sphereorient.pose.model import Light, even_light
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 
 KINDS: tuple[type[Light], ...] = (DiskLight, LabLight)
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
-CLEARLY_MORE = 1.0  # standard errors of the gain by which it must leave less
-# Shares of the variance: by which it must leave less, or may leave more where it is preferred; within which two lights
-# explain about as much; and by which it never gets less.
-CHANGED, ALIKE, HOPELESS = 0.01, 0.05, 0.2
+# Shares of the variance: which it may leave more, and within which two lights explain about as much.
+CHANGED, ALIKE = 0.01, 0.05
 
 Rivals = tuple[FittedPoses, FittedPoses, Tensor] | None  # fits of the same pictures by two models, and `use` (B, C)
 
@@ -31,33 +28,25 @@ def light_of(parts: Mapping[str, Tensor], known: bool) -> Light:
     return kind(known=known, **{name: parts[name] for name in kind.names()})
 
 
-def lit_in_the_lab(
-    fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, *, preferred: bool = False
-) -> tuple[Fitter, FittedPoses, Rivals]:
-    """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
+def lit_in_the_lab(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Rivals]:
+    """Return a fitter with one light in the lab for all cameras, and its fit, unless maps of the disks explain more:
+    it has fewer freedoms, and hardly any that look like a turn of the ball.
     Both are learnt from every other row of `use` (B, C); what counts is what they leave in the pictures of the rows
-    between, beside its standard error. Return the fits of these rows by both where neither explains clearly more.
-    `preferred`: where it does not explain clearly less, half-way or at the end.
+    between. Return the fits of these rows by both where they explain about as much.
     """
     if len(use) < FEWEST_LIT:
         return fitter, fit, None
     every = torch.arange(len(use))
     learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
-    maps, lit = fitter.with_light_of(*learning), fitter
-    maps_leave, most = maps.logs_left(*held), -math.inf
-    for light in lab_lights(*learning, fitter.model()):
-        lit = replace(fitter, light=light)
-        gains = maps_leave - lit.logs_left(*held)
-        gain, error = float(gains.mean()), float(gains.std()) / math.sqrt(len(gains))
-        most = max(most, gain)
-        if gain < -HOPELESS:  # half-way, too
-            return fitter, fit, None
-    if (most < -CHANGED) if preferred else (gain < max(CHANGED, CLEARLY_MORE * error)):
-        return fitter, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -ALIKE else None
-    for _ in range(4):  # the poses, too, were found with the maps
+    maps, lit = fitter.with_light_of(*learning), replace(fitter, light=lab_light(*learning, fitter.model()))
+    gain = float((maps.logs_left(*held) - lit.logs_left(*held)).mean())
+    rivals = (maps.again(*held), lit.again(*held), held[2]) if abs(gain) < ALIKE else None
+    if gain < -CHANGED:
+        return fitter, fit, rivals
+    for _ in range(3):  # the poses, too, were found with the maps
         lit = lit.with_light_of(pixels, fit, use)
         fit = lit.again(pixels, fit, use)
-    return lit, fit, None
+    return lit, fit, rivals
 
 
 def some_of(rows: Tensor, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Pixels, FittedPoses, Tensor]:

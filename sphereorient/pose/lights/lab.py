@@ -1,7 +1,6 @@
 """One light in the lab for all cameras and places: what the paint scatters, and what its gloss mirrors."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -31,15 +30,16 @@ from sphereorient.sphere.view import polynomials
 
 SCATTERED, MIRRORED = 6, 16  # degrees of the harmonics over the normal and over the mirrored direction
 KNOTS = (0.0, 0.12, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0)  # depths, radii, between which the paint's cover is linear
-FRONTAL = 0.04  # share of the light that a smooth cover (refractive index 1.5) mirrors at normal incidence
+# Share of the light that a smooth cover of refractive index 1.5 mirrors at the knots. Source: Fresnel 1823.
+FRESNEL = (1.0, 0.421, 0.217, 0.125, 0.072, 0.051, 0.041, 0.04)
 SIDE = 256  # cells per axis of a look-up map
 BASIS_SIDE = 128  # the same of the harmonics that light is learnt with: 20 MB
 DEPTHS = 1024  # entries of the look-up of the cover's functions
 GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
-ROUNDS, AGAIN = 10, 3  # of Gauss-Newton from an even light, from one of the lab
+ROUNDS, AGAIN = 5, 1  # of Gauss-Newton from an even light, from one of the lab
 # Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
-LEVEL, SLOPES, GLOSS = 3.0, 0.2, 0.03  # the mean, all others, those of the mirrored light
-THROUGH, FACE = 0.2, 0.1  # of the cover's two functions at a knot
+LEVEL, SLOPES, GLOSS = 3.0, 0.2, 1.0  # the mean, all others, those of the mirrored light: lamps are brighter than paint
+THROUGH, FACE = 0.2, 0.3  # of the cover's two functions at a knot, the second relative
 TINT = (0.15, 0.08, 0.08)  # of a frame's own light, relative, by order
 SHADE = (0.04, 0.02)  # of its own offset, in units of white less black paint
 
@@ -97,8 +97,7 @@ class LabLight(Light):
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
     ) -> "LabLight":
         """Estimate light and noise from this light on; see `Light.learnt`."""
-        *_, light = lab_lights(pixels, fit, use, model, self)
-        return light
+        return lab_light(pixels, fit, use, model, self)
 
 
 UNKNOWN = ("difference", "black", "gloss", "through", "mirrored")
@@ -162,11 +161,11 @@ def _cells(coefficients: Tensor, degree: int) -> Tensor:
     return sample_texture(grid, octahedral_directions(SIDE)).float()
 
 
-def lab_lights(
+def lab_light(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, first: LabLight | None = None
-) -> Iterator[LabLight]:
-    """Yield the light and the noise of the fits of B * C disks, those of `use` (B, C) bool, estimated half-way and at
-    the end. Gauss-Newton from the first light, None: an even one as bright as that of the model; each frame's light may
+) -> LabLight:
+    """Estimate the light and the noise of the fits of B * C disks, those of `use` (B, C) bool.
+    Gauss-Newton from the first light, None: an even one as bright as that of the model; each frame's light may
     differ a little, as its tints do in the fit, and its pose may change: a light at given poses favours them.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
@@ -175,14 +174,13 @@ def lab_lights(
     bases = _bases(at.view, pixels)
     light, rounds = (_flat(model.light, at.view, pixels, use), ROUNDS) if first is None else (first, AGAIN)
     light = replace(light, stray=learn_stray(at, pixels, use, light.stray))
-    for done in range(1, rounds + 1):
+    for _ in range(rounds):
         light = _better(light, at, pixels, used, bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
-        if done in (rounds // 2, rounds):
-            counted = at.inside & ~pixels.clipped & used
-            light = replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
-            yield light.with_lean(at.view, pixels, use)
+    counted = at.inside & ~pixels.clipped & used
+    light = replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
+    return light.with_lean(at.view, pixels, use)
 
 
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
@@ -209,7 +207,7 @@ def _flat(known: Light, view: SphereView, pixels: Pixels, use: Tensor) -> LabLig
         black=black[first] * mean,
         gloss=torch.zeros((MIRRORED + 1) ** 2),
         through=knots,
-        mirrored=FRONTAL * knots,
+        mirrored=torch.tensor(FRESNEL),
         gain=torch.where(use.any(0), difference / difference[first], 1.0),
         noise=known.noise,
         stray=known.stray,
@@ -271,11 +269,13 @@ def _better(
     expected, deviation = _beforehand(unit)
     known = deviation.double() ** -2
     step = torch.linalg.solve(normal + known.diag(), right + known * (expected - now))
-    # What all frames of a camera share of their own factor is the camera's gain.
-    own_factor = factor[:, -1] - factor[:, :-1] @ step
-    shared = by_pose(own_factor, cameras).sum(0) / by_pose(counts, cameras).sum(0).clamp_min(1)
-    gain = light.gain * (1.0 + shared).float()
-    return replace(light, gain=gain, **dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True)))
+    # What all frames share of their own factor is of the light, what those of a camera share beside it is its gain.
+    own_factor, number = factor[:, -1] - factor[:, :-1] @ step, by_pose(counts, cameras).sum(0)
+    shared = (1.0 + by_pose(own_factor, cameras).sum(0) / number.clamp_min(1)).float()
+    first = int((number > 0).int().argmax())
+    gain = torch.where(number > 0, light.gain * shared / shared[first], light.gain)
+    parts = dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True))
+    return replace(light, gain=gain, **parts | {name: parts[name] * shared[first] for name in UNKNOWN[:3]})
 
 
 def _beforehand(unit: float) -> tuple[Tensor, Tensor]:
@@ -285,6 +285,7 @@ def _beforehand(unit: float) -> tuple[Tensor, Tensor]:
     mirrored = GLOSS / (1 + degree[1]) * unit
     knots = torch.ones(len(KNOTS))
     free = torch.cat([knots[:-1], 1e-6 * knots[-1:]])  # at the disk's middle both are given
-    deviation = torch.cat([scattered, scattered, mirrored, THROUGH * free, FACE * free])
+    fresnel = torch.tensor(FRESNEL)
+    deviation = torch.cat([scattered, scattered, mirrored, THROUGH * free, FACE * free * fresnel])
     harmonic = torch.zeros(len(deviation) - 2 * len(knots))
-    return torch.cat([harmonic, knots, FRONTAL * knots]), deviation
+    return torch.cat([harmonic, knots, fresnel]), deviation
