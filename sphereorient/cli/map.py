@@ -19,9 +19,8 @@ from sphereorient.files.whole_file import check_ending
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sphereorient.mapping import LearntMap
-    from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
+    from sphereorient.sphere.compare import MapComparison
     from sphereorient.tools.wear import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
@@ -82,7 +81,7 @@ def map_(given: _MapOptions) -> None:
     for name, result in results.items():
         if name:
             typer.echo(f"ball {name}")
-        _print(result.learnt)
+        _print(result)
         if result.comparison is not None:
             _print_moved(result.comparison, f"against {given.init}")
             typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
@@ -120,10 +119,11 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
     return [out, seen, learnt, figure, moved]
 
 
-def _print(learnt: "LearntMap") -> None:
+def _print(result: "MapResult") -> None:
     """Print from what the map was learnt, and how well it explains the pictures."""
     from sphereorient.report.texture_map import shares_seen
 
+    learnt = result.learnt
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
     closure, last = learnt.closure, learnt.rounds[-1]
     before, after = (math.degrees(drift) for drift in (closure.drift_before_rad, closure.drift_after_rad))
@@ -178,9 +178,9 @@ def compare_maps_(
 
 
 def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
-    from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
+    from sphereorient.sphere.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
 
     after, before = (_known_map(path) for path in maps)
     comparison = compare_maps(after, before, turned=turned)

@@ -21,13 +21,13 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.scene_start import EXPLAINED, SceneFound, SceneStart
 from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
-from sphereorient.mapping.compare import compare_maps
 from sphereorient.methods.method import Job
 from sphereorient.methods.paint import open_paints
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import texture_map
 from sphereorient.preflight.cameras import BAD, OUTLINE_PX, off_size
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
+from sphereorient.sphere.compare import compare_maps
 
 FRAMES = 8  # spread over the movies
 SEEN = 0.8  # share of the frames in which a ball should be found

@@ -20,14 +20,13 @@ from sphereorient.experiment import Experiment
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
-from sphereorient.mapping.compare import MapComparison
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.pose.worn import worn_share, worn_texels
 from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import contrast, crop, lit_picture
 from sphereorient.report.overlay_page import crop_side
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note, spread
-from sphereorient.sphere.texture import seen_path
+from sphereorient.sphere.compare import MapComparison
+from sphereorient.sphere.texture import seen_path, texel_areas
 from sphereorient.trajectory import Trajectory
 
 EXTENT = -180, 180, -90, 90  # of the axes of a map, degrees

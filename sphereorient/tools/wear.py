@@ -15,7 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.compare import (
+from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note, spread
+from sphereorient.report.texture_map import CHANGE_REACH, EXTENT, draw_map
+from sphereorient.sphere.compare import (
     CHANGED,
     RADIUS_DEG,
     MapComparison,
@@ -25,10 +27,7 @@ from sphereorient.mapping.compare import (
     turned_map,
     without_changed,
 )
-from sphereorient.mapping.grid import texel_areas
-from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note, spread
-from sphereorient.report.texture_map import CHANGE_REACH, EXTENT, draw_map
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import map_directions, texel_areas
 
 BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
 LEAST_DEG = 1.5  # radius of the smallest place that is reported

@@ -17,10 +17,9 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cli import main
 from sphereorient.errors import PaintError
-from sphereorient.mapping.compare import turned_map
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_seen
-from sphereorient.sphere.texture import map_directions, random_texture
+from sphereorient.sphere.compare import turned_map
+from sphereorient.sphere.texture import map_directions, random_texture, texel_areas
 from sphereorient.tools.wear import WearSeries, connected_places, wear_series
 
 HEIGHT = 128

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.sphere.texture import check_texture_shape, map_directions, sample_texture
+from sphereorient.sphere.texture import check_texture_shape, fibonacci_directions, map_directions, sample_texture
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 
 SEARCH_DEG = 10.0  # step of the grid of rotations
@@ -155,15 +155,6 @@ def without_changed(comparison: MapComparison, change: Tensor, most: float) -> M
     changed = (change.abs() > most).double()  # an unknown texel has not changed
     spoilt = sample_texture(changed, spots).mean(1) > CHANGED_SHARE
     return replace(comparison, moved_rad=torch.where(spoilt[:, None], torch.nan, comparison.moved_rad))
-
-
-def fibonacci_directions(count: int) -> Tensor:
-    """Return evenly spread directions, (count, 3) float64, without the poles (Swinbank and Purser 2006)."""
-    k = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * k / count
-    angle = math.pi * (1 + math.sqrt(5.0)) * k
-    level = (1 - z * z).sqrt()
-    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=-1)
 
 
 def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
