@@ -151,12 +151,6 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
     assert int(number.max()) == 2
 
 
-def test_texel_areas_are_those_of_their_zones():
-    area = texel_areas(3) / (4 * math.pi)  # 60 degrees a row
-    assert float(area.sum()) == pytest.approx(1.0)
-    assert_close(area[:, 0] * 6, torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))
-
-
 def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
     monkeypatch.setattr(sys, "argv", ["sphereorient", "compare-maps", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
