@@ -31,7 +31,7 @@ APART_DEG = 20.0  # nearer rotations show the same view
 REFINED = 40  # pairs whose rotation is refined
 BATCH = 64  # views that are normalised at once
 ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: single frames are doubtful, useless
-FRAMES = 8  # of each camera, compared with the map
+FRAMES = 8  # spread over the movies, compared with the map
 FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains
 CLEARLY = 0.08  # difference of this share between the picture and its mirror image
 
