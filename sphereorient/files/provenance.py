@@ -3,10 +3,12 @@ import platform
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from sphereorient.errors import OutputError, SphereOrientError, refusal
 from sphereorient.files.whole_file import relative_path
 
 PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
@@ -21,6 +23,16 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
+
+
+def package(name: str, extra: str, error: type[SphereOrientError] = OutputError) -> Any:
+    """Import a package of an extra; the error names the command that installs it."""
+    try:
+        return import_module(name)
+    except ImportError as fault:
+        label, do = f"sphereorient[{extra}]", f"install it with `pip install 'sphereorient[{extra}]'`"
+        got = f"the package {name.partition('.')[0]}"
+        raise error(refusal(label, expected=got, got="none", do=do)) from fault
 
 
 def sha256(path: Path) -> str:
