@@ -1,4 +1,5 @@
 import hashlib
+import math
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,15 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
+
+
+def without_nan(value: Any) -> Any:
+    """Return a value, or nested lists and mappings of such, with None, JSON's null, for NaN and infinity."""
+    if isinstance(value, dict):
+        return {name: without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def package(name: str, extra: str, error: type[SphereOrientError] = OutputError) -> Any:
