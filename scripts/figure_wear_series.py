@@ -20,11 +20,10 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.mapping.compare import turned_map
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_texture
 from sphereorient.sphere import sample_texture
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.compare import turned_map
+from sphereorient.sphere.texture import map_directions, texel_areas
 from sphereorient.synth import random_texture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

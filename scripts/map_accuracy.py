@@ -30,9 +30,9 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
-from sphereorient.mapping.compare import compare_maps
 from sphereorient.report.texture_map import shares_seen
 from sphereorient.sphere import load_texture, read_seen, seen_path
+from sphereorient.sphere.compare import compare_maps
 from sphereorient.synth import SynthSettings
 from sphereorient.synth import write_synthetic_experiment as render
 from sphereorient.trajectory import Trajectory

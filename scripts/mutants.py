@@ -80,7 +80,9 @@ def _pytest(mark: str, tests: Sequence[Path], package: str) -> tuple[int, str]:
     """Run test files against another copy of the package until one fails; return the exit code and the last word."""
     # PYTHONSAFEPATH: the working directory, with the package as it is, must not come first.
     environment = {**os.environ, "PYTHONPATH": package, "PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", mark, "--tb=no"]
+    # Hypothesis' profile "ci" has no deadlines: a busy machine kills no mutant.
+    options = ["-q", "-x", "-p", "no:cacheprovider", "--hypothesis-profile", "ci", "-m", mark, "--tb=no"]
+    command = [sys.executable, "-m", "pytest", *options]
     try:
         run = subprocess.run(
             [*command, *map(str, tests)], cwd=REPO, env=environment, capture_output=True, text=True, timeout=LONGEST_S

@@ -24,10 +24,11 @@ from sphereorient.errors import TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.methods.paper import in_the_lab
 from sphereorient.report import plots
+from sphereorient.report.build import uncorrected
 from sphereorient.report.plots import style as look
 from sphereorient.search import Candidates, TemplateBank, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
-from sphereorient.statistics.cameras import camera_distances, without_perspective
+from sphereorient.statistics.cameras import camera_distances
 from sphereorient.statistics.summary import Distributions
 from sphereorient.trajectory import Reason, Trajectory
 from sphereorient.trajectory.rotations import tait_bryan
@@ -421,7 +422,7 @@ def sample_track(example: Example) -> Figure:
 def camera_distance(found: Measured) -> Figure:
     """Figure 8: PDF of the distance of the cameras, with and without the correction of perspective."""
     rough = [
-        without_perspective(track, experiment.cameras)
+        uncorrected(track, experiment.cameras)
         for track, experiment in zip(found.tracks, found.experiments, strict=True)
     ]
     return plots.camera_distance_figure(camera_distances(found.tracks, rough))

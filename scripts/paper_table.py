@@ -20,12 +20,13 @@ from sphereorient.errors import TrackError, refusal
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.methods.proposers import paper_proposer, precise_proposer
 from sphereorient.methods.settings import Settings
+from sphereorient.report.build import uncorrected
 from sphereorient.report.plots import style as look
 from sphereorient.search.candidates import resized
 from sphereorient.sphere import load_texture, orthographic_view
 from sphereorient.statistics import Interval, Moments, StatisticsSettings, Summary, Surroundings, summarise
 from sphereorient.statistics.bootstrap import bootstrap, segment_sums
-from sphereorient.statistics.cameras import camera_distances, without_perspective
+from sphereorient.statistics.cameras import camera_distances
 from sphereorient.statistics.density import StretchedFit, fit_stretched, flatness_of
 from sphereorient.statistics.flow import FlowScales
 from sphereorient.statistics.moments import noise_let_through, table_of_moments
@@ -200,7 +201,7 @@ def accuracy_rows(found: Mapping[str, Measured], views: Mapping[str, Floats]) ->
     def distances(one: Measured, corrected: bool) -> list[Floats]:
         parts = []
         for track, experiment in zip(one.tracks, one.experiments, strict=True):
-            (apart,) = camera_distances(track, [without_perspective(track, experiment.cameras)])
+            (apart,) = camera_distances(track, [uncorrected(track, experiment.cameras)])
             radians = apart.distance_rad if corrected else apart.uncorrected_rad
             parts.append(np.rad2deg(radians[radians < math.radians(APART_DEG)]))
         return parts

@@ -34,12 +34,12 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import open_recording
 from sphereorient.files.threads import silent
 from sphereorient.mapping import take_crops
-from sphereorient.mapping.compare import compare_maps
 from sphereorient.mapping.disks import disks_of
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.camera_view import widest_px
 from sphereorient.sphere import load_texture, read_seen, seen_path
+from sphereorient.sphere.compare import compare_maps
 from sphereorient.sphere.texture import KINDS, random_texture
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.scene import make_scene, render_frame, seeded

@@ -114,8 +114,3 @@ def _log(number: float | Tensor, like: Floats | Tensor) -> Any:
     if isinstance(like, Tensor):
         return torch.as_tensor(number, dtype=like.dtype, device=like.device).log()
     return np.log(number)
-
-
-def _log_peak(tail: float | Tensor) -> Any:
-    lib: Any = torch if isinstance(tail, Tensor) else math
-    return lib.lgamma((tail + 3) / 2) - lib.lgamma(tail / 2) - 1.5 * lib.log(tail * math.pi)

@@ -18,7 +18,7 @@ from sphereorient.cameras import Camera, ParameterCovariance, in_air
 from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
 
-POSE_PARTS = 6  # rotation (rad, lab) and translation (mm) of a plate pose
+POSE_PARTS = len(ROTATION) + len(TRANSLATION)  # of a plate pose: rad, lab, and mm
 HELD = ("pixel_pitch_u", "pixel_pitch_v", "sx", "k3")  # scales that f already has, and a term that few lenses need
 SOFT = 2.0  # sigmas beyond which the loss of a residual grows linearly
 OUTLIER = 6.0  # robust standard deviations beyond which a point is left out

@@ -66,13 +66,13 @@ def look_at_plate(path: Path) -> PlateSeen:
     usual = float(np.median(best.width))
     large = best.width > LARGER * usual
     extent = (np.ptp(best.index, axis=0) + 1).tolist()
-    axis, marks = _marks(best.index, best.index[large])
+    axis, marks = _marks(best.index[large])
     columns, rows = sorted(extent, reverse=True) if axis is None else (extent[axis], extent[1 - axis])
     larger = float(np.median(best.width[large])) if large.any() else math.nan
     return PlateSeen(size=size, columns=columns, rows=rows, dark=dark, width=usual, larger=larger, marks=marks)
 
 
-def _marks(index: Ints, large: Ints) -> tuple[int | None, tuple[int, int] | None]:
+def _marks(large: Ints) -> tuple[int | None, tuple[int, int] | None]:
     """Return the axis of the lattice that is the plate's x, and the dots from the origin's to those on x and y.
     The origin is the larger dot at which the other two make a right angle; from the front, y is left of x.
     """

@@ -13,9 +13,7 @@ from sphereorient.errors import CameraError, ShapeError, refusal
 DAMPING = 1e-4  # at the start, relative to the information's diagonal
 LEAST, MOST = 1e-12, 1e10  # of the damping; beyond the upper one no step helps
 FAR = 1e6  # residual of a point that a trial camera does not see
-SIGMA_PX = (
-    0.05  # of good centroids, and of corners of drawn boards (0.03 to 0.07): points without noise would seem certain
-)
+SIGMA_PX = 0.05  # of good centroids, and of corners of drawn boards (0.03 to 0.07): none is certain
 UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: float64 cannot tell less from zero
 
 
@@ -119,7 +117,7 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
     change = least_squares(lambda change: expected_px(change).detach() - uv_px.reshape(-1), slopes, zero)
     slope, missed = torch.nan_to_num(slopes(change)), expected_px(change).detach() - uv_px.reshape(-1)
     spare = max(uv_px.numel() - size, 1)
-    sigma_px = max(float(torch.nan_to_num(missed, nan=1e6).square().sum() / spare) ** 0.5, SIGMA_PX)
+    sigma_px = max(float(torch.nan_to_num(missed, nan=FAR).square().sum() / spare) ** 0.5, SIGMA_PX)
     matrix = sigma_px**2 * inverse_information(slope.mT @ slope, names)
     covariance = ParameterCovariance(names=tuple(names), matrix=matrix)
     return cast(AnyCamera, replace(cast(Any, with_parameters(start, names, change)), covariance=covariance))

@@ -13,6 +13,7 @@ from sphereorient.cameras.camera import (
     sphere_disk_px,
     sphere_radius_px,
     triangulate,
+    without_perspective,
 )
 from sphereorient.cameras.io.cameras_yaml import add_model, load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.model import PinholeCamera

@@ -165,6 +165,15 @@ def R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
     return camera.R_cam_lab.mT @ R_cam_view(camera.rays(uv_px).direction_lab @ camera.R_cam_lab.mT)
 
 
+def without_perspective(camera: Camera, uv_px: Tensor, R_lab_body: Tensor) -> Tensor:
+    """Return orientations (..., 3, 3) as if each line of sight, at pixels (..., 2), were parallel to the camera's axis.
+    Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
+    """
+    R_cam_lab = camera.R_cam_lab
+    to_axis = R_cam_view(camera.rays(uv_px).direction_lab @ R_cam_lab.mT).mT
+    return R_cam_lab.mT @ to_axis @ R_cam_lab @ R_lab_body
+
+
 def centre_lab_mm(camera: Camera) -> Tensor:
     """Return the origin (3,) of the camera's frame, lab, mm: the projection centre of a central camera."""
     return -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm)

@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
-from sphereorient.cli.options import Quiet
+from sphereorient.cli.options import YAML, Quiet
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError, refusal
 from sphereorient.files.whole_file import TEXT_BYTES, check_ending, has_mark, read_text, relative_path, write_text
 from sphereorient.files.yaml_file import DraftKey, draft_yaml, flow, given, open_keys, read_yaml
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from sphereorient.preflight.first_look import FirstLook
 
-YAML = (".yaml", ".yml")
 HEAD = "Made by `sphereorient init`. Remove # before the keys to use; paths are relative to this file."
 
 

@@ -9,15 +9,13 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import ExperimentPath, SphereName, names_in, tracks_in
+from sphereorient.cli.options import YAML, ExperimentPath, SphereName, names_in, tracks_in
 from sphereorient.errors import CameraError, ExperimentError, refusal
 from sphereorient.files.whole_file import check_ending, put_aside
 
 if TYPE_CHECKING:
     from sphereorient.cameras import Camera
 
-YAML = (".yaml", ".yml")
-OPENCV = (".yml", ".yaml", ".xml", ".json")
 MADE_BY = "X_cam = R X_lab + T, mm; made by"
 
 
@@ -122,13 +120,13 @@ def convert_cameras(
 
 
 def _load(source: Path, image_size: tuple[int, int] | None, par: Path | None) -> "Camera":
-    from sphereorient.cameras.io.opencv import load_opencv
+    from sphereorient.cameras.io.opencv import SUFFIXES, load_opencv
     from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 
-    if source.suffix in OPENCV:
+    if source.suffix in SUFFIXES:
         return load_opencv(source, image_size)
     if source.suffix != ".ori":
-        expected, do = f"a file ending in {', '.join(OPENCV)} or .ori", "name a calibration file of OpenCV or OpenPTV"
+        expected, do = f"a file ending in {', '.join(SUFFIXES)} or .ori", "name a calibration file of OpenCV or OpenPTV"
         raise CameraError(refusal(str(source), expected=expected, got=f"'{source.name}'", do=do))
     if par is None:
         raise CameraError(refusal("--par", expected="OpenPTV's ptv.par", got="none", do="add --par parameters/ptv.par"))

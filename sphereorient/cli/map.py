@@ -13,15 +13,15 @@ from typer import Argument, Option
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, file_of
 from sphereorient.errors import PaintError, refusal
+from sphereorient.files.provenance import without_nan
 from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import check_ending
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sphereorient.mapping import LearntMap
-    from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
+    from sphereorient.sphere.compare import MapComparison
     from sphereorient.tools.wear import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
@@ -82,7 +82,7 @@ def map_(given: _MapOptions) -> None:
     for name, result in results.items():
         if name:
             typer.echo(f"ball {name}")
-        _print(result.learnt)
+        _print(result)
         if result.comparison is not None:
             _print_moved(result.comparison, f"against {given.init}")
             typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
@@ -120,10 +120,11 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
     return [out, seen, learnt, figure, moved]
 
 
-def _print(learnt: "LearntMap") -> None:
+def _print(result: "MapResult") -> None:
     """Print from what the map was learnt, and how well it explains the pictures."""
     from sphereorient.report.texture_map import shares_seen
 
+    learnt = result.learnt
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
     closure, last = learnt.closure, learnt.rounds[-1]
     before, after = (math.degrees(drift) for drift in (closure.drift_before_rad, closure.drift_after_rad))
@@ -178,9 +179,9 @@ def compare_maps_(
 
 
 def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
-    from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
+    from sphereorient.sphere.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
 
     after, before = (_known_map(path) for path in maps)
     comparison = compare_maps(after, before, turned=turned)
@@ -192,8 +193,8 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
     if out is not None:
         write_figure(texture_map.moved_figure(before, comparison, change), out)
     if as_json:
-        numbers = {**_numbers(comparison), "changed_share": _or_none(changed), "R_new_old": R.tolist()}
-        typer.echo(json.dumps(numbers))
+        numbers = {**_numbers(comparison), "changed_share": changed, "R_new_old": R.tolist()}
+        typer.echo(json.dumps(without_nan(numbers)))
         return
     _print_moved(comparison, f"{maps[0]} against {maps[1]}")
     typer.echo(
@@ -213,7 +214,7 @@ def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json
     if out is not None:
         write_figure(wear_figure(known[0], found, names), out)
     if as_json:
-        typer.echo(json.dumps(_series_numbers(found, [str(path) for path in maps])))
+        typer.echo(json.dumps(without_nan(_series_numbers(found, [str(path) for path in maps]))))
     else:
         _print_series(found, names)
 
@@ -250,8 +251,8 @@ def _series_numbers(found: "WearSeries", names: list[str]) -> dict[str, object]:
     rows = [
         {
             "map": name,
-            **{f"{what}_share": _or_none(getattr(one, what)) for what in ("known", "worn", "grown", "stays")},
-            "scatter": _or_none(wear.scatter),
+            **{f"{what}_share": getattr(one, what) for what in ("known", "worn", "grown", "stays")},
+            "scatter": wear.scatter,
             **_numbers(wear.comparison),
             "R_map_first": wear.comparison.R_other_reference.tolist(),
         }
@@ -261,7 +262,7 @@ def _series_numbers(found: "WearSeries", names: list[str]) -> dict[str, object]:
         {
             "longitude_deg": place.longitude_deg,
             "latitude_deg": place.latitude_deg,
-            "worn_share_of_ball": [_or_none(share) for share in place.share],
+            "worn_share_of_ball": list(place.share),
         }
         for place in found.places
     ]
@@ -282,15 +283,10 @@ def _numbers(comparison: "MapComparison") -> dict[str, object]:
     """Return the figures of a displacement for JSON."""
     return {
         "patches": len(comparison.length_rad),
-        "moved_rms_deg": _or_none(math.degrees(comparison.rms_rad)),
-        "moved_max_deg": _or_none(math.degrees(comparison.max_rad)),
+        "moved_rms_deg": math.degrees(comparison.rms_rad),
+        "moved_max_deg": math.degrees(comparison.max_rad),
         "correlation": comparison.correlation,
     }
-
-
-def _or_none(value: float) -> float | None:
-    """Return null for JSON where a figure could not be measured."""
-    return value if math.isfinite(value) else None
 
 
 def _known_map(path: Path) -> "Tensor":

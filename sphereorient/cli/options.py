@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sphereorient.methods.settings import Settings
     from sphereorient.trajectory import Tracks
 
+YAML = (".yaml", ".yml")
 ExperimentPath = Annotated[Path, Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
 TrackPath = Annotated[Path, Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
 SphereName = Annotated[str | None, Option("--sphere", help="Of several balls, only this one.")]

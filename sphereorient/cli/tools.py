@@ -13,6 +13,7 @@ from typer import Argument, Option
 from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import Quiet, names_in
 from sphereorient.errors import TextureError, refusal
+from sphereorient.files.provenance import without_nan
 from sphereorient.files.whole_file import check_ending, make_folder, write_text
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def spin(given: _SpinOptions) -> None:
         if isinstance(ball, DotTable) and given.dot_radius is None:
             ball = ball.measured(found.disks, found.R_view_body)
             found = spin_of(loaded, ball, settings, lambda stage, *rest: advance(f"{stage}, dots measured", *rest))
-    result = _spin_document(found, loaded)
+    result = without_nan(_spin_document(found, loaded))
     if isinstance(ball, DotTable):
         result["dot_radius_deg"] = ball.radius_deg
     write_text(given.out, json.dumps(result, indent=2) + "\n")
@@ -94,7 +95,7 @@ def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, 
                 "file": name,
                 "time_s": float(photographs.time_s[k]),
                 "R_view_body": found.R_view_body[k].tolist(),
-                "residual_deg": math.degrees(residual) if math.isfinite(residual) else None,
+                "residual_deg": math.degrees(residual),
                 "score": float(found.score[k]),
                 "evidence": float(found.evidence[0, k]),
             }

@@ -25,7 +25,8 @@ from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import Grey, Movie, flipped_picture
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
-Shown = TypeVar("Shown", bound=Grey | OnDemand)
+Shown = Grey | OnDemand  # a picture that was decoded, or is where it is asked for
+Read = TypeVar("Read", bound=Shown)
 
 BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a given picture, uncompressed, and of its header
 EVERY = 4  # pixels: faults of whole pictures show in every fourth row and column
@@ -58,8 +59,8 @@ class CameraStream:
         return self._with_reasons(partial(self.movie.on_demand, pool), first, last)
 
     def _with_reasons(
-        self, read: Callable[[int, int], Iterator[Shown | None]], first: int, last: int | None
-    ) -> Iterator[tuple[Shown | None, Reason]]:
+        self, read: Callable[[int, int], Iterator[Read | None]], first: int, last: int | None
+    ) -> Iterator[tuple[Read | None, Reason]]:
         rows = self.rows[first:last]
         for row, picture in zip(rows.tolist(), _of_rows(read, rows), strict=True):
             why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
@@ -93,18 +94,34 @@ def uniform(picture: Grey) -> bool:
     return bool(some.min() == some.max())
 
 
+def whole(shown: Shown) -> Grey:
+    """Return a whole picture (H, W)."""
+    if not isinstance(shown, OnDemand):
+        return shown
+    height, width = shown.shape
+    return shown.part(0, 0, width - 1, height - 1)
+
+
+def equal(shown: Shown, before: Shown | None) -> bool:
+    """Return whether a picture repeats the one before it."""
+    if isinstance(shown, OnDemand) or isinstance(before, OnDemand) or before is None:
+        return isinstance(shown, OnDemand) and shown.equals(before)
+    some = np.s_[:: EVERY**2]
+    return np.array_equal(shown[some], before[some]) and np.array_equal(shown, before)
+
+
 def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
     """Yield a movie's pictures by number (N,); None for NONE and undecodable pictures."""
     return _of_rows(movie.readable, rows)
 
 
-def _of_rows(read: Callable[[int, int], Iterator[Shown | None]], rows: NDArray[np.int64]) -> Iterator[Shown | None]:
+def _of_rows(read: Callable[[int, int], Iterator[Read | None]], rows: NDArray[np.int64]) -> Iterator[Read | None]:
     found = _read(read, rows[rows != NONE].tolist())
     for row in rows.tolist():
         yield None if row == NONE else next(found)
 
 
-def _read(read: Callable[[int, int], Iterator[Shown | None]], numbers: Sequence[int]) -> Iterator[Shown | None]:
+def _read(read: Callable[[int, int], Iterator[Read | None]], numbers: Sequence[int]) -> Iterator[Read | None]:
     """Yield pictures by number, consecutive ones in one pass."""
     for run in np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1):
         if len(run):

@@ -1,12 +1,15 @@
 import hashlib
+import math
 import platform
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from sphereorient.errors import OutputError, SphereOrientError, refusal
 from sphereorient.files.whole_file import relative_path
 
 PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
@@ -21,6 +24,25 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
+
+
+def without_nan(value: Any) -> Any:
+    """Return a value, or nested lists and mappings of such, with None, JSON's null, for NaN and infinity."""
+    if isinstance(value, dict):
+        return {name: without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def package(name: str, extra: str, error: type[SphereOrientError] = OutputError) -> Any:
+    """Import a package of an extra; the error names the command that installs it."""
+    try:
+        return import_module(name)
+    except ImportError as fault:
+        label, do = f"sphereorient[{extra}]", f"install it with `pip install 'sphereorient[{extra}]'`"
+        got = f"the package {name.partition('.')[0]}"
+        raise error(refusal(label, expected=got, got="none", do=do)) from fault
 
 
 def sha256(path: Path) -> str:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.files.provenance import without_nan
 from sphereorient.live.live import Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
@@ -103,7 +104,7 @@ class JsonLines:
             "reason": [str(why) for why in now.reason],
             "latency_ms": 1e3 * now.latency_s,
         }
-        return json.dumps({name: without_nan(value) for name, value in content.items()}, allow_nan=False)
+        return json.dumps(without_nan(content), allow_nan=False)
 
     def _rates(self, now: Measured) -> tuple[Rate, Rate]:
         before, self._before = self._before, now if _states_errors(now) else None
@@ -155,10 +156,3 @@ class Told:
     def json(self) -> str:
         """A line of JSON."""
         return self.json_lines.line(self.now)
-
-
-def without_nan(value: object) -> object:
-    """Return a number, or nested lists, with None, JSON's null, for NaN and infinity."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return [without_nan(part) for part in value] if isinstance(value, list) else value

@@ -15,6 +15,7 @@ from typing import IO, Any
 
 from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.page_server import HOST
+from sphereorient.files.provenance import package
 from sphereorient.live.feed import Tell
 from sphereorient.live.live import TrackBlocks
 from sphereorient.trajectory import Trajectory, journal
@@ -125,11 +126,7 @@ class ZmqOutput(Output):
 
     def __init__(self, host: str, port: int) -> None:
         name = f"zmq:{host}:{port}"
-        try:
-            import zmq
-        except ImportError:
-            do = "install it with `pip install 'sphereorient[live]'`"
-            raise OutputError(refusal(name, expected="the package pyzmq", got="none", do=do)) from None
+        zmq = package("zmq", "live")
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PUB)
         self._socket.set_hwm(MOST_LINES)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from sphereorient.errors import OutputError, Reason, refusal
 from sphereorient.files.page_server import PageHandler, PageServer, new_token
 from sphereorient.files.picture import eight_bits
+from sphereorient.files.provenance import without_nan
 from sphereorient.live.feed import Arrival, Feed, Tell
-from sphereorient.live.lines import without_nan
 from sphereorient.live.live import Measured
 from sphereorient.pose import CameraView
 from sphereorient.report.overlay_model import Path3D, axes_px, outline_px

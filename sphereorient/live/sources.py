@@ -17,6 +17,7 @@ import numpy as np
 from sphereorient.errors import MovieError, SettingsError, error_words, refusal
 from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.picture import luma
+from sphereorient.files.provenance import package
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
 from sphereorient.live.shared import shared_frames
 
@@ -81,14 +82,10 @@ def genicam_pictures(where: str) -> Iterator[Picture]:
     Raise MovieError: the package harvesters is missing, no such camera, one of colour, or one that fails.
     """
     name = f"genicam:{where}"
-    try:
-        from harvesters.core import Harvester, TimeoutException
-    except ImportError:
-        do = "install it with `pip install 'sphereorient[genicam]'`"
-        raise MovieError(refusal(name, expected="the package harvesters", got="none", do=do)) from None
+    driver = package("harvesters.core", "genicam", MovieError)
     producer, _, serial = where.partition("#")
     try:
-        with Harvester() as harvester:
+        with driver.Harvester() as harvester:
             harvester.add_file(producer, check_existence=True, check_validity=True)
             harvester.update()
             if not harvester.device_info_list:
@@ -100,7 +97,7 @@ def genicam_pictures(where: str) -> Iterator[Picture]:
                     try:
                         # Of one call of a GenICam driver; a camera that waits for its trigger is asked again.
                         buffer = camera.fetch(timeout=1.0)
-                    except TimeoutException:
+                    except driver.TimeoutException:
                         continue
                     with buffer:  # its memory is the driver's again behind this
                         shown = buffer.payload.components[0]

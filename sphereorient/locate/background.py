@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import Reason
-from sphereorient.experiment.recording import EVERY, CameraStream, uniform
-from sphereorient.files.picture import OnDemand
+from sphereorient.experiment.recording import EVERY, CameraStream, Shown, equal, uniform, whole
 
 Picture = NDArray[Any]
 # A pixel's noise is a quantile of its deviations over that of a unit normal. Measured mean: glitter is in more frames
@@ -153,17 +152,14 @@ def _nan_quantile(values: NDArray[np.float32], share: float) -> NDArray[np.float
 class Frame:
     """Picture of one camera at one instant; made by `screened_frames`."""
 
-    shown: Picture | OnDemand  # (H, W); zeros if missing
+    shown: Shown  # (H, W); zeros if missing
     read: Reason = Reason.OK  # OK, MISSING, UNDECODABLE, or REPEATED: equal to the frame before
     background: Background | None = None  # of the empty scene, by which it is dark or white; None: it is not
 
     @cached_property
     def picture(self) -> Picture:
         """The whole picture."""
-        if not isinstance(self.shown, OnDemand):
-            return self.shown
-        height, width = self.shown.shape
-        return self.shown.part(0, 0, width - 1, height - 1)
+        return whole(self.shown)
 
     @cached_property
     def reason(self) -> Reason:
@@ -197,9 +193,9 @@ def dark_or_white(picture: Picture, background: Background) -> Reason | None:
     return None
 
 
-def screened(picture: Picture | OnDemand, before: Picture | OnDemand | None, background: Background) -> Frame:
+def screened(picture: Shown, before: Shown | None, background: Background) -> Frame:
     """Return the frame of a picture (H, W) that was read after another one."""
-    read = Reason.REPEATED if _equal(picture, before) else Reason.OK
+    read = Reason.REPEATED if equal(picture, before) else Reason.OK
     return Frame(shown=picture, read=read, background=background)
 
 
@@ -215,7 +211,7 @@ def screened_frames(
     """
     lead = min(first, 1)
     blank = np.zeros(stream.movie.frame_shape, stream.movie.dtype)
-    before: Picture | OnDemand | None = None
+    before: Shown | None = None
     pictures = stream.pictures(first - lead, last) if pool is None else stream.on_demand(pool, first - lead, last)
     for k, (picture, reason) in enumerate(pictures):
         if k >= lead and picture is None:
@@ -223,10 +219,3 @@ def screened_frames(
         elif k >= lead and picture is not None:
             yield screened(picture, before, background)
         before = picture
-
-
-def _equal(picture: Picture | OnDemand, before: Picture | OnDemand | None) -> bool:
-    if isinstance(picture, OnDemand) or isinstance(before, OnDemand) or before is None:
-        return isinstance(picture, OnDemand) and picture.equals(before)
-    some = np.s_[:: EVERY**2]
-    return np.array_equal(picture[some], before[some]) and np.array_equal(picture, before)

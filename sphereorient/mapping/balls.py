@@ -20,13 +20,12 @@ from sphereorient.locate.disks import find_disks
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.position import Match, assigned, match_disks, places_of
 from sphereorient.locate.scene import CameraScene, find_scenes
-from sphereorient.mapping.compare import MapComparison, compare_maps, fit_levels, turned_map
 from sphereorient.mapping.disks import Crop, Crops, cut_crop, take_crops
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.mapping.learn import LearntMap
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import CameraView
-from sphereorient.sphere.texture import map_directions, texture_coordinates
+from sphereorient.sphere.compare import MapComparison, compare_maps, fit_levels, turned_map
+from sphereorient.sphere.texture import map_directions, texel_areas, texture_coordinates
 
 FREE = 1.1  # sums of two radii: disks that are nearer than this are not used
 AWAY = 0.1  # of the radius, for each frame since it was seen: how far a sphere may be from where it is expected

@@ -19,10 +19,9 @@ from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.poses import Poses, blank_parts, no_pose
 
 SEARCH_STEP_DEG = 8.0  # of the grid of relative rotations
-SEARCH_EVERY = 2  # pixels of the small disks
 SMALLER = 2  # factor by which disks are reduced for a search
 ITERATIONS = 6  # of a pair's refinement
-EVERY = 2  # pixels of the disks in it
+EVERY = 2  # pixels of the disks in it, and of the small ones in a search
 NEAR = 0.5  # cosine between lines of sight in the body, above which two disks share enough for a comparison
 OVERLAP_MIN = 0.25  # of a disk, shared by a loop's pictures
 SCALE_RAD = math.radians(1.0)  # scatter of single frames by errors of their outlines
@@ -76,7 +75,7 @@ def chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, Relative
     grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), math.radians(settings.turn_max_deg))
     first = torch.arange(count - 1)
     still = torch.eye(3, dtype=torch.float64).expand(count - 1, 3, 3)
-    start = search_pairs(reduced(disks, SMALLER), first, first + 1, still, grid, SEARCH_EVERY)
+    start = search_pairs(reduced(disks, SMALLER), first, first + 1, still, grid, EVERY)
     # Keep all neighbours: nothing else connects the frames before and after.
     parts = [refine_pairs(disks, first, first + 1, start, ITERATIONS, EVERY)]
     R = chained(parts[0].R_ji)
@@ -104,7 +103,7 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
         step = math.radians(SEARCH_STEP_DEG)
         rough = math.radians(SEARCH_STEP_DEG + 4)
         grid = so3.local_grid(step, reach) if reach < math.pi else so3.lattman_grid(rough)
-        about = search_pairs(reduced(disks, SMALLER), first, second, about, grid, SEARCH_EVERY)
+        about = search_pairs(reduced(disks, SMALLER), first, second, about, grid, EVERY)
     found = refine_pairs(disks, first, second, about, ITERATIONS, EVERY)
     good = found.where((found.score > settings.score_min) & (found.overlap > OVERLAP_MIN))
     if len(first) and not len(good):
@@ -220,7 +219,7 @@ class RelativeTracker:
         searched = not len(pairs)
         if searched:
             grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), math.radians(self._settings.turn_max_deg))
-            start = search_pairs(reduced(disks, SMALLER), first, second, R[-1] @ R.mT, grid, SEARCH_EVERY)
+            start = search_pairs(reduced(disks, SMALLER), first, second, R[-1] @ R.mT, grid, EVERY)
             pairs = self._good(refine_pairs(disks, first, second, start, ITERATIONS, EVERY))
         if not len(pairs):
             return None, True

@@ -33,7 +33,7 @@ from sphereorient.sphere.view import perspective_view
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
-OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its median times this is the sigma of noise
+OUTLINES_MIN = 8  # that can show a scatter
 # Scatter of a fixed ball's outlines that is refused: px, of the radius, and of that of their size. Where outlines are
 # found badly, both scatter alike.
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
@@ -144,7 +144,7 @@ def _fixed_scene(
     seen = torch.tensor([one.circle for one in each if one is not None], dtype=torch.float64)
     if len(seen) >= OUTLINES_MIN:
         middle = seen.median(0).values
-        u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()
+        u, v, size = (1.4826 * (seen - middle).abs().median(0).values).tolist()
         wander = math.hypot(u, v)
         if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
             got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: false`, and the diameter"

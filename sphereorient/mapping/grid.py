@@ -83,13 +83,6 @@ def map_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> TextureTabl
     return TextureTable(torch.cat(parts), blur_rad)
 
 
-def texel_areas(height: int) -> Tensor:
-    """Return the solid angle of every texel, (H, 2 H) float64, sr; the sum is 4 pi."""
-    edge = math.pi / 2 - math.pi * torch.arange(height + 1, dtype=torch.float64) / height
-    band = (edge[:-1].sin() - edge[1:].sin()) * (math.pi / height)
-    return band[:, None].expand(height, 2 * height)
-
-
 def stiffness(height: int) -> csr_matrix:
     """Return L, m^T L m being the integral of the map's squared slope over the sphere (finite volumes)."""
     width = 2 * height

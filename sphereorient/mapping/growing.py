@@ -15,7 +15,6 @@ from sphereorient.follow.fixed_centre import FixedCentre, centre_of
 from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import chained
 from sphereorient.mapping.disks import Crop, Crops, disks_of, evenly_spread, pixels_of
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.mapping.iterations import State
 from sphereorient.mapping.learn import final_map, interpolated
 from sphereorient.mapping.settings import MapSettings
@@ -24,6 +23,7 @@ from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.pixels import Pixels, stacked
 from sphereorient.search import GreySearch
+from sphereorient.sphere.texture import texel_areas
 from sphereorient.sphere.texture_table import texture_table
 
 MOST_PIXELS = 1200  # of a disk

@@ -14,7 +14,6 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.files.threads import side_by_side
 from sphereorient.mapping import grid
-from sphereorient.mapping.compare import fit_levels
 from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
 from sphereorient.mapping.grid import NormalMatrix, SplineTable
 from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
@@ -28,7 +27,8 @@ from sphereorient.pose.model import even_light
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart
 from sphereorient.pose.residuals import noise_curves
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.compare import fit_levels
+from sphereorient.sphere.texture import map_directions, texel_areas
 from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
@@ -247,7 +247,7 @@ def _lit_in_the_lab(state: State) -> State:
 def _rescaled(state: State) -> State:
     """Scale the map to black 0 and white 1: pictures alone do not separate a dark light from a dark map."""
     values, order = state.texture.reshape(-1).sort()
-    share = grid.texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
+    share = texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
     light = state.fitter.light

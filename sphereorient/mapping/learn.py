@@ -17,9 +17,8 @@ from sphereorient.files.threads import Progress, counted
 from sphereorient.files.whole_file import writing
 from sphereorient.mapping import iterations
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
-from sphereorient.mapping.compare import compare_maps, turned_map, weighted_correlation
 from sphereorient.mapping.disks import Crops, Disks, disks_of, evenly_spread, normalised_disks
-from sphereorient.mapping.grid import look_up, texel_areas
+from sphereorient.mapping.grid import look_up
 from sphereorient.mapping.iterations import Iteration, State
 from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
@@ -28,7 +27,8 @@ from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.lights.kinds import light_of
 from sphereorient.pose.model import Light
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.compare import compare_maps, turned_map, weighted_correlation
+from sphereorient.sphere.texture import map_directions, texel_areas
 from sphereorient.sphere.view import perspective_view
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).

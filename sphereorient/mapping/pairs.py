@@ -193,7 +193,7 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
     return torch.stack(list(side_by_side(best, zip(first, second, about.float(), strict=True)))).double()
 
 
-def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
+def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int = 1) -> Tensor:
     """Return correlations (N, M) of all first disks of a camera with one disk, `second`, at rotations (M, 3, 3).
     `cameras`: of the first disks and of the second; the rotations take the first view frame to the second.
     """

@@ -12,15 +12,21 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.chain import EVERY, ITERATIONS, OVERLAP_MIN, SMALLER, PairwiseAttitudes, check_turned
+from sphereorient.mapping.chain import (
+    EVERY,
+    ITERATIONS,
+    OVERLAP_MIN,
+    SEARCH_STEP_DEG,
+    SMALLER,
+    PairwiseAttitudes,
+    check_turned,
+)
 from sphereorient.mapping.disks import Disks, reduced
 from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs, search_views, solve_graph
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.search.candidates import distinct
 
-STEP_DEG = 8.0  # of the grid of rotations
 TILT_DEG = 75.0  # between lines of sight in the body, beyond which two disks share too little
-SEARCH_EVERY = 1  # pixels of the small disks
 MODES, PEAKS = 96, 3  # best rotations of a pair, and distinct ones among them that are refined
 PEAK_DEG = 18.0  # between distinct ones
 FINER = 2.7  # detail, window and pixels of the disks in the last comparison, where the pictures have it
@@ -97,7 +103,7 @@ def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:
 def all_pairs(disks: Disks) -> RelativeRotations:
     """Compare all pairs of disks over all rotations, and refine the best few rotations of each pair."""
     small = reduced(disks, SMALLER)
-    grid = so3.lattman_grid(math.radians(STEP_DEG))
+    grid = so3.lattman_grid(math.radians(SEARCH_STEP_DEG))
     grid = grid[grid[:, 2, 2] > math.cos(math.radians(TILT_DEG))]
     first, second, R_ji = (torch.cat(part) for part in zip(*_starts(small, grid), strict=True))
     return refine_pairs(disks, first, second, R_ji, ITERATIONS, EVERY)
@@ -109,7 +115,7 @@ def _starts(small: Disks, grid: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor
     R_lab_view = small.R_lab_view.double()
     for second in range(len(small)):
         for a, b in ((a, b) for a in cameras for b in cameras if small.seen[second, b]):
-            scores = search_views(small, (a, b), second, grid, SEARCH_EVERY)
+            scores = search_views(small, (a, b), second, grid)
             top = scores.topk(min(MODES, len(grid)), dim=1).indices
             peak = distinct(grid[top], math.radians(PEAK_DEG))
             peak &= (peak.cumsum(1) <= PEAKS) & small.seen[:, a, None]

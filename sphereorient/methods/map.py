@@ -15,11 +15,11 @@ from sphereorient.files.provenance import provenance
 from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
 from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
-from sphereorient.mapping.compare import MapComparison
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.compare import MapComparison
 from sphereorient.trajectory import Trajectory
 
 

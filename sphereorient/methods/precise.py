@@ -1,7 +1,6 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion; for K balls."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.assemble.identity import same_balls
-from sphereorient.errors import ExperimentError, Flag, refusal
+from sphereorient.errors import ExperimentError, refusal
 from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.ball import BallTracker
@@ -26,8 +25,6 @@ from sphereorient.pose.poses import PoseTable, exchanged, pose_tables
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
-
-SURE = 0.99  # probability from which a ball has its name
 
 
 def learn(job: Job, progress: Progress) -> Follower:
@@ -94,8 +91,7 @@ def join(job: Job, follower: Follower | None, measured: Iterable[Measured], prog
         own, sure = _named([tables[name] for name in names], job, follower)
         for name, table, certain in zip(names, own, sure, strict=True):
             track, learnt = joined(job.of(name), follower.appearances[name], table)
-            flags = np.where(certain < SURE, np.uint32(Flag.IDENTITY), np.uint32(0))
-            found[name] = replace(track, identity=certain, flags=track.flags | flags), learnt
+            found[name] = results.with_identity(track, certain), learnt
     return {name: found[name] for name in follower.appearances}
 
 

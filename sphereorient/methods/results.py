@@ -51,6 +51,7 @@ RUNAWAY = (
     "and white paint in even light; try `--method precise`"
 )
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
+SURE = 0.99  # probability from which a ball has its name
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
 
 
@@ -237,6 +238,14 @@ def with_errors(
     if lasting is not None:  # after the others: only noise is scaled
         track = with_lasting_errors(track, lasting.covariance, lasting.alone)
     return track, remarks
+
+
+def with_identity(track: Trajectory, certain: NDArray[np.float64]) -> Trajectory:
+    """Return a ball's track with the probability that it has kept its name, (N,), NaN: never in doubt; what is less
+    than sure is marked.
+    """
+    doubtful = np.where(certain < SURE, np.uint32(Flag.IDENTITY), np.uint32(0))
+    return replace(track, identity=certain, flags=track.flags | doubtful)
 
 
 def missed_text(track: Trajectory) -> list[str]:

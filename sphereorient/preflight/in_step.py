@@ -9,12 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.comparison import gaps_between
+from sphereorient.calibration.comparison import LATEST, gaps_between
 from sphereorient.cameras import Camera
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample, pair_starts
 
-REACH = 8  # frames by which a movie may be late
 STRETCH, STRETCHES = 20, 2  # consecutive frames in one stretch, and number of stretches
 MOVES_PX = 0.3  # least motion per frame across the lines of sight that shows an offset
 MEET, MEET_PX = 0.3, 0.7  # lines of sight meet if the gap is less than this share of the motion per frame, or px
@@ -27,7 +26,7 @@ FEW = 8  # frames with a ball in both cameras
 class OffsetScan:
     """The gap at each offset between two movies; made by `scan_offsets`, drawn by the figure."""
 
-    gap_px: Tensor  # (2 REACH + 1,) of each offset: root mean square of the gap, px; NaN: unknown
+    gap_px: Tensor  # (2 LATEST + 1,) of each offset: root mean square of the gap, px; NaN: unknown
     varying_px: Tensor  # likewise without the constant part of the gap, which is an error of the cameras
     moved_px: float  # typical motion across the lines of sight in one frame, px
     best: float  # the offset of the least gap, to parts of a frame; NaN: unknown
@@ -36,7 +35,7 @@ class OffsetScan:
     @property
     def offset(self) -> range:
         """Frames by which the second movie is late."""
-        return range(-REACH, REACH + 1)
+        return range(-LATEST, LATEST + 1)
 
     @property
     def shift(self) -> int:
@@ -46,7 +45,7 @@ class OffsetScan:
     @property
     def in_step_px(self) -> float:
         """Gap at that shift, px."""
-        return float(self.gap_px[REACH + self.shift])
+        return float(self.gap_px[LATEST + self.shift])
 
 
 def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
@@ -80,7 +79,7 @@ def scan_offsets(
         moved.append((gaps.position_lab_mm.diff(dim=0) * gaps.across_lab[1:]).sum(-1) * gaps.per_mm_px[1:])
     motion = _finite(moved)
     moved_px = float(motion.square().mean().sqrt()) if len(motion) else 0.0
-    rows = [_gap_at(cameras, stretches, offset) for offset in range(-REACH, REACH + 1)]
+    rows = [_gap_at(cameras, stretches, offset) for offset in range(-LATEST, LATEST + 1)]
     gap, varying = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
     best, least_px = _least(gap)
     meet_px = max(MEET_PX, MEET * moved_px)
@@ -127,13 +126,13 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
     """Return the offset of the least gap, by a parabola, and that gap; NaN at the ends of the range."""
     square = gap_px.square()
     k = int(square.argmin())
-    if not torch.isfinite(square).all() or k in (0, 2 * REACH):
+    if not torch.isfinite(square).all() or k in (0, 2 * LATEST):
         return math.nan, math.nan
     before, here, after = square[k - 1 : k + 2].tolist()
     bend = before - 2 * here + after
     if bend <= 0:
-        return float(k - REACH), math.sqrt(here)
-    return k - REACH + 0.5 * (before - after) / bend, math.sqrt(max(0.0, here - (before - after) ** 2 / (8 * bend)))
+        return float(k - LATEST), math.sqrt(here)
+    return k - LATEST + 0.5 * (before - after) / bend, math.sqrt(max(0.0, here - (before - after) ** 2 / (8 * bend)))
 
 
 def shifts_of(scans: Sequence[OffsetScan]) -> dict[str, float]:
@@ -153,7 +152,7 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
     scans = [scan for scan in scans if scan.moved_px > MOVES_PX]
     late = shifts_of(scans)
     if any(math.isnan(value) for value in late.values()):
-        measured = f"unknown: within {REACH} frames no shift makes the lines of sight meet"
+        measured = f"unknown: within {LATEST} frames no shift makes the lines of sight meet"
         return warning(title, measured, "correct the findings on ball and lines of sight first, then check again")
     name = max(list(late)[1:] if len(scans) == 1 else late, key=lambda one: abs(late[one]))
     measured = f"{name} shows the same instant {abs(late[name]):.2f} frames "
@@ -164,7 +163,7 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
         which = "both" if len(scans) == 1 else "all"
         advice = f"trigger {which} cameras by one signal: start: cannot correct a part of a frame"
         return judged(title, measured, (abs(late[name]) > IN_STEP, WARNING, advice))
-    now = max(float(scan.gap_px[REACH]) for scan in shifted)
+    now = max(float(scan.gap_px[LATEST]) for scan in shifted)
     best = max(float(scan.gap_px.min()) for scan in shifted)
     measured += f"; the gap falls from {now:.2f} to {best:.2f} px"
     begins = ", ".join(f"{one}: {first}" for one, first in starts_in_step(start, late).items())

@@ -21,16 +21,15 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.scene_start import EXPLAINED, SceneFound, SceneStart
 from sphereorient.locate import Frame, find_disks
 from sphereorient.locate.outline import Outline
-from sphereorient.mapping.compare import compare_maps
 from sphereorient.methods.method import Job
 from sphereorient.methods.paint import open_paints
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import texture_map
 from sphereorient.preflight.cameras import BAD, OUTLINE_PX, off_size
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
+from sphereorient.preflight.movies import BALL_SEEN
+from sphereorient.sphere.compare import compare_maps
 
-FRAMES = 8  # spread over the movies
-SEEN = 0.8  # share of the frames in which a ball should be found
 WHOLE = 0.7  # share of the rim of a disk that tells the size of a ball
 
 
@@ -59,7 +58,7 @@ def look_at_scene(
     first = {name: paint.first for paint in open_paints(job, progress) for name in paint.names}
     balls = {name: first[name] for name in recording.experiment.names}
     cameras = next(iter(balls.values())).fitter.views
-    frames, places = sample_frames(job.recording, cameras, FRAMES)
+    frames, places = sample_frames(job.recording, cameras, texture_map.FRAMES)
     start, found, disks = SceneStart(balls), [], []
     for shots in counted("balls", frames, len(frames), progress):
         disks.append(_disks(shots, balls))
@@ -146,7 +145,7 @@ def found_balls(found: Sequence[SceneFound], balls: Mapping[str, Initialiser]) -
         none = f"check texture and diameter under spheres.{name}, or leave it out where it is not there"
         few = "it is hidden, out of the pictures, or wears another map than the one named"
         measured = f"found by its paint in {count} of {len(found)} frames"
-        complaints = (not count, FAULT, none), (count < SEEN * len(found), WARNING, few)
+        complaints = (not count, FAULT, none), (count < BALL_SEEN * len(found), WARNING, few)
         yield judged(f"ball {name}", measured, *complaints)
 
 

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.experiment.recording import spread_frames
-from sphereorient.mapping.compare import fibonacci_directions
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.search import GreySearch, crop_disk
@@ -19,7 +17,7 @@ from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture, unseen_share
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import fibonacci_directions, map_directions, texel_areas
 from sphereorient.sphere.texture_table import texture_table
 
 ROWS = 32  # of the reduced map on which views are averaged: 5.6 degrees
@@ -33,7 +31,7 @@ APART_DEG = 20.0  # nearer rotations show the same view
 REFINED = 40  # pairs whose rotation is refined
 BATCH = 64  # views that are normalised at once
 ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: single frames are doubtful, useless
-FRAMES = 8  # of each camera, compared with the map
+FRAMES = 8  # spread over the movies, compared with the map
 FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains
 CLEARLY = 0.08  # difference of this share between the picture and its mirror image
 

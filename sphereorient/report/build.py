@@ -8,6 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient.cameras import Camera, without_perspective
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.files.threads import Progress, counted, silent
@@ -23,7 +28,7 @@ from sphereorient.report.texture_map import worn_figure
 from sphereorient.report.verdicts import Verdict, verdicts
 from sphereorient.sphere import load_texture
 from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
-from sphereorient.statistics.cameras import camera_distances, without_perspective
+from sphereorient.statistics.cameras import camera_distances
 from sphereorient.trajectory import Trajectory
 
 KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, and what is in them
@@ -57,7 +62,7 @@ def write_report(
     names = list(tracks)
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     summary = summarise(list(tracks.values()), settings, around, partial(progress, "numbers"), name)
-    rough = [None if (e := known[key]) is None else without_perspective(tracks[key], e.cameras) for key in tracks]
+    rough = [None if (e := known[key]) is None else uncorrected(tracks[key], e.cameras) for key in tracks]
     of = summary, tracks, camera_distances(list(tracks.values()), rough)
     words = verdicts(*of)
     with _folder(out) as aside:
@@ -119,6 +124,17 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
                 label, got = f"{experiment.path}, {key}", f"{value:g}"
                 raise ExperimentError(refusal(label, expected=f"{known[key]:g} as before", got=got, do=do))
     return Surroundings(**known)
+
+
+def uncorrected(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, NDArray[np.float64]]:
+    """Return a track's orientations by each of the given cameras, as `without_perspective`."""
+    return {
+        name: without_perspective(
+            cameras[name], torch.from_numpy(seen.centre_px), torch.from_numpy(seen.orientation)
+        ).numpy()
+        for name, seen in track.cameras.items()
+        if name in cameras
+    }
 
 
 def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> Iterator[Plan]:

@@ -4,14 +4,13 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from importlib import import_module
 from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import OutputError, refusal
+from sphereorient.files.provenance import package
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.datasets import stored_fields
 
@@ -182,12 +181,3 @@ def with_unit(name: str, units: str) -> str:
     """Return a name with its unit at the end, once: alpha_lab_rad_s2, score, centre_px."""
     unit = "" if units == "1" else "_" + units.replace("^", "").replace("/", "_")
     return name if name.endswith(unit) else f"{name}{unit}"
-
-
-def package(name: str, extra: str) -> Any:
-    """Import a package of an extra; an OutputError names the command that installs it."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        label, do = f"sphereorient[{extra}]", f"install it with `pip install sphereorient[{extra}]`"
-        raise OutputError(refusal(label, expected=f"the package {name}", got="none", do=do)) from error

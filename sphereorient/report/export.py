@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
+from sphereorient.files.provenance import package
 from sphereorient.files.whole_file import put_aside
 from sphereorient.report import columns as table
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
@@ -211,7 +212,7 @@ def _write_vtk(job: Export) -> None:
 
 def _write_nwb(job: Export) -> None:
     """Write Neurodata Without Borders: rotation, angular velocity, position and the walk as time series; SI units."""
-    pynwb = table.package("pynwb", "nwb")
+    pynwb = package("pynwb", "nwb")
     from datetime import UTC, datetime
 
     track, walk = job.track, job.track.walk()

@@ -12,13 +12,13 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sphereorient.calibration import Calibrated, PictureReport
+from sphereorient.calibration.comparison import LATEST
 from sphereorient.files.picture import decoded_grey
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import BRIGHT_QUANTILE, Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
 from sphereorient.preflight.cameras import expected_outline_px, sample_positions
 from sphereorient.preflight.first_look import FirstLook
-from sphereorient.preflight.in_step import REACH
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, say_empty, spread, write_figure
 from sphereorient.report.texture_map import draw_map
@@ -249,7 +249,7 @@ def _draw_gap(ax: Any, result: Preflight) -> None:
             ax.axvline(scan.best, ls="--", lw=1.2, color=EXPECTED, label=f"least at {scan.best:+.2f}{of}")
     late = result.scans[0].names[1] if single else f"the other movie than in {result.scans[0].names[0]}"
     ax.set(xlabel=f"frames later in {late}", ylabel="gap of the lines of sight (px)", ylim=(0, None))
-    ax.set_xlim(-REACH - 0.5, REACH + 0.5)
+    ax.set_xlim(-LATEST - 0.5, LATEST + 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(9, integer=True))
     ax.legend(fontsize=7, framealpha=0.8)
     ax.set_title("are the movies in step", fontsize=9)

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import Flag, OutputError, Reason
+from sphereorient.files.provenance import package
 from sphereorient.files.whole_file import put_aside
-from sphereorient.report.columns import package, plain_cell
+from sphereorient.report.columns import plain_cell
 from sphereorient.report.frame_warnings import stated_error
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.cameras import CameraDistance

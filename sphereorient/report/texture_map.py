@@ -20,20 +20,18 @@ from sphereorient.experiment import Experiment
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
-from sphereorient.mapping.compare import MapComparison
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.pose.worn import worn_share, worn_texels
 from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import contrast, crop, lit_picture
-from sphereorient.report.overlay_page import crop_side
+from sphereorient.report.overlay_page import RESIDUAL_REACH, crop_side
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note, spread
-from sphereorient.sphere.texture import seen_path
+from sphereorient.sphere.compare import MapComparison
+from sphereorient.sphere.texture import seen_path, texel_areas
 from sphereorient.trajectory import Trajectory
 
 EXTENT = -180, 180, -90, 90  # of the axes of a map, degrees
 EXAMPLES = 6  # frames that are shown
 UNSEEN = "#C9B48A"  # sand colour: differs from any paint
-REACH = 0.5  # of the contrast of white and black paint: the ends of the residual's scale
 ARROW = "#D0021B"
 LEARNT = {  # tensors of a learnt map in its file, without a unit
     "texture": "paint, 0 black .. 1 white; NaN where never seen",
@@ -149,7 +147,7 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
         figure,
         "Map: longitude to the right, latitude upwards, as seen from outside; sand: no picture shows the place. "
         "Examples: as filmed, as rendered with the map, and the difference, red where the picture is "
-        f"brighter; full colour is {REACH:g} of the step from black to white paint. Below: the correlation "
+        f"brighter; full colour is {RESIDUAL_REACH:g} of the step from black to white paint. Below: the correlation "
         "of the paint, for which the picture was held out of the map.",
     )
     return figure
@@ -166,7 +164,7 @@ def _draw_example(rows: Sequence[Axes], example: MapExample, first: bool) -> Non
     rows[0].set_title(example.title, fontsize=7)
     rows[1].set_facecolor(UNSEEN)
     rows[1].imshow(np.ma.masked_invalid(example.model), cmap="gray", vmin=low, vmax=high)
-    rows[2].imshow(np.ma.masked_invalid(residual), cmap="RdBu_r", vmin=-REACH, vmax=REACH)
+    rows[2].imshow(np.ma.masked_invalid(residual), cmap="RdBu_r", vmin=-RESIDUAL_REACH, vmax=RESIDUAL_REACH)
     rows[2].set_xlabel(f"paint: {example.correlation:.3f}", fontsize=7)
 
 

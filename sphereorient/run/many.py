@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
+from sphereorient.files.provenance import package
 from sphereorient.files.threads import Progress, limit_cores, silent
 from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import one_thread
@@ -112,17 +113,14 @@ def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
     """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
     Raises SettingsError: Dask is not installed, or the scheduler does not answer.
     """
-    try:
-        import distributed
-    except ImportError as error:
-        do = "install it with `pip install sphereorient[cluster]`"
-        raise SettingsError(refusal("--cluster", expected="the package distributed", got="none", do=do)) from error
-    join: Any = distributed.Client  # without types of its own
+    distributed = package("distributed", "cluster", SettingsError)
+    join = distributed.Client
     try:
         if cluster == "local":
             count = workers or os.cpu_count() or 1
-            local: Any = distributed.LocalCluster
-            here: Any = local(n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+            here = distributed.LocalCluster(
+                n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+            )
             return DaskExecutor(join(here), here)
         if cluster.endswith(".json"):
             return DaskExecutor(join(scheduler_file=cluster, timeout=20))

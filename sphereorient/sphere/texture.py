@@ -198,6 +198,13 @@ def texel_coordinates(direction_body: Tensor, height: int) -> tuple[Tensor, Tens
     return (longitude + math.pi) * (height / math.pi) - 0.5, (math.pi / 2 - latitude) * (height / math.pi) - 0.5
 
 
+def texel_areas(height: int) -> Tensor:
+    """Return the solid angle of every texel, (H, 2 H) float64, sr; the sum is 4 pi."""
+    edge = math.pi / 2 - math.pi * torch.arange(height + 1, dtype=torch.float64) / height
+    band = (edge[:-1].sin() - edge[1:].sin()) * (math.pi / height)
+    return band[:, None].expand(height, 2 * height)
+
+
 def _continued(texture: Tensor, texels: int) -> Tensor:
     """Pad the map across the poles (opposite meridian) and the date line."""
     beyond = texture.roll(texture.shape[1] // 2, 1)
@@ -212,6 +219,15 @@ def spline_weights(place: Tensor) -> tuple[Tensor, Tensor]:
     s = 1.0 - t
     weights = [s**3, 4.0 - 3.0 * t * t * (1.0 + s), 4.0 - 3.0 * s * s * (1.0 + t), t**3]
     return below.long() - 1, torch.stack(weights, dim=-1) / 6.0
+
+
+def fibonacci_directions(count: int) -> Tensor:
+    """Return evenly spread directions, (count, 3) float64, without the poles (Swinbank and Purser 2006)."""
+    k = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * k / count
+    angle = math.pi * (1 + math.sqrt(5.0)) * k
+    level = (1 - z * z).sqrt()
+    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=-1)
 
 
 def random_directions(count: int, rng: torch.Generator) -> Tensor:

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from itertools import combinations, zip_longest
 
 import numpy as np
-import torch
 
-from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.statistics.bootstrap import Floats
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.rotations import distance_rad
@@ -29,7 +27,7 @@ def camera_distances(
     tracks: Trajectory | Sequence[Trajectory], uncorrected: Sequence[Mapping[str, Floats] | None] = (), bins: int = 60
 ) -> list[CameraDistance]:
     """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
-    `uncorrected` holds for each track the result of `without_perspective`; None or missing: unknown.
+    `uncorrected` holds for each track the orientations of its cameras by `cameras.without_perspective`; None: unknown.
     Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
@@ -53,21 +51,6 @@ def _pooled(pair: tuple[str, str], apart: Floats, rough_parts: list[Floats] | No
     return CameraDistance(
         cameras=pair, distance_rad=apart, edges_rad=edges, pdf=own, uncorrected_rad=rough, uncorrected_pdf=other
     )
-
-
-def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
-    """Return R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
-    These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
-    Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
-    """
-    found = {}
-    for name, seen in track.cameras.items():
-        if name in cameras:
-            to_cam = cameras[name].R_cam_lab
-            direction_cam = cameras[name].rays(torch.from_numpy(seen.centre_px)).direction_lab @ to_cam.mT
-            rotation = to_cam.mT @ R_cam_view(direction_cam).mT @ to_cam
-            found[name] = (rotation @ torch.from_numpy(seen.orientation)).numpy()
-    return found
 
 
 def _pdf(x: Floats, edges: Floats) -> Floats:

@@ -17,7 +17,6 @@ NODES = 120  # values of a at which the likelihood is tabulated
 STEP = 1e-3  # of ln|x|, of its derivative
 FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
-TINY = 1e-300  # keeps the logarithm of 0 finite
 REACH, BINS = 10.0, 61  # of the PDF to either side, standard deviations; odd: one bin is about 0
 
 
@@ -38,7 +37,7 @@ def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float =
         logs = [np.log(w / np.sqrt(2 * np.pi)) + one for w, one in zip(weight, each, strict=True)]
         return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
     a = np.asarray(a, np.float64)
-    size = np.maximum(np.abs(x), TINY)
+    size = np.maximum(np.abs(x), 1e-300)  # keeps the logarithm of 0 finite
     z = (np.log(size / ROOT3) + 2 * a**2) / (np.sqrt(2) * a)
     far = np.maximum(z, 0.0)
     near = np.log(2.0) + log_ndtr(-np.sqrt(2) * np.minimum(z, 0.0))

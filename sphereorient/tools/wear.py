@@ -15,8 +15,11 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.compare import (
+from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note, spread
+from sphereorient.report.texture_map import CHANGE_REACH, EXTENT, draw_map
+from sphereorient.sphere.compare import (
     CHANGED,
+    HALF,
     RADIUS_DEG,
     MapComparison,
     compare_maps,
@@ -25,14 +28,10 @@ from sphereorient.mapping.compare import (
     turned_map,
     without_changed,
 )
-from sphereorient.mapping.grid import texel_areas
-from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note, spread
-from sphereorient.report.texture_map import CHANGE_REACH, EXTENT, draw_map
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import map_directions, texel_areas
 
 BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
 LEAST_DEG = 1.5  # radius of the smallest place that is reported
-HALF = 0.5  # share of a place that a map must know to give its worn share
 SHOWN = 6  # maps that are drawn at most, spread over the series
 NAMED = 6  # places that have their number in the maps, and their own curve
 

@@ -7,14 +7,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self, cast
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import Flag, OutputError, Reason, ShapeError, TrackError, refusal
+from sphereorient.errors import Flag, Reason, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, SPHERES, UNNAMED, whole_hdf5
+from sphereorient.files.provenance import package
 from sphereorient.trajectory import datasets, journal
 from sphereorient.trajectory.datasets import in_length, reasons_of, stored, stored_fields
 
@@ -244,11 +245,7 @@ class Trajectory:
         It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
         Raises OutputError: pandas is not installed.
         """
-        try:
-            import pandas as pd
-        except ImportError as error:
-            do = "install it with `pip install sphereorient[table]`"
-            raise OutputError(refusal("to_pandas", expected="the package pandas", got="none", do=do)) from error
+        pandas = package("pandas", "table")
         table: dict[str, NDArray[Any]] = {"time_s": self.time}
         table |= {name: getattr(self, name) for name in ("valid", "segment", "flags", "confidence")}
         for name, c in stored_fields(self):
@@ -257,7 +254,7 @@ class Trajectory:
                 table |= {f"{name}_{axis}_{unit}": getattr(self, name)[:, i] for i, axis in enumerate("xyz")}
         for name, R in (("quat", self.orientation), ("quat_smooth", self.orientation_smooth)):
             table |= {f"{name}_{axis}": part for axis, part in zip("wxyz", quaternions_wxyz(R).T, strict=True)}
-        return pd.DataFrame(table)
+        return cast("pd.DataFrame", pandas.DataFrame(table))
 
     @property
     def posed(self) -> Floats:

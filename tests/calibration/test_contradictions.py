@@ -99,6 +99,16 @@ def test_a_gap_between_the_lines_of_sight_is_stated_and_marked_from_a_pixel_on()
         np.testing.assert_allclose(np.sqrt(marked.position_cov[:, 0, 0]), half_mm, rtol=0.02)
 
 
+def test_a_gap_that_errors_of_the_calibration_explain_is_not_stated_again():
+    """Two lines of sight whose middle errs by sigma are 2 sigma apart: 7 sigma are 3.5 of these, 14 are 7."""
+    track = track_of({}, {"cam1": 3.0})
+    gap_mm = float((3.0 * MM / (2 * track.cameras["cam1"].radius_px)).mean())
+    for sigmas, stated in ((7, False), (14, True)):
+        systematic = np.broadcast_to((gap_mm / sigmas) ** 2 * np.eye(3), (FRAMES, 3, 3))
+        marked, _ = with_contradictions(replace(track, position_systematic_cov=systematic), CAMERAS, MM, True)
+        assert ((marked.position_cov > track.position_cov)[:, 0, 0] == stated).all()
+
+
 def test_a_gap_turns_a_pose_between_two_pictures_but_not_that_of_one_camera():
     for why, rolls in ((Reason.OK, True), (Reason.CONTRADICTS, False)):
         track = track_of({}, {"cam1": 3.0}, why)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sphereorient.cameras import R_cam_view
+from sphereorient.cameras import PinholeCamera, R_cam_view, without_perspective
 from sphereorient.errors import ShapeError
 
 Z = f64((0.0, 0.0, 1.0))
@@ -83,3 +83,23 @@ def test_a_batch_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
 def test_another_last_axis_is_refused():
     with pytest.raises(ShapeError, match=r"direction_cam: expected shape \(\.\.\., 3\)"):
         R_cam_view(torch.zeros(4, 2))
+
+
+def test_without_perspective_the_side_that_faces_the_camera_seems_to_face_along_its_axis():
+    camera = PinholeCamera(
+        R_cam_lab=torch.from_numpy(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()),
+        T_cam_lab_mm=f64((10.0, -20.0, 500.0)),
+        f_px=f64(2000.0),
+        centre_px=f64((320.0, 320.0)),
+        image_size=(640, 640),
+    )
+    rng = np.random.default_rng(4)
+    R = Rotation.random(62, rng).as_matrix()
+    uv = torch.from_numpy(rng.uniform(0, 640, (62, 2)))
+    found = without_perspective(camera, uv, torch.from_numpy(R)).numpy()
+    sight = camera.rays(uv).direction_lab.numpy()
+    axis_lab = camera.R_cam_lab.numpy()[2]
+    facing_body = np.einsum("nji,nj->ni", R, sight)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", found, facing_body), np.tile(axis_lab, (62, 1)), atol=1e-12)
+    turned = Rotation.from_matrix(found @ R.swapaxes(1, 2)).magnitude()
+    np.testing.assert_allclose(turned, np.arccos(sight @ axis_lab), atol=1e-7)

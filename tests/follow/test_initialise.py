@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import torch
 
-from sphereorient.follow.initialise import explaining_first
+from sphereorient.follow.initialise import Initialiser, explaining_first
+from sphereorient.locate import LocateSettings
+from sphereorient.locate.background import Background
+from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.poses import FittedPoses, blank_parts
 
 
@@ -39,3 +45,16 @@ def test_a_disk_of_unknown_paint_does_not_count():
 def test_poses_without_a_likelihood_stay_last():
     assert order([float("inf"), 50.0], [0.99, 0.5]) == [1, 0]
     assert order([float("nan"), 50.0, 40.0], [float("nan"), 0.5, 0.55]) == [2, 1, 0]
+
+
+def test_a_blob_with_less_merit_than_the_balls_is_none():
+    rows, columns = np.mgrid[:160, :160]
+    disk = np.hypot(rows - 80, columns - 70) < 20
+    empty = Background(mean=np.zeros(disk.shape, np.float32), noise=np.ones(disk.shape, np.float32), full_scale=255.0)
+    view = CameraView(name="cam1", camera=None, background=empty, diameter_px=40.0, sight=None)
+    search = Initialiser(fitter=None, proposers={}, locating=LocateSettings(), candidates=1, known={})
+    picture = np.where(disk, 120, 0).astype(np.uint8)
+    merit = search.merit(picture, view)
+    assert merit > 0
+    assert search.merit(picture, replace(view, merit_min=0.99 * merit)) == merit
+    assert search.merit(picture, replace(view, merit_min=1.01 * merit)) == 0

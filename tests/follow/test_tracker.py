@@ -193,3 +193,8 @@ def test_subsets_come_by_decreasing_size():
     assert list(by_decreasing_size([0, 1])) == [[(0,), (1,)]]  # of two cameras: each alone
     assert list(by_decreasing_size([0, 2, 3])) == [[(0, 2), (0, 3), (2, 3)], [(0,), (2,), (3,)]]
     assert list(by_decreasing_size([1])) == []
+
+
+def test_frames_that_are_followed_back_have_rising_times():
+    (back,) = mirrored([range(3, 6)], [0.0, 0.1, 0.2, 0.3, 0.5, 0.8])
+    assert [back.time_s[frame] for frame in range(back.first, back.last)] == [-0.8, -0.5, -0.3]

@@ -11,7 +11,7 @@ from sphereorient import so3
 from sphereorient.files.threads import silent
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.balls import shared_maps
-from sphereorient.mapping.compare import turned_map
+from sphereorient.sphere.compare import turned_map
 from sphereorient.sphere.texture import map_directions, random_texture
 from sphereorient.synth import SynthSettings
 

@@ -8,14 +8,25 @@ import numpy as np
 import pytest
 import torch
 
+from sphereorient import so3
 from sphereorient.cameras import sphere_disk_px
 from sphereorient.errors import PaintError
 from sphereorient.locate import CameraScene
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.position import assigned
-from sphereorient.mapping.balls import FARTHEST, FREE, crops_of_ball, linked_matches, linked_places, matched_instant
+from sphereorient.mapping.balls import (
+    FARTHEST,
+    FREE,
+    crops_of_ball,
+    linked_matches,
+    linked_places,
+    matched_instant,
+    nearest_texels,
+)
 from sphereorient.mapping.disks import Crop
 from sphereorient.pose.camera_view import CameraView
+from sphereorient.sphere.compare import turned_map
+from sphereorient.sphere.texture import random_texture
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras
 
@@ -132,3 +143,12 @@ def test_more_balls_named_than_seen_are_told(seen):
     six = [dict.fromkeys("abcdef", one["a"]) for one in scenes]
     with pytest.raises(PaintError, match="expected 6 balls in a frame"):
         linked_matches(instants, six, dict.fromkeys("abcdef", RADIUS_MM))
+
+
+def test_counts_follow_the_frame_as_the_paint_does():
+    paint, turn = random_texture("dots", 3, 128), so3.exp(torch.tensor([1.2, -2.0, 0.4], dtype=torch.float64))
+    turned = nearest_texels((paint > 0.5).long() * 7, turn, 128)
+    there = turned_map(paint, turn)
+    clear = (there - 0.5).abs() > 0.45
+    assert torch.equal(turned[clear], (there[clear] > 0.5).long() * 7)
+    assert set(turned.unique().tolist()) <= {0, 7}, "counts are not averaged"

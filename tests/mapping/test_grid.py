@@ -22,11 +22,10 @@ from sphereorient.mapping.grid import (
     sharpened,
     solve_map,
     stiffness,
-    texel_areas,
     texel_weights,
 )
 from sphereorient.mapping.joint import LinearSystem
-from sphereorient.sphere.texture import map_directions, random_directions, random_texture, sample_spline
+from sphereorient.sphere.texture import map_directions, random_directions, random_texture, sample_spline, texel_areas
 
 
 def test_a_look_up_is_the_spline_of_the_room_sphere(rng):

@@ -22,9 +22,9 @@ from sphereorient.experiment.timeline import timeline
 from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
-from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.mapping.learn import SHOWN_MIN, interpolated, times_seen
 from sphereorient.so3 import exp
+from sphereorient.sphere.texture import fibonacci_directions
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
 QUICK = MapSettings(pixels=700, rounds=6)

@@ -19,10 +19,10 @@ from sphereorient import so3
 from sphereorient.cli import main
 from sphereorient.cli.app import progress_bar
 from sphereorient.experiment.recording import open_recording
-from sphereorient.mapping.compare import compare_maps
 from sphereorient.movies import open_movie
 from sphereorient.report.texture_map import shares_seen, write_seen, write_texture
 from sphereorient.sphere import load_texture, read_seen, seen_path
+from sphereorient.sphere.compare import compare_maps
 from sphereorient.sphere.texture import random_texture
 from sphereorient.trajectory import Trajectory
 
@@ -225,7 +225,7 @@ def test_shares_are_of_the_sphere_not_of_the_picture():
 def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     paint = random_texture("dots", 3, 96)
     Q = so3.exp(torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64))
-    from sphereorient.mapping.compare import turned_map
+    from sphereorient.sphere.compare import turned_map
 
     save_map(paint, tmp_path / "old.png")
     save_map(turned_map(paint, Q.mT), tmp_path / "new.png")

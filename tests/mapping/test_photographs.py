@@ -22,11 +22,11 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.mapping import MapSettings
-from sphereorient.mapping.compare import compare_maps
 from sphereorient.mapping.pairs import search_pairs, search_views
 from sphereorient.mapping.photographs import all_pairs, find_photographs, joined_sets, measured_evidence
 from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.compare import compare_maps
 
 SETTINGS = MapSettings(disk_px=48)
 

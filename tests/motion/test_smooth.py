@@ -380,10 +380,9 @@ def test_every_setting_is_described() -> None:
     assert all(entry.description for entry in SmoothSettings.model_fields.values())
 
 
-@pytest.mark.slow
 def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_of_the_poses():
     # Of a variance c^2 s^2 the smoother estimates the fast part f; the slow one is f share / (1 - share).
-    truth, share = planted(), 0.25
+    truth, share = planted(time_s=clock(60)), 0.25
     without, with_slow = (
         smoothed(truth, *measured(truth, torch.Generator().manual_seed(7)), settings=each)
         for each in (WHITE, SmoothSettings(slow_share=share))

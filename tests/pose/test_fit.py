@@ -634,3 +634,14 @@ def test_errors_of_2000_noisy_renders_are_as_large_as_the_covariance_says(camera
     scaled, in_sigmas = drawn(64.0, cameras, kind, 200, 10)
     assert len(scaled) == 2000
     check_coverage(cameras, scaled, in_sigmas)
+
+
+def test_information_without_the_light_is_the_inverse_of_the_poses_covariance(rng):
+    columns = torch.randn(2, 9, 40, generator=rng, dtype=torch.float64)
+    normal, gradient = columns @ columns.mT, torch.randn(2, 9, generator=rng, dtype=torch.float64)
+    information, left, mixed = residuals_module.without_light(normal, gradient)
+    assert_close(information, torch.linalg.inv(torch.linalg.inv(normal)[:, :6, :6]), atol=1e-4)
+    step = torch.linalg.solve(information, left[..., None])[..., 0]
+    whole = torch.linalg.solve(normal, gradient[..., None])[..., 0]
+    assert_close(step, whole[:, :6], atol=1e-6)
+    assert_close(mixed, torch.linalg.solve(normal[:, 6:, 6:], normal[:, 6:, :6]), atol=1e-6)

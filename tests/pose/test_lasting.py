@@ -29,7 +29,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.pose.lasting import Lasting, lasting_errors, limb_wider_px, of_left_out
+from sphereorient.pose.lasting import Lasting, by_power, lasting_errors, limb_wider_px, of_left_out
 from sphereorient.pose.poses import FittedPoses, PoseStart
 
 COUNT, SIGMA = 24, 4.0
@@ -174,3 +174,9 @@ def test_what_two_models_differ_in_is_within_one_sigma():
         for camera in range(2):
             distance2 = more[camera] @ torch.linalg.solve(wide.own_rad2[camera], more[camera])
             assert_close(distance2, torch.ones((), dtype=torch.float64), atol=1e-4)
+
+
+def test_light_by_the_logarithm_of_its_power_is_as_differences_say():
+    light, scale, step = torch.tensor([3.0, 40.0, 90.0], dtype=torch.float64), torch.tensor(40.0), 1e-5
+    more, less = (scale * (light / scale) ** np.exp(power) for power in (step, -step))
+    assert_close(by_power(light, scale), (more - less) / (2 * step), atol=1e-6)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from conftest import assert_close
@@ -27,7 +28,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose.lights.disk import DiskLight, light_basis, light_columns, light_sums, no_glints, solved_light
-from sphereorient.pose.model import FIRST, SphereView, even_light
+from sphereorient.pose.model import FIRST, SphereView, even_light, leaning
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import PoseStart
 from sphereorient.pose.residuals import noise_curve
@@ -311,3 +312,53 @@ def lamp_pictures(rig: Rig, X: Tensor, R: Tensor, sigma: float = 5.0) -> Tensor:
         difference, black = (part.reshape(-1, height, width) for part in lamp(across.flatten(2), c))
         pictures.append(BEHIND * (1 - filled[:, c]) + black * filled[:, c] + difference * paint[:, c])
     return noisy(blurred(torch.stack(pictures, dim=1).float(), OPTICS_PX), sigma, 6)
+
+
+def a_view(across: Tensor, blur: float = 0.1) -> SphereView:
+    """Grey paint of slope 0.3 per radius to the right on one disk of radius 7 mm, at places (2, P)."""
+    count = across.shape[1]
+    none = torch.zeros(1, 3, count, dtype=torch.float64)
+    by_position = none.clone()
+    by_position[:, 0] = -0.3 / 7.0  # a ball that moves to the right brings darker paint
+    return SphereView(
+        paint=0.5 + 0.3 * across[None, 0],
+        coverage=torch.ones(1, count, dtype=torch.float64),
+        across=across[None],
+        outward=none,
+        aside=across.norm(dim=0)[None],
+        paint_by_rotation=none,
+        paint_by_position=by_position,
+        coverage_by_position=none,
+        known=None,
+        blur=torch.full((1, 1), blur, dtype=torch.float64),
+    )
+
+
+def test_the_blur_of_paint_and_light_together_is_that_of_their_product():
+    across = torch.tensor([[0.2, -0.4], [0.1, 0.0]], dtype=torch.float64)
+    lean = even_light(1)["lean"]
+    lean[0, 0, 0] = 0.5  # the logarithm of the light rises by so much per radius to the right
+    model = SimpleNamespace(light=SimpleNamespace(lean=lean), radius_mm=7.0)
+    pixels = SimpleNamespace(axes=torch.eye(3, dtype=torch.float64)[None, :2])
+    found = leaning(a_view(across), pixels, model).paint
+    node, weight = (torch.from_numpy(part) for part in np.polynomial.hermite_e.hermegauss(9))
+    lit = weight * (0.5 * 0.1 * node).exp()
+    by_force = (lit * (0.5 + 0.3 * (across[0][:, None] + 0.1 * node))).sum(1) / lit.sum()
+    assert_close(found[0], by_force, atol=1e-9)
+    assert not torch.allclose(a_view(across).paint, found, atol=1e-3)
+
+
+def test_the_lean_of_a_light_is_the_slope_of_its_logarithm():
+    class Lamp(DiskLight):
+        def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
+            x, y = view.across.unbind(1)
+            return 80.0 * (0.5 * x - 0.25 * y + 0.3 * x * y).exp(), 0.0 * x
+
+    step = torch.linspace(-0.65, 0.65, 24, dtype=torch.float64)
+    across = torch.stack(torch.meshgrid(step, step, indexing="xy")).flatten(1)
+    lamp = Lamp.unknown(1, NOISE).with_lean(a_view(across), None, torch.ones(1, 1, dtype=torch.bool))
+    by_x, by_y = lamp.lean[0].double()
+    expected = torch.zeros(2, 10, dtype=torch.float64)  # of 1, x, y, ...
+    expected[0, [0, 2]], expected[1, [0, 1]] = torch.tensor([[0.5, 0.3], [-0.25, 0.3]]).double()
+    assert_close(by_x, expected[0], atol=1e-3)
+    assert_close(by_y, expected[1], atol=1e-3)

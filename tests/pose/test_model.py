@@ -312,6 +312,18 @@ def test_a_moving_sphere_is_the_mean_over_the_exposure(model):
     assert torch.allclose(exposed(at_rest), exposed(looked(pixels, X, R)), atol=1e-6)
 
 
+def test_paint_that_turns_in_the_exposure_is_smeared():
+    one, (X, R) = rig("pinhole", 40.0), ball()
+    pixels, turned = empty(one, X), f64([[0.3, -0.2, 0.4, 0.0, 0.0, 0.0]])
+    shares = (torch.arange(40) + 0.5) / 40 - 0.5
+    mean = torch.stack([exposed(looked(pixels, X, so3.exp(s * turned[:, :3]) @ R)) for s in shares]).mean(0)
+    still, turning = (
+        (exposed(looked(some, X, R)) - mean).square().mean().sqrt()
+        for some in (pixels, replace(pixels, moved=turned, instants=8))
+    )
+    assert turning < 0.05 * still
+
+
 def test_a_moving_sphere_changes_as_its_derivatives_say():
     one, (X, R) = rig("pinhole", 40.0), ball()
     pixels = replace(empty(one, X), moved=MOVED, instants=3)

@@ -14,7 +14,7 @@ from conftest import assert_close
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sphereorient.calibration.comparison import gaps_between
+from sphereorient.calibration.comparison import LATEST, gaps_between
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, holds_disk, triangulate
 from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.experiment.recording import pictures_of
@@ -23,7 +23,7 @@ from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
 from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.preflight.finding import FAULT, OK, worst
-from sphereorient.preflight.in_step import REACH, OffsetScan, in_step, scan_offsets, starts_in_step
+from sphereorient.preflight.in_step import OffsetScan, in_step, scan_offsets, starts_in_step
 from sphereorient.preflight.movies import limb_blur_px, motion_blur
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
 from sphereorient.preflight.texture_map import match_texture
@@ -105,7 +105,7 @@ def test_the_least_gap_is_at_the_planted_offset(late):
     steps = steps_of(late)
     assert steps.shift == late
     assert steps.best == pytest.approx(late, abs=0.1)
-    assert float(steps.gap_px[REACH + late]) < 1e-6
+    assert float(steps.gap_px[LATEST + late]) < 1e-6
 
 
 @pytest.mark.parametrize("late", [-3, 0, 2])
@@ -119,7 +119,7 @@ def test_a_ball_that_hardly_moves_tells_nothing():
     assert math.isnan(steps_of(2, moving=0.02).best)
 
 
-@given(st.integers(0, 30), st.integers(0, 30), st.integers(-REACH, REACH))
+@given(st.integers(0, 30), st.integers(0, 30), st.integers(-LATEST, LATEST))
 def test_the_start_advised_shifts_by_the_offset_and_is_never_negative(first, second, shift):
     new_first, new_second = starts_in_step({"a": first, "b": second}, {"a": 0.0, "b": float(shift)}).values()
     assert new_second - new_first == second - first + shift
@@ -242,7 +242,7 @@ def test_a_telecentric_camera_expects_its_own_scale():
 def scans_of(best: dict[str, float]) -> list[OffsetScan]:
     """Scans of other movies against the first; the gap is least at the offsets given."""
     first, *others = best
-    offset = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
+    offset = torch.arange(-LATEST, LATEST + 1, dtype=torch.float64)
     return [
         OffsetScan(
             gap_px=0.1 + (offset - best[name]).abs(),

@@ -13,7 +13,6 @@ from preflight_examples import PAINTED, Example, checked, clean_example, of
 
 from sphereorient import so3
 from sphereorient.errors import TextureError
-from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.preflight import Severity
 from sphereorient.preflight.texture_map import (
     ViewPair,
@@ -24,7 +23,7 @@ from sphereorient.preflight.texture_map import (
     views_towards,
 )
 from sphereorient.search.settings import GreySearchSettings
-from sphereorient.sphere.texture import map_directions, random_texture
+from sphereorient.sphere.texture import fibonacci_directions, map_directions, random_texture
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 RADIUS_PX = 39.0

@@ -11,9 +11,9 @@ from sphereorient import so3
 from sphereorient.experiment import Sphere
 from sphereorient.files.threads import silent
 from sphereorient.locate.outline import Outline
-from sphereorient.mapping.compare import turned_map
 from sphereorient.preflight.finding import FAULT, OK, WARNING
 from sphereorient.preflight.scene import ball_sizes, disk_counts, found_balls, look_at_scene, same_paint
+from sphereorient.sphere.compare import turned_map
 from sphereorient.sphere.texture import random_texture
 
 PX_PER_MM = 4.0

@@ -168,7 +168,9 @@ def test_names_of_cameras_that_no_table_takes_are_made_plain():
 @pytest.mark.parametrize("package", ["pyarrow", "xarray"])
 def test_a_missing_package_is_named_with_its_remedy(monkeypatch, track, tmp_path, package):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(OutputError, match=rf"package {package}, got none; .*pip install sphereorient\[table\]") as told:
+    with pytest.raises(
+        OutputError, match=rf"package {package}, got none; .*pip install 'sphereorient\[table\]'"
+    ) as told:
         to_xarray(track) if package == "xarray" else export_track(track, tmp_path / "t.parquet")
     assert "\n" not in str(told.value)
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ from sphere_examples import body_direction, f64, looked_up, random_map
 
 from sphereorient.errors import ShapeError, TextureError
 from sphereorient.sphere import load_texture, load_unseen, reduced_texture, sample_texture, unseen_share
-from sphereorient.sphere.texture import map_directions, sample_spline, texture_coordinates
+from sphereorient.sphere.texture import map_directions, sample_spline, texel_areas, texture_coordinates
 
 
 def saved(folder, picture, name="texture.png"):
@@ -280,3 +280,9 @@ def test_counts_of_another_size_and_a_map_without_paint_are_refused(tmp_path):
     saved(tmp_path, np.zeros((16, 32), np.uint8), "texture_seen.png")
     with pytest.raises(TextureError, match="expected paint that some picture shows, got none"):
         load_unseen(path)
+
+
+def test_texel_areas_are_those_of_their_zones():
+    area = texel_areas(3) / (4 * math.pi)  # 60 degrees a row
+    assert float(area.sum()) == pytest.approx(1.0)
+    assert_close(area[:, 0] * 6, torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))

@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 from statistics_examples import track
 
-from sphereorient.cameras import PinholeCamera
-from sphereorient.statistics.cameras import camera_distances, without_perspective
+from sphereorient.statistics.cameras import camera_distances
 from sphereorient.trajectory import CameraTrack
 
 
@@ -45,32 +43,6 @@ def test_distances_without_the_correction_come_beside_where_given():
 
 def test_one_camera_has_no_distance():
     assert camera_distances(replace(track([60]), cameras={"a": CameraTrack.empty(62)})) == []
-
-
-def test_without_perspective_the_side_that_faces_the_camera_seems_to_face_along_its_axis():
-    camera = PinholeCamera(
-        R_cam_lab=torch.from_numpy(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()),
-        T_cam_lab_mm=torch.tensor([10.0, -20.0, 500.0], dtype=torch.float64),
-        f_px=torch.tensor(2000.0, dtype=torch.float64),
-        centre_px=torch.tensor([320.0, 320.0], dtype=torch.float64),
-        image_size=(640, 640),
-    )
-    whole = track([60])
-    count = len(whole)
-    rng = np.random.default_rng(4)
-    R = Rotation.random(count, rng).as_matrix()
-    uv = rng.uniform(0, 640, (count, 2))
-    one = replace(CameraTrack.empty(count), orientation=R, centre_px=uv)
-    found = without_perspective(replace(whole, cameras={"cam": one, "other": one}), {"cam": camera})
-    assert list(found) == ["cam"]
-    sight = camera.rays(torch.from_numpy(uv)).direction_lab.numpy()
-    axis_lab = camera.R_cam_lab.numpy()[2]
-    facing_body = np.einsum("nji,nj->ni", R, sight)
-    np.testing.assert_allclose(
-        np.einsum("nij,nj->ni", found["cam"], facing_body), np.tile(axis_lab, (count, 1)), atol=1e-12
-    )
-    turned = Rotation.from_matrix(found["cam"] @ R.swapaxes(1, 2)).magnitude()
-    np.testing.assert_allclose(turned, np.arccos(sight @ axis_lab), atol=1e-7)
 
 
 def test_distances_of_many_tracks_are_pooled_by_the_names_of_the_cameras():

@@ -17,10 +17,9 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cli import main
 from sphereorient.errors import PaintError
-from sphereorient.mapping.compare import turned_map
-from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_seen
-from sphereorient.sphere.texture import map_directions, random_texture
+from sphereorient.sphere.compare import turned_map
+from sphereorient.sphere.texture import map_directions, random_texture, texel_areas
 from sphereorient.tools.wear import WearSeries, connected_places, wear_series
 
 HEIGHT = 128
@@ -150,12 +149,6 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
     number = connected_places(pole)
     assert number[0, 1] == number[0, 5] != number[3, 0] == number[3, 3]
     assert int(number.max()) == 2
-
-
-def test_texel_areas_are_those_of_their_zones():
-    area = texel_areas(3) / (4 * math.pi)  # 60 degrees a row
-    assert float(area.sum()) == pytest.approx(1.0)
-    assert_close(area[:, 0] * 6, torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))
 
 
 def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:

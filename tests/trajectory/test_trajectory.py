@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import shutil
 import subprocess
@@ -262,15 +261,8 @@ def test_the_table_has_units_in_its_names_and_quaternions_w_first() -> None:
 
 
 def test_the_table_names_the_extra_where_pandas_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    real_import = builtins.__import__
-
-    def no_pandas(name: str, *rest: Any, **more: Any) -> Any:
-        if name == "pandas":
-            raise ImportError(name)
-        return real_import(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", no_pandas)
-    with pytest.raises(OutputError, match=r"pip install sphereorient\[table\]"):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(OutputError, match=r"pip install 'sphereorient\[table\]'"):
         full_trajectory().to_pandas()
 
 

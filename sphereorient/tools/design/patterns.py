@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.sphere import sample_texture
-from sphereorient.sphere.texture import map_directions, random_directions
+from sphereorient.sphere.texture import fibonacci_directions, map_directions, random_directions
 
 POINTS = 40_000  # at which a map is sampled: 1 degree apart
 CIRCLES, AROUND = 400, 1440  # great circles on which borders are counted, and points of each

@@ -11,17 +11,8 @@ from map_examples import shift_field, warped
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.mapping.balls import nearest_texels
-from sphereorient.mapping.compare import (
-    compare_maps,
-    compass,
-    fibonacci_directions,
-    fit_levels,
-    texture_change,
-    turned_map,
-    without_changed,
-)
-from sphereorient.sphere.texture import map_directions, random_texture
+from sphereorient.sphere.compare import compare_maps, compass, fit_levels, texture_change, turned_map, without_changed
+from sphereorient.sphere.texture import fibonacci_directions, map_directions, random_texture
 
 HEIGHT = 128
 TURN = so3.exp(torch.tensor([1.2, -2.0, 0.4], dtype=torch.float64))
@@ -151,15 +142,6 @@ def test_worn_paint_is_shown_and_moved_paint_is_not(paint):
     unknown = torch.where(spot, torch.nan, paint)
     assert torch.isnan(texture_change(unknown, paint)[spot]).all()
     assert torch.isnan(texture_change(paint, unknown)[spot]).all()
-
-
-def test_counts_follow_the_frame_as_the_paint_does(paint):
-    counts = (paint > 0.5).long() * 7
-    turned = nearest_texels(counts, TURN, HEIGHT)
-    there = turned_map(paint, TURN)
-    clear = (there - 0.5).abs() > 0.45
-    assert_close(turned[clear], (there[clear] > 0.5).long() * 7)
-    assert set(turned.unique().tolist()) <= {0, 7}, "counts are not averaged"
 
 
 def test_compass_axes_point_east_and_north():

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.sphere.texture import check_texture_shape, map_directions, sample_texture
+from sphereorient.sphere.texture import check_texture_shape, fibonacci_directions, map_directions, sample_texture
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 
 SEARCH_DEG = 10.0  # step of the grid of rotations
@@ -24,7 +24,7 @@ ALIKE_MIN = 0.55  # correlation below which two maps do not show one ball; of tw
 DIRECTIONS = 500  # in which the displacement is measured
 FINE_BLUR_DEG = 0.5  # of the finest tables: below a cell of theirs
 SIDE = 256  # of the tables: 0.7 degrees, tangent planes between
-HALF = 0.5  # share of a patch that must have been seen
+HALF = 0.5  # share of a patch, or of a worn place, that a map must know
 RADIUS_DEG = 1.0  # within which the other map must show a grey level: displacement alone is no wear
 CHANGED = 0.15  # of black to white: a change that is reported
 CHANGED_SHARE = 0.01  # of a patch
@@ -155,15 +155,6 @@ def without_changed(comparison: MapComparison, change: Tensor, most: float) -> M
     changed = (change.abs() > most).double()  # an unknown texel has not changed
     spoilt = sample_texture(changed, spots).mean(1) > CHANGED_SHARE
     return replace(comparison, moved_rad=torch.where(spoilt[:, None], torch.nan, comparison.moved_rad))
-
-
-def fibonacci_directions(count: int) -> Tensor:
-    """Return evenly spread directions, (count, 3) float64, without the poles (Swinbank and Purser 2006)."""
-    k = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * k / count
-    angle = math.pi * (1 + math.sqrt(5.0)) * k
-    level = (1 - z * z).sqrt()
-    return torch.stack([level * angle.cos(), level * angle.sin(), z], dim=-1)
 
 
 def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
