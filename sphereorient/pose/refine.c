@@ -1253,7 +1253,7 @@ static void point_at(const Near *n, Task *t, int64_t pose) {
     t->covariance = of->covariance + pose * 36, t->step = of->step + pose * 6, t->nll = of->nll + pose;
     t->own_turn = of->own_turn + k * 3, t->own_covariance = of->own_covariance + k * 9;
     t->own_move = of->own_move + k * 3, t->own_sigma = of->own_sigma + k;
-    t->excess = of->excess + k, t->score = of->score + k;
+    t->limb_coverage = of->limb_coverage + k, t->excess = of->excess + k, t->score = of->score + k;
 }
 
 /* Take one step, and `more` from where that one was long; return whether it was. */
