@@ -47,7 +47,8 @@ operations on batches (`sphereorient/synth/degrade.py`), changes of the scene an
 experiment with exact truth and any number of them at once; `synth.degrade` applies those of pictures to a batch.
 Level 1 is a good lab on a bad day, level 5 is where failure is expected. They are applied in the order of the table,
 which is that of the light: scene, paint, light, what is behind and before the ball, liquid, lens, sensor, memory; last
-comes what the method is given. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)).
+comes what the method is given. The optics' own blur is between the light on the ball (`uneven_light`, `highlights`) and
+what is behind and before it. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)).
 Movies of several balls (`balls`) take all but `uneven_light`, `highlights`, `occlusion` and `bubbles`, which lie on the
 disk of one ball. Table and figure are made by `scripts/figure_degradations.py`.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from sphereorient.files.picture import write_picture
 from sphereorient.movies import write_ffv1
 from sphereorient.synth import RandomMotion, SynthSettings, degrade, make_scene, random_texture
 from sphereorient.synth.degrade import Disk
-from sphereorient.synth.degrade_scene import picture_of_ball
+from sphereorient.synth.degrade_scene import picture_of_ball, through_optics
 from sphereorient.synth.scene import Exposure, digitise, exposures, seeded
 from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, instants_s, write_truth
 
@@ -96,14 +95,9 @@ def put(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple
     """
     static, moving = (seeded(TEXTURE_SEED, *seeds[:count]) for count in (1, 3))
     bubbles = {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}
-    behind, cover = torch.from_numpy(light[exposure.window].copy()), torch.from_numpy(exposure.cover)
-    exposure.put(light)
-    lit = replace(disk, cover=cover, behind=behind)
-    beyond = exposure.within(round(0.5 * float(disk.radius_px)))  # bubbles reach beyond the sphere, lamps do not
-    for part, one, values, rng in (exposure, lit, LAMPS, static), (beyond, disk, bubbles, moving):
-        corner = torch.tensor([side.start for side in part.window[::-1]])
-        inside = replace(one, centre_px=one.centre_px - corner)
-        light[part.window] = degrade(torch.from_numpy(light[part.window]), inside, values, rng)
+    through_optics(exposure, disk, LAMPS, lambda _: static).put(light)
+    window = exposure.within(round(0.5 * float(disk.radius_px))).window  # bubbles reach beyond the sphere
+    light[window] = degrade(torch.from_numpy(light[window]), disk.within(window), bubbles, moving)
 
 
 def film(folder: Path, number: int, frames: int) -> None:

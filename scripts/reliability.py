@@ -10,15 +10,14 @@ whether it is within 10 degrees of the truth. A run that was cut off goes on. A 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from sphereorient.bench import BenchSettings, SceneResult
 from sphereorient.bench.results import WRONG_DEG
-from sphereorient.bench.run import CACHE, KEPT, kept_results, limit_threads, run_scene, trackers_of
+from sphereorient.bench.run import CACHE, KEPT, kept_results, run_all, run_scene, trackers_of
 from sphereorient.bench.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.cli.app import progress_bar
 from sphereorient.learn.metrics import reliability
@@ -40,16 +39,11 @@ def main() -> None:
     (options.out / KEPT).mkdir(parents=True, exist_ok=True)
     places = [options.out / KEPT / f"{scene.name}.{METHOD}.json" for scene in scenes]
     missing = [scene for scene, place in zip(scenes, places, strict=True) if not place.exists()]
-    with (
-        progress_bar(unit="") as advance,
-        ProcessPoolExecutor(
-            options.jobs, multiprocessing.get_context("spawn"), limit_threads, (options.out / CACHE,)
-        ) as pool,
-    ):
-        tasks = [pool.submit(run_scene, options.out, scene, trackers_of([METHOD])) for scene in missing]
-        for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
-            task.result()
-            advance("scenes", done, len(scenes))
+    tasks = [partial(run_scene, options.out, scene, trackers_of([METHOD])) for scene in missing]
+    with progress_bar(unit="") as advance:
+        run_all(
+            tasks, options.out / CACHE, options.jobs, lambda left: advance("scenes", len(scenes) - left, len(scenes))
+        )
     outcomes = [one for place in places for one in kept_results(place)]
     tell(outcomes)
 

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sphereorient.bench.run import CACHE, limit_threads
+from sphereorient.bench.run import CACHE, run_all
 from sphereorient.cli.app import progress_bar
 from sphereorient.errors import Flag, SphereOrientError
 from sphereorient.experiment import load_experiment
@@ -89,14 +87,15 @@ def main() -> None:
 def measured(tasks: Sequence[tuple[str, Callable[[], list[Stated]]]], out: Path, jobs: int) -> list[Stated]:
     """Measure what is not kept yet; return all."""
     places = [out / f"{name}.json" for name, _ in tasks]
-    missing = [(place, task) for place, (_, task) in zip(places, tasks, strict=True) if not place.exists()]
-    context = multiprocessing.get_context("spawn")
-    with progress_bar(unit="") as advance, ProcessPoolExecutor(jobs, context, limit_threads, (out / CACHE,)) as pool:
-        running = [(place, pool.submit(task)) for place, task in missing]
-        for done, (place, task) in enumerate(running, start=len(tasks) - len(missing) + 1):
-            write_text(place, json.dumps([asdict(one) for one in task.result()]))
-            advance("movies", done, len(tasks))
+    missing = [partial(keep, place, task) for place, (_, task) in zip(places, tasks, strict=True) if not place.exists()]
+    with progress_bar(unit="") as advance:
+        run_all(missing, out / CACHE, jobs, lambda left: advance("movies", len(tasks) - left, len(tasks)))
     return [Stated(**one) for place in places for one in json.loads(place.read_text())]
+
+
+def keep(place: Path, task: Callable[[], list[Stated]]) -> None:
+    """Measure, and write what was measured."""
+    write_text(place, json.dumps([asdict(one) for one in task()]))
 
 
 def of_set(folder: Path, cameras: Sequence[str]) -> list[Stated]:

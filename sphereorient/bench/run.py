@@ -78,23 +78,31 @@ def run_benchmark(
     scenes = scenes_of(settings)
     # The hardest first, which take longest: no process waits for another's last one.
     missing = sorted((scene for scene in scenes if _missing(folder, scene, chosen)), key=lambda scene: -scene.level)
-    progress(len(scenes) - len(missing), len(scenes))
-    context = multiprocessing.get_context("spawn")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
-    with ProcessPoolExecutor(jobs, context, limit_threads, (folder / CACHE,)) as pool:
-        tasks = [pool.submit(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
-        try:
-            for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
-                task.result()
-                progress(done, len(scenes))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    tasks = [partial(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
+    run_all(tasks, folder / CACHE, jobs, lambda left: progress(len(scenes) - left, len(scenes)))
     outcomes = [one for scene in scenes for name in chosen for one in kept_results(_path(folder, scene, name))]
     results = Results(settings=settings, versions=versions(), outcomes=outcomes)
     save_results(results, folder / RESULTS)
     shutil.rmtree(folder / CACHE, ignore_errors=True)
     return results
+
+
+def run_all(
+    tasks: Sequence[Callable[[], None]], cache: Path, jobs: int, progress: Callable[[int], None] = lambda left: None
+) -> None:
+    """Run tasks in `jobs` processes of one thread each, see `limit_threads`; `progress` gets how many are left."""
+    progress(len(tasks))
+    context = multiprocessing.get_context("spawn")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
+    with ProcessPoolExecutor(jobs, context, limit_threads, (cache,)) as pool:
+        running = [pool.submit(task) for task in tasks]
+        try:
+            for done, task in enumerate(as_completed(running), start=1):
+                task.result()
+                progress(len(tasks) - done)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def run_benchmarks(

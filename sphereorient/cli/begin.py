@@ -223,7 +223,7 @@ def _found(look: "FirstLook") -> str:
         return f"{told}; no ball was found: light, or more than one thing that moves?"
     where = (
         "one picture"
-        if len(look.movie) == 1
+        if look.photograph
         else "stays in its place"
         if look.stays
         else f"moves, found in {look.found} of {look.looked} frames"
@@ -237,7 +237,7 @@ def _next(target: Path, cameras: Path, looks: "Sequence[FirstLook]") -> list[str
         "sphereorient init --plate FOLDER  # pictures of a calibration plate",
         f"sphereorient calibrate calibration.yaml --out {cameras}",
     ]
-    photographs = all(len(look.movie) == 1 for look in looks)  # no map is learnt from one picture
+    photographs = all(look.photograph for look in looks)  # no map is learnt from one picture
     return [
         *([] if cameras.exists() else calibrate),
         *([] if photographs else [f"sphereorient map {target} --out {target.parent / 'texture.png'}"]),

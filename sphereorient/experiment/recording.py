@@ -48,6 +48,11 @@ class CameraStream:
     def __len__(self) -> int:
         return len(self.rows)
 
+    @property
+    def photograph(self) -> bool:
+        """Whether it is one picture: of one camera alone it tells the size of the ball."""
+        return len(self) == 1
+
     def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
         """Yield the pictures of frames first .. last - 1, from the first frame in use, or None, with the reason."""
         return self._with_reasons(self.movie.readable, first, last)
@@ -216,8 +221,8 @@ class Recording:
 
     @property
     def photograph(self) -> bool:
-        """Whether one picture of one camera is all there is: it tells the size of the ball."""
-        return len(self.streams) == len(self.timeline.number) == 1
+        """Whether one picture of one camera is all there is."""
+        return len(self.streams) == 1 and self.streams[0].photograph
 
     @property
     def frames(self) -> range:

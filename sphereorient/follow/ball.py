@@ -36,7 +36,7 @@ HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk tha
 SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 # What a camera alone gives, beside rotation and move from the pose.
-OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
+OWN = ("own_covariance", "own_sigma_mm", "limb_coverage", "excess", "score")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

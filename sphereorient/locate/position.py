@@ -78,9 +78,9 @@ def find_positions(
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
     rays: Rays  # (N), to the centre of the outline
-    from_size_mm: Tensor  # (N, 3), on the ray, at the distance from the radius
+    from_size_mm: Tensor  # (N, 3), on the ray, at the distance from the radius; of parallel rays anywhere
     across: Tensor  # (N, 3, 3), information across the ray, of the centre alone, 1/mm^2; 1 px where not measured
-    whole: Tensor  # (N, 3, 3), of centre and radius
+    whole: Tensor  # (N, 3, 3), of centre and radius; NaN of parallel rays
 
 
 def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
@@ -90,6 +90,8 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     # Sine of the angle between the rays of centre and limb: exact for small angles.
     away = torch.linalg.cross(rays.direction_lab[:, None].expand_as(limb.direction_lab), limb.direction_lab)
     sine = away.norm(dim=-1).mean(1)
+    parallel = sine == 0  # of a telecentric camera: its pictures do not tell the distance, and any will do
+    sine = torch.where(parallel, 1.0, sine)
     distance = radius_mm / sine
     # Behind a port the rays start apart: subtract this part of the distance.
     begun = torch.linalg.cross(rays.origin_lab_mm[:, None] - limb.origin_lab_mm, limb.direction_lab)
@@ -105,7 +107,7 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
         rays=rays,
         from_size_mm=rays.origin_lab_mm + along * rays.direction_lab,
         across=px_mm[:, :2].mT @ torch.linalg.inv(covariance[:, :2, :2]) @ px_mm[:, :2],
-        whole=px_mm.mT @ torch.linalg.inv(covariance) @ px_mm,
+        whole=torch.where(parallel[:, None, None], torch.nan, px_mm.mT @ torch.linalg.inv(covariance) @ px_mm),
     )
 
 

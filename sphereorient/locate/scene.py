@@ -69,7 +69,7 @@ def find_scenes(
     each = {name: recording.of(name) for name in recording.experiment.names}
     sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
     empty, background = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None
-    photograph = len(stream) == len(each) == 1
+    photograph = stream.photograph and len(each) == 1
     in_place = photograph or all(one.experiment.fixed for one in each.values())
     if in_place and (empty is None or None in sizes.values()):
         find = still_ball if photograph else fixed_ball

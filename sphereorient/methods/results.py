@@ -129,6 +129,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         centre_px=centre_px.numpy(),
         centre_sigma_px=(picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm).numpy(),
         radius_px=radius_px.numpy(),
+        limb_coverage=torch.where(shown, picked["limb_coverage"][:, place], torch.nan).numpy(),
         orientation=torch.where(where, turned_alone(picked, place), torch.nan).numpy(),
         orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
         score=picked["score"][:, place].numpy(),

@@ -18,6 +18,7 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
 from sphereorient.pose.residuals import (
     EDGE_PX,
+    Residuals,
     disk_sums,
     loss_of,
     noise_variance,
@@ -150,6 +151,7 @@ def refine(
         R_lab_body=R,
         covariance=_covariance(last, pixels, begin, model),
         **_by_each(last, model.radius_mm),
+        limb_coverage=by_pose(_limb_coverage(at, pixels, last.to_centre.flatten(0, 1), model), cameras),
         score=by_pose(scores_of(at).double(), cameras),
         nll=(by_pose(loss_of(at, pixels.inside), cameras) * seen).sum(1),
         step=step,
@@ -220,6 +222,20 @@ def _limb_moved_px(step: Tensor, model: SphereModel) -> Tensor:
     stray = model.light.stray.double()
     share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
     return model.blur_px * share.sqrt() / step.clamp_min(1.0)
+
+
+def _limb_coverage(at: Residuals, pixels: Pixels, to_centre: Tensor, model: SphereModel) -> Tensor:
+    """Return the share of the limb of L disks whose pixels count, (L,): border, masks, occluders, shadow and unknown
+    paint take some. `to_centre` (L, 3), mm.
+    """
+    limb = (at.view.coverage_by_position.norm(dim=1) * (at.weight > 0)).double().sum(-1)  # 1/mm
+    distance = to_centre.norm(dim=-1)
+    px_mm = pixels.pitch_mm + pixels.pitch_rad * distance
+    place_px2 = math.pi * float(pixels.place[:, -1].square().sum()) / pixels.place.shape[1]  # one stands for
+    # That of a whole disk on the camera's axis: of a near ball the picture is larger than its angle.
+    whole = 2 * math.pi * model.radius_mm / px_mm.square() / (1 - (model.radius_mm / distance).square()).square()
+    share: Tensor = (place_px2 * limb / whole).clamp_max(1.0)
+    return share
 
 
 def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:

@@ -55,6 +55,7 @@ class FittedPoses:
     # mm, lab: how each camera alone would move the sphere, distance by size included.
     own_move: Tensor = field(metadata=_of(-1, 3))
     own_sigma_mm: Tensor = field(metadata=_of(-1))  # of the place by each camera alone, across its line of sight
+    limb_coverage: Tensor = field(metadata=_of(-1))  # 0 to 1: share of the limb whose pixels count
     excess: Tensor = field(metadata=_of(-1))  # deviation of own rotation over that of independent noise; right model: 1
     # 1 less the share of the picture's variance that is left; 0 of hardly any known paint.
     score: Tensor = field(metadata=_of(-1))

@@ -65,8 +65,8 @@ typedef struct {
     const int64_t *place;          /* (2, places), px to the right and below */
     /* results: places that count, (disks, places), and the parts of `FittedPoses` */
     uint8_t *kept;
-    double *position, *rotation, *covariance, *own_turn, *own_covariance, *own_move, *own_sigma, *excess, *score, *nll;
-    double *step;
+    double *position, *rotation, *covariance, *own_turn, *own_covariance, *own_move, *own_sigma, *limb_coverage, *excess;
+    double *score, *nll, *step;
 } Task;
 
 /* Where one disk stands in the fit, and what a step needs of it. */
@@ -78,7 +78,7 @@ typedef struct {
     double *scores;                    /* (tiles, n), n = 6 + n_difference + n_black */
     double normal[COLUMNS * COLUMNS], gradient[COLUMNS];
     double information[36], pull[6];
-    double told[3];      /* share of variance explained, loss, median step from black to white */
+    double told[4];      /* share of variance explained, loss, median step from black to white, limb that counts, 1/mm */
     double to_centre[3]; /* from the camera, mm */
 } Sums;
 
@@ -731,6 +731,10 @@ static void tell(const Task *t, const Disk *at, Sums *of, float deviation) {
     told[0] = score_of(t, at, of);
     told[1] = loss;
     for (int64_t p = 0; p < t->inner; p++) at->sorted[p] = most(at->lit[p], 0.0f); /* below 1 all count alike */
+    told[3] = 0;
+    for (int64_t p = 0; p < P; p++)
+        if (of->weight[p] > 0.0f)
+            told[3] += sqrtf(at->limb[0][p] * at->limb[0][p] + at->limb[1][p] * at->limb[1][p] + at->limb[2][p] * at->limb[2][p]);
     told[2] = t->inner ? ranked(at->sorted, t->inner, (t->inner - 1) / 2) : 0.0;
 }
 
@@ -911,6 +915,13 @@ static double trace(const double *matrix, int n) {
     return sum;
 }
 
+/* The area that a place stands for, px: places are in order of distance. */
+static double place_px2(const Task *t) {
+    if (!t->places) return 0;
+    const double right = (double)t->place[t->places - 1], down = (double)t->place[2 * t->places - 1];
+    return 0.5 * TWO_PI * (right * right + down * down) / (double)t->places;
+}
+
 /* Tell the covariance of a pose, and what each camera alone says. `whole` is the information of all, `step` the last. */
 static void conclude(const Task *t, const Sums *sums, int64_t pose, const double *whole, const double *step) {
     const int64_t cameras = t->cameras, n_all = 6 + t->n_difference + t->n_black;
@@ -957,10 +968,13 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
                 across -= to_centre[a] * own[(3 + a) * 6 + 3 + b] * to_centre[b] / (distance * distance);
         t->own_sigma[k] = sqrt((across > 0 ? across : 0) / 2);
         t->score[k] = of->told[0];
+        const double px_mm = (double)t->pitch_mm[k] + (double)t->pitch_rad[k] * distance;
+        const double angle = 1 - radius * radius / (distance * distance);
+        const double limb = place_px2(t) * of->told[3] * px_mm * px_mm * angle * angle / (TWO_PI * radius);
+        t->limb_coverage[k] = limb > 1 ? 1 : limb;
         if (!use[c]) continue;
         nll += of->told[1];
         /* An edge that is a pixel off moves the sphere along each line of sight. */
-        const double px_mm = (double)t->pitch_mm[k] + (double)t->pitch_rad[k] * distance;
         double edge[6], moved[6];
         for (int a = 0; a < 6; a++) {
             edge[a] = 0;
@@ -975,8 +989,8 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
         const float *stray = t->stray + c * HARMONICS;
         double square = (double)stray[0] * stray[0];
         for (int h = 1; h < HARMONICS; h++) square += 0.5 * stray[h] * stray[h];
-        const double limb = t->blur_px * sqrt(square) / (of->told[2] > 1 ? of->told[2] : 1);
-        aside_px = limb > aside_px ? limb : aside_px;
+        const double moved_px = t->blur_px * sqrt(square) / (of->told[2] > 1 ? of->told[2] : 1);
+        aside_px = moved_px > aside_px ? moved_px : aside_px;
         finest_mm = px_mm < finest_mm ? px_mm : finest_mm;
     }
     t->nll[pose] = nll;
@@ -1239,7 +1253,7 @@ static void point_at(const Near *n, Task *t, int64_t pose) {
     t->covariance = of->covariance + pose * 36, t->step = of->step + pose * 6, t->nll = of->nll + pose;
     t->own_turn = of->own_turn + k * 3, t->own_covariance = of->own_covariance + k * 9;
     t->own_move = of->own_move + k * 3, t->own_sigma = of->own_sigma + k;
-    t->excess = of->excess + k, t->score = of->score + k;
+    t->limb_coverage = of->limb_coverage + k, t->excess = of->excess + k, t->score = of->score + k;
 }
 
 /* Take one step, and `more` from where that one was long; return whether it was. */

@@ -141,7 +141,7 @@ def limb_shape(edge: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def rim_shape(coverage: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
     """Return look-ups along the radius near the limb, the means of equal parts of the cut-off Gaussian in standard
     deviations, and how far each moves with the sphere, (L, n, P) each, of coverage and density (L, 1, P).
-    Paint that is linear within each part is averaged exactly: quantiles in place of means turn the ball by 0.03 degrees.
+    Paint that is linear within each part is averaged exactly. With quantiles the ball is turned by 0.03 degrees.
     """
     counted = coverage.clamp_min(1e-4)
     share = torch.arange(RIM_NODES + 1, dtype=coverage.dtype, device=coverage.device)[:, None] / RIM_NODES

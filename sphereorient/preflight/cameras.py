@@ -217,7 +217,7 @@ def ball_size_px(sample: MovieSample) -> Finding:
         return warning(title, "unknown: no ball was found", SEE_BALL)
     usual = float(seen.median())
     measured = f"{usual:.1f} px across ({float(seen.min()):.1f} .. {float(seen.max()):.1f})"
-    if sample.expected_px is None and len(sample.stream) == 1:
+    if sample.expected_px is None and sample.stream.photograph:
         return judged(title, measured)
     if sample.expected_px is None:
         advice = f"set locate.diameter_px to {usual:.0f} (--set, or in the settings file)"

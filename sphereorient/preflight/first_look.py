@@ -48,6 +48,11 @@ class FirstLook:
     outline: Outline | None  # of the ball in it
     vfov_deg: float | None = None  # field of view, by the tags of a photograph
 
+    @property
+    def photograph(self) -> bool:
+        """Whether the movie is one picture."""
+        return len(self.movie) == 1
+
 
 def look_at(
     paths: Sequence[Path | str], progress: Progress = silent, shown: NDArray[np.bool_] | None = None
@@ -63,7 +68,7 @@ def look_at(
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
     """Look at the movie of a camera; `shown` (H, W) is False where something hides the ball."""
     settings, stream = LocateSettings(), _stream(name, movie, shown)
-    find = still_ball if len(movie) == 1 else fixed_ball
+    find = still_ball if stream.photograph else fixed_ball
     sample = sample_movie(stream, None, settings)
     outlines = [outline for _, outline in sample.balls]
     with_ball = [k for k, (outline, _) in enumerate(sample.found) if outline is not None]
@@ -83,7 +88,6 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
             radius_px = outline.radius_px
         except (ExperimentError, MovieError):
             stays = None
-    photograph = movie_files(movie.path)[0] if len(movie) == 1 else None
     rate_hz = None if movie.times_s is None or len(movie) < 2 else 1 / float(np.median(np.diff(movie.times_s)))
     return FirstLook(
         name=name,
@@ -96,7 +100,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
         frame=int(sample.row[k]),
         picture=picture,
         outline=outline if seen else None,
-        vfov_deg=vertical_field_deg(photograph) if photograph else None,
+        vfov_deg=vertical_field_deg(movie_files(movie.path)[0]) if stream.photograph else None,
     )
 
 
@@ -142,7 +146,7 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
 
 
 def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
-    if all(len(one.movie) == 1 for one in looks):
+    if all(one.photograph for one in looks):
         return DraftKey(name="frame_rate", value=1.0, comment="Hz; any, of one picture")
     rate = looks[0].rate_hz
     if rate is not None and all(one.rate_hz for one in looks):
@@ -154,11 +158,11 @@ def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
 def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
     stays = all(one.stays for one in looks)
     sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
-    photograph = len(looks) == len(looks[0].movie) == 1
+    photograph = len(looks) == 1 and looks[0].photograph
     unknown = "; null where it is not known: lengths are then in radii" if len(looks) == 1 and stays else ""
     size = f"mm{unknown} ({sizes or 'no ball was found'})"
     fixed = f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies"
-    if len(looks[0].movie) == 1:
+    if looks[0].photograph:
         stays, fixed = False, "whether the ball only turns, in its place: no matter, in one picture"
     return [
         DraftKey(name="sphere.diameter", value=None if photograph else ..., comment=size, example=18.0, asked=True),

@@ -108,7 +108,7 @@ def background(sample: MovieSample, experiment: Experiment) -> Finding:
     advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
     if experiment.fixed:
         return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
-    if len(sample.stream) == 1:
+    if sample.stream.photograph:
         return judged(title, "of one picture: guessed from the surroundings of the ball")
     balls = [outline.circle for _, outline in sample.balls]
     covers = (sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in balls) / len(balls) for u, v, _ in balls)

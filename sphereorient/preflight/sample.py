@@ -112,9 +112,9 @@ def sample_movie(
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
 
     def at_size(size_px: float) -> MovieSample:
-        if empty is None and (fixed or len(stream) == 1):
+        if empty is None and (fixed or stream.photograph):
             background = replace(_surroundings(some), shown=stream.shown)
-            if len(stream) == 1:
+            if stream.photograph:
                 with suppress(ExperimentError):  # no ball is reported by the checks
                     background = still_ball(some, settings, shown=stream.shown)[1]
         else:

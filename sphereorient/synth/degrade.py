@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -44,6 +45,11 @@ class Disk:
     def radius(self, pictures: Tensor) -> Tensor:
         """Return the radius with pixel axes, (..., 1, 1), px."""
         return self.radius_px.to(pictures)[..., None, None]
+
+    def within(self, window: tuple[slice, slice]) -> Self:
+        """Return it as seen in a part of the pictures: rows and columns."""
+        corner = self.centre_px.new_tensor([side.start for side in window[::-1]])
+        return replace(self, centre_px=self.centre_px - corner)
 
     def covered(self, pictures: Tensor) -> Tensor:
         """Return the coverage of each pixel, (..., H, W), 0 to 1."""
@@ -242,7 +248,8 @@ FIELDS: Mapping[str, tuple[Draw, Put]] = MappingProxyType(
 )
 NOISE = ("shot_noise", "read_noise")  # of every pixel in every frame
 BEYOND = {"occlusion": 2.0, "bubbles": BUBBLE_RADII}  # how far these reach beyond the disk, radii
-OF_ONE_BALL = ("uneven_light", "highlights", "occlusion", "bubbles")  # lie on the disk of a ball
+ON_THE_BALL = ("uneven_light", "highlights")  # its own light, before the blur of the optics
+OF_ONE_BALL = (*ON_THE_BALL, "occlusion", "bubbles")  # lie on the disk of a ball
 
 
 def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:

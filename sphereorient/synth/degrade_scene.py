@@ -1,7 +1,7 @@
 """What degradations change of a filmed scene: its settings, the map, the pictures, and the reported inputs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -15,7 +15,18 @@ from sphereorient.cameras import Camera, TsaiCamera
 from sphereorient.sphere import sample_texture
 from sphereorient.sphere.renderer import rim_directions
 from sphereorient.sphere.texture import map_directions
-from sphereorient.synth.degrade import BEYOND, FIELDS, NOISE, OPERATIONS, Disk, blur_reach, gain_to_clip, lost_frames
+from sphereorient.synth.degrade import (
+    BEYOND,
+    FIELDS,
+    NOISE,
+    ON_THE_BALL,
+    OPERATIONS,
+    Disk,
+    blur_reach,
+    degrade,
+    gain_to_clip,
+    lost_frames,
+)
 from sphereorient.synth.scene import Exposure, expose, make_scene, seeded
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, degradation
@@ -103,6 +114,18 @@ def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tenso
     return (fields <= rising.values.gather(-1, last)[..., None]).to(texture.device)
 
 
+def through_optics(
+    exposure: Exposure, disk: Disk, values: Mapping[str, float], rng: Callable[[str], torch.Generator]
+) -> Exposure:
+    """Return an exposure with what `ON_THE_BALL` names of `values`, then blurred by the optics; `rng` is of a name."""
+    ball = replace(disk.within(exposure.window), cover=torch.from_numpy(exposure.cover), behind=torch.zeros(()))
+    light = torch.from_numpy(exposure.light)
+    for name in ON_THE_BALL:
+        if name in values:
+            light = degrade(light, ball, {name: values[name]}, rng(name))
+    return replace(exposure, light=light.numpy()).through_optics()
+
+
 class Filming:
     """Apply degradations of map, pictures and movie, name -> physical value, each with its own random numbers."""
 
@@ -112,7 +135,7 @@ class Filming:
         self.cameras = cameras
         without = {name: DEGRADATIONS[name].nothing for name in OPERATIONS}
         self.applied = tuple(name for name, value in without.items() if self.values.get(name, value) != value)
-        self.optics = tuple(name for name in self.applied if name not in NOISE)
+        self.optics = tuple(name for name in self.applied if name not in (*ON_THE_BALL, *NOISE))
         size = {name: camera.image_size[::-1] for name, camera in cameras.items()}
         self.fields = {
             (name, what): draw(torch.empty(size[name]), self.values[what], self._generator(what, name))
@@ -136,11 +159,12 @@ class Filming:
         """Return degraded grey levels (H, W) of a camera's frame, before the camera's own noise.
         `disk` is the place of the sphere. What the sphere cannot change is taken from the empty picture.
         """
+        exposure = self._lit_ball(exposure, disk, name)
         beyond = max((BEYOND.get(what, 0.0) for what in self.optics), default=0.0) * float(disk.radius_px)
         changed = exposure.within(math.ceil(beyond) + self._spread)
         picture = self.empty[name].clone()
         picture[changed.window] = self._lit(changed, disk, name, frame, self.optics)
-        for what in self.applied[len(self.optics) :]:
+        for what in (one for one in self.applied if one in NOISE):
             picture = OPERATIONS[what](picture, self.values[what], disk, self._generator(what, name, frame))
         return cast("NDArray[np.float32]", picture.numpy())
 
@@ -155,14 +179,16 @@ class Filming:
         """How far the lens spreads a pixel, px."""
         return blur_reach(self.values.get("defocus", 0.0))
 
+    def _lit_ball(self, exposure: Exposure, disk: Disk, name: str) -> Exposure:
+        return through_optics(exposure, disk, self.values, lambda what: self._generator(what, name))
+
     def _lit(self, part: Exposure, disk: Disk, name: str, frame: int | None, optics: Sequence[str]) -> Tensor:
         """Return grey levels (h, w) of a part of a picture, before noise; frame None: as far as the movie shares it."""
         wider = part.within(self._spread)
         (rows, columns), height, width = wider.window, *part.light.shape
-        corner = disk.centre_px.new_tensor([columns.start, rows.start])
-        behind, cover = torch.tensor(float(self.settings.background)), torch.from_numpy(wider.cover)
-        disk = replace(disk, centre_px=disk.centre_px - corner, cover=cover, behind=behind)
-        light = torch.from_numpy(wider.light) + (1 - cover) * behind
+        cover = torch.from_numpy(wider.cover)
+        disk = replace(disk.within(wider.window), cover=cover)
+        light = torch.from_numpy(wider.light) + (1 - cover) * float(self.settings.background)
         for what in optics:
             moves = DEGRADATIONS[what].where == "frame"
             if what in FIELDS:
@@ -180,8 +206,9 @@ class Filming:
         """Return the exposure gain that saturates a white sphere, after the operations before saturation."""
         camera, origin = self.cameras[name], torch.zeros(1, 1, 3, dtype=torch.float64)
         white = make_scene(torch.ones(8, 16), self.settings)
-        part = expose([white], camera, origin, torch.eye(3, dtype=torch.float64)[None, None])
         disk = picture_of_ball(camera, origin[0, 0], self.settings.diameter_mm / 2)
+        part = expose([white], camera, origin, torch.eye(3, dtype=torch.float64)[None, None])
+        part = self._lit_ball(part, disk, name)
         light = self._lit(part, disk, name, None, self.optics[: self.optics.index("saturation")])
         inside = torch.from_numpy(part.cover) > 0.99
         return float(gain_to_clip(light.flatten(), inside.flatten(), self.values["saturation"]))

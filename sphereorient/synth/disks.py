@@ -14,7 +14,7 @@ from sphereorient.sphere import reduced_texture, see_sphere
 from sphereorient.sphere.renderer import lambert
 from sphereorient.sphere.texture import random_directions
 from sphereorient.sphere.view import disk_offsets
-from sphereorient.synth.degrade import OPERATIONS, Disk, blurred, centre_error, degrade, radius_error
+from sphereorient.synth.degrade import ON_THE_BALL, OPERATIONS, Disk, blurred, centre_error, degrade, radius_error
 from sphereorient.synth.scene import LIT
 from sphereorient.synth.severities import DEGRADATIONS, check_values
 
@@ -61,8 +61,9 @@ def film_disks(
     disk = Disk(centre_px=middle, radius_px=torch.full((count,), radius))
     grey, behind = _lit(texture, R_view_body.float(), values, disk, side, rng)
     within = {name: value * (scale if name in IN_PX else 1.0) for name, value in values.items() if name in OPERATIONS}
-    before = replace(disk, behind=behind)
-    grey = degrade(blurred(grey, max(BLUR_PX * scale, 0.3)), before, within, rng)  # coarse pixels blur by themselves
+    before, lamps = replace(disk, behind=behind), {name: within.pop(name) for name in ON_THE_BALL if name in within}
+    grey = blurred(degrade(grey, before, lamps, rng), max(BLUR_PX * scale, 0.3))  # coarse pixels blur by themselves
+    grey = degrade(grey, before, within, rng)
     noise = (READ_NOISE**2 + SHOT_NOISE**2 * grey.clamp_min(0)).sqrt()
     grey = (grey + noise * torch.randn(grey.shape, generator=rng)).round().clamp(0, 255)
     return _cropped(grey, _outline(disk, values, scale, rng, settings), settings.size_px)

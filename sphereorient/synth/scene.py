@@ -53,12 +53,13 @@ def make_scene(texture: Tensor, settings: SynthSettings) -> RenderedScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
-    """The part of a picture that balls change, before noise; made by `exposures`."""
+    """The part of a picture that balls change, before noise; made by `exposures`, before the blur of the optics."""
 
     size: tuple[int, int]  # height and width of the whole picture, px
     window: Window
-    light: Floats  # (h, w), grey level of the balls times their coverage, blurred by the optics
-    cover: Floats  # (h, w), their coverage, blurred alike
+    light: Floats  # (h, w), grey level of the balls times their coverage
+    cover: Floats  # (h, w), their coverage
+    blur_px: float = 0.0  # of the optics, that light and cover do not have yet
 
     @classmethod
     def none(cls, size: tuple[int, int]) -> Self:
@@ -74,8 +75,16 @@ class Exposure:
 
     def put(self, picture: Floats) -> None:
         """Put the balls before the grey levels of a picture (H, W), in place."""
-        picture[self.window] *= 1 - self.cover
-        picture[self.window] += self.light
+        seen = self.through_optics()
+        picture[self.window] *= 1 - seen.cover
+        picture[self.window] += seen.light
+
+    def through_optics(self) -> Self:
+        """Return it as the optics blur it."""
+        if not self.blur_px:
+            return self
+        light, cover = (cv2.GaussianBlur(one, (0, 0), self.blur_px) for one in (self.light, self.cover))
+        return replace(self, light=np.asarray(light, np.float32), cover=np.asarray(cover, np.float32), blur_px=0.0)
 
     def within(self, margin_px: int) -> Self:
         """Return it with a window that is wider on all sides, as far as the picture reaches."""
@@ -86,9 +95,9 @@ class Exposure:
 
     @property
     def covered(self) -> Floats:
-        """The coverage of every pixel, (H, W)."""
+        """The coverage of every pixel in the picture, (H, W)."""
         whole = np.zeros(self.size, np.float32)
-        whole[self.window] = self.cover
+        whole[self.window] = self.through_optics().cover
         return whole
 
 
@@ -189,9 +198,7 @@ def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tupl
         there *= 1 - seen[:, 1:]
         there += seen
     light, cover = both.mean(0)
-    if blur_px > 0:
-        light, cover = (np.asarray(cv2.GaussianBlur(one, (0, 0), blur_px)) for one in (light, cover))
-    return Exposure(size=size, window=window, light=light, cover=cover)
+    return Exposure(size=size, window=window, light=light, cover=cover, blur_px=blur_px)
 
 
 def _around(windows: Sequence[Window]) -> Window:

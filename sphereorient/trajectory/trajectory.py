@@ -53,6 +53,7 @@ class CameraTrack:
         "px", "standard deviation of centre_px in any direction, of noise and paint", since="0.3"
     )
     radius_px: Floats = stored("px", "radius of the outline")
+    limb_coverage: Floats = stored("1", "share of the limb whose pixels gave the position", since="0.3")
     outline_rms_px: Floats = stored("px", "rms distance of the edge points from the fitted outline")
     orientation: Floats = stored("1", "R_lab_body of this camera's own best candidate", 3, 3)
     orientation_cov: Floats = stored("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)

@@ -165,7 +165,7 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
 def part(turn: float, cameras: int) -> Poses:
     """What some cameras say of a ball, that is turned about x from where others see it."""
     whole = seen(0.0, 0.0)
-    names = ("own_turn", "own_covariance", "own_move", "own_sigma_mm", "excess", "score")
+    names = ("own_turn", "own_covariance", "own_move", "own_sigma_mm", "limb_coverage", "excess", "score")
     return replace(
         whole,
         R_lab_body=so3.exp(f64([[turn, 0.0, 0.0]])),

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient.cameras import Camera
+from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.errors import ExperimentError
 from sphereorient.locate import find_positions
 from sphereorient.trajectory import Flag
@@ -87,6 +88,31 @@ def test_one_camera_gives_the_distance_from_the_size(camera):
     assert (found.flags == int(Flag.ONE_CAMERA)).all()
     assert found.measured.all()
     assert found.gap_mm.isnan().all()
+
+
+def parallel() -> Camera:
+    """A telecentric camera that looks down."""
+    pose = {"R_cam_lab": looking_down().R_cam_lab, "T_cam_lab_mm": looking_down().T_cam_lab_mm}
+    scale, middle = torch.tensor(0.23, dtype=torch.float64), looking_down().centre_px
+    return TelecentricCamera(image_size=looking_down().image_size, scale_mm_px=scale, centre_px=middle, **pose)
+
+
+def test_a_telecentric_camera_tells_the_place_beside_another_one_and_none_by_itself():
+    cameras = {"cam1": looking_along_y(), "cam2": parallel()}
+    of_size = exact_radius_px(cameras["cam1"], PLACES), DIAMETER_MM / 2 / 0.23
+    seen = {
+        name: sightings(camera.project(PLACES), radius)
+        for (name, camera), radius in zip(cameras.items(), of_size, strict=True)
+    }
+    found = find_positions(seen, cameras, DIAMETER_MM)
+    assert_close(found.position_lab_mm, PLACES, atol=1e-6)
+    assert torch.isfinite(found.covariance_mm2).all()
+    other = find_positions({**seen, "cam2": sightings(lost(4))}, cameras, DIAMETER_MM)
+    alone = find_positions({"cam1": seen["cam1"]}, {"cam1": cameras["cam1"]}, DIAMETER_MM)
+    assert_close(other.position_lab_mm, alone.position_lab_mm)
+    none = find_positions({**seen, "cam1": sightings(lost(4))}, cameras, DIAMETER_MM)
+    assert none.position_lab_mm.isnan().all()
+    assert not none.measured.any()
 
 
 def test_a_sphere_on_the_axis_is_as_far_as_its_limb_says():

@@ -12,7 +12,7 @@ CAMERAS = 2
 OK = (Reason.OK, Reason.OK)
 TAILS = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "nll": (), "step": (6,)}
 TAILS |= {"own_turn": (CAMERAS, 3), "own_covariance": (CAMERAS, 3, 3), "own_move": (CAMERAS, 3)}
-TAILS |= dict.fromkeys(("own_sigma_mm", "excess", "score"), (CAMERAS,))
+TAILS |= dict.fromkeys(("own_sigma_mm", "limb_coverage", "excess", "score"), (CAMERAS,))
 
 
 def poses(count: int, seed: int, reason: tuple[Reason, ...] = OK) -> Poses:

@@ -76,6 +76,7 @@ def assert_same(found, expected) -> None:
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, expected.R_lab_body)).max()) < 2e-3
     assert float((found.position_lab_mm - expected.position_lab_mm).norm(dim=-1).max()) < 5e-4
     assert float((found.score - expected.score).abs().max()) < 1e-3
+    assert float((found.limb_coverage - expected.limb_coverage).abs().max()) < 0.01
     sigmas = [part.covariance.diagonal(dim1=-2, dim2=-1) for part in (found, expected)]
     assert float((sigmas[0] / sigmas[1] - 1).abs().max()) < 0.02
 

@@ -19,6 +19,7 @@ from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import DEGRADATIONS, SynthSettings, severity, write_degraded, write_synthetic_experiment
+from sphereorient.synth.degrade import ON_THE_BALL
 from sphereorient.synth.degrade_scene import (
     degraded_settings,
     misdrawn,
@@ -148,6 +149,21 @@ def test_structure_and_dirt_stand_still_and_are_in_the_picture_without_the_ball(
         for frame in frames:
             assert np.array_equal(frame[corner], empty[corner])
         assert empty.std() > 5
+
+
+@pytest.mark.parametrize("name", ON_THE_BALL)
+def test_the_optics_blur_the_light_of_the_ball(name, tmp_path):  # the other order: 1.7 and 49 grey levels off
+    quiet = SETTINGS.model_copy(update={"frames": 2, "read_noise": 0.0, "shot_noise": 0.0, "white": 120.0})
+    values = {name: severity(name, 3)}
+    sharp, seen = (
+        frames_of(
+            write_synthetic_experiment(tmp_path / str(blur), quiet.model_copy(update={"blur_px": blur}), values=values)
+        )["cam1"]
+        for blur in (0.0, 2.0)
+    )
+    for before, after in zip(sharp, seen, strict=True):
+        expected = cv2.GaussianBlur(before.astype(np.float32), (0, 0), 2.0)
+        assert np.abs(after - expected).max() <= 1.0  # both are rounded to whole levels
 
 
 @pytest.mark.slow

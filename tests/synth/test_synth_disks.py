@@ -18,7 +18,7 @@ from sphereorient.search.normalisation import crop_disk
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth import disks, random_texture, render_frame, severity
-from sphereorient.synth.degrade import OPERATIONS
+from sphereorient.synth.degrade import OPERATIONS, blurred
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings, film_disks
 
 EXACT = DiskSettings(centre_sigma_px=0.0, radius_sigma=0.0)  # outlines without error
@@ -232,3 +232,16 @@ def test_unknown_names_and_impossible_values_are_refused(values, word):
     with pytest.raises(SettingsError, match=word) as caught:
         film_disks(torch.ones(16, 32), torch.eye(3)[None], values, seeded(), EXACT)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("uneven_light", 8.0), ("highlights", 30.0)])
+def test_the_optics_blur_the_light_of_the_ball(name, value, noiseless, monkeypatch):
+    monkeypatch.setattr(disks, "_cropped", lambda grey, *_: grey)
+    R = so3.random_rotations(2, generator=seeded()).float()
+    texture = random_texture("blobs", 1, 64)
+    seen = []
+    for blur in (0.3, 2.0):
+        monkeypatch.setattr(disks, "BLUR_PX", blur)
+        seen.append(film_disks(texture, R, {name: value}, seeded(), EXACT))
+    expected = blurred(seen[0], math.sqrt(2.0**2 - 0.3**2))
+    assert (seen[1] - expected).abs().max() < 1.2  # both are rounded to whole levels; the other order: 11 and 5

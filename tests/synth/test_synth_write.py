@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -164,8 +165,8 @@ def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
     motion = motion_of(settings)
     for name, camera in default_cameras(settings).items():
         for k, frame in enumerate(frames_of(path)[name]):
-            # The middles of the exposure's halves: 1 ms before and after the frame's time.
-            now = motion.at(torch.tensor([k / 200 - 0.001, k / 200 + 0.001], dtype=torch.float64))
+            # Two instants with the variance of 4 ms: 4 / sqrt(12) ms before and after the frame's time.
+            now = motion.at(k / 200 + 0.004 / math.sqrt(12) * torch.tensor([-1.0, 1.0], dtype=torch.float64))
             rng = seeded(0)
             expected = render_frame(scene, camera, now.position_lab_mm, now.R_lab_body, rng)
             assert np.abs(frame.astype(int) - expected).max() <= 1

@@ -31,7 +31,7 @@ FORMAT_SHAPES |= {"margin": (), "margin_angle": ()}
 MOTIONS = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 FORMAT_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
 FORMAT_CAMERA = {"centre_px", "centre_sigma_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov"}
-FORMAT_CAMERA |= {"score", "xi", "reason"}
+FORMAT_CAMERA |= {"limb_coverage", "score", "xi", "reason"}
 FORMAT_CAMERA |= {"candidates/offset", "candidates/orientation", "candidates/score"}
 
 
