@@ -104,7 +104,7 @@ class PyramidLevel:
 
     def stencil(self, radius_px: float) -> Stencil:
         """Return the places of a disk of some radius."""
-        return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
+        return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)), self.blur_px)
 
 
 Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations

@@ -19,6 +19,9 @@ VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 # Parts of `Pixels`, the places along their last axis.
 ALONG_PLACES = ("grey", "behind", "inside", "clipped", "direction")
 OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  # and those with an entry for each disk
+# Side of a tile: least, in standard deviations of the blur (of one of 3 px errors over sigma are 1.0 with tiles of 14 px,
+# 1.4 with 6), and how many there are at least across half a disk.
+TILE_PX, TILE_BLURS, FEWEST_TILES = 6, 10.0, 3
 INNER = 0.67  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
@@ -162,9 +165,11 @@ class Stencil:
 
 
 @lru_cache(maxsize=64)
-def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stencil:
-    """Return all places within a radius, `step_px` apart; tiles are no smaller than a step."""
-    tile_px = max(tile_px, step_px)
+def disk_stencil(radius_px: float, step_px: int = 1, blur_px: float = 0.0) -> Stencil:
+    """Return all places within a radius, `step_px` apart. Errors of the model of paint that is blurred by `blur_px`
+    reach as far as tiles do; there are some on every disk.
+    """
+    tile_px = max(round(min(TILE_BLURS * blur_px, radius_px / FEWEST_TILES)), TILE_PX, step_px)
     reach = math.ceil(radius_px)
     at = np.arange(-reach, reach + 1)
     at = at[at % step_px == 0]

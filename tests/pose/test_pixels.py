@@ -206,9 +206,11 @@ def test_the_order_is_the_same_each_time():
     assert (one.down == other.down).all()
 
 
-@pytest.mark.parametrize(("radius_px", "tile_px"), [(9.0, 6), (22.3, 6), (22.3, 9)])
-def test_tiles_are_squares_of_neighbours(radius_px, tile_px):
-    stencil = disk_stencil(radius_px, tile_px=tile_px)
+@pytest.mark.parametrize(
+    ("radius_px", "blur_px", "tile_px"), [(9.0, 0.0, 6), (22.3, 0.5, 6), (30.0, 0.9, 9), (30.0, 3.0, 10)]
+)
+def test_tiles_are_squares_of_neighbours(radius_px, blur_px, tile_px):
+    stencil = disk_stencil(radius_px, blur_px=blur_px)
     tile = stencil.tile.numpy()
     # Without gaps in their numbers, each a square, all places of a square in one.
     assert set(tile.tolist()) == set(range(tile.max() + 1))
