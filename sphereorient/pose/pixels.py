@@ -19,8 +19,8 @@ VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 # Parts of `Pixels`, the places along their last axis.
 ALONG_PLACES = ("grey", "behind", "inside", "clipped", "direction")
 OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  # and those with an entry for each disk
-# Side of a tile: least, in standard deviations of the blur (3 px: errors over sigma are 1.0 with 14 px, 1.4 with 6), and
-# how many there are at least across half a disk.
+# Side of a tile: least, in standard deviations of the blur (3 px: errors over sigma are 1.0 with 14 px, 1.4 with 6),
+# and how many there are at least across half a disk.
 TILE_PX, TILE_BLURS, FEWEST_TILES = 6, 10.0, 3
 INNER = 0.67  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
