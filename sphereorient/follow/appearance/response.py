@@ -18,13 +18,14 @@ MOST = math.log(2.0)  # by which a round may change ln gamma: the step is linear
 MORE = 1.02  # ratio of a blur that is a little more
 CODED = 0.2  # ln gamma from which a response is not linear: gloss that is not modelled looks like 0.08
 SURE = 0.05  # standard deviation of ln gamma up to which pictures tell it; of one photograph it is 0.2
+MOST_CLIPPED = 0.05  # share of a disk's pixels; white that is cut off looks like a gamma of 0.7
 
 
 def with_response(studied: Studied, *, given: bool) -> tuple[Studied, bool]:
     """Estimate gamma of the cameras whose response is not known, with blur and light. Those whose pictures are linear,
     or do not tell, stay as they are. Return also whether one was learnt. `given`: as in `light_and_blur`.
     """
-    asked = torch.tensor([view.response is None for view in studied.fitter.views])
+    asked = torch.tensor([view.response is None for view in studied.fitter.views]) & ~_clipped(studied)
     gamma, learnt = torch.zeros(len(asked), dtype=torch.float64), studied
     for _ in range(ROUNDS if bool(asked.any()) else 0):
         fits = learnt.pixels, learnt.fit, learnt.use
@@ -38,6 +39,13 @@ def with_response(studied: Studied, *, given: bool) -> tuple[Studied, bool]:
         if bool((change.abs() < STAYS).all()):
             break
     return learnt, learnt is not studied
+
+
+def _clipped(studied: Studied) -> Tensor:
+    """Return the cameras, (C,) bool, whose disks are clipped in many pixels."""
+    shares = (studied.pixels.clipped & studied.pixels.inside).float().mean(1).reshape(studied.use.shape)
+    found: Tensor = (shares * studied.use).sum(0) > MOST_CLIPPED * studied.use.sum(0)
+    return found
 
 
 def with_more_blur(studied: Studied) -> SphereModel:
