@@ -37,6 +37,7 @@ BASIS_SIDE = 128  # the same of the harmonics that light is learnt with: 20 MB
 DEPTHS = 1024  # entries of the look-up of the cover's functions
 GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
 ROUNDS, AGAIN = 5, 1  # of Gauss-Newton from an even light, from one of the lab
+INDEPENDENT = 0.1  # share of the pixels that tell of the light: neighbours err alike; with it other frames fit best
 # Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
 LEVEL, SLOPES, GLOSS = 3.0, 0.2, 1.0  # the mean, all others, those of the mirrored light: lamps are brighter than paint
 THROUGH, FACE = 0.2, 0.3  # of the cover's two functions at a knot, the second relative
@@ -220,7 +221,8 @@ def _better(
     light: LabLight, at: Residuals, pixels: Pixels, used: Tensor, bases: tuple[Tensor, Tensor, Tensor]
 ) -> LabLight:
     """Return the light after one step of Gauss-Newton; `used` (L, 1) bool."""
-    unit, view, precision = float(light.difference[0]), at.view, (at.weight / at.variance).where(used, 0.0)
+    unit, view = float(light.difference[0]), at.view
+    precision = INDEPENDENT * (at.weight / at.variance).where(used, 0.0)
     cameras = len(light.gain)
     tied = torch.tensor([TINT[0]] + [TINT[1]] * 2 + [TINT[2]] * 3 + [unit * SHADE[0]] + [unit * SHADE[1]] * 2)
     unknown = [getattr(light, name) for name in UNKNOWN]
