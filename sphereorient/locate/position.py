@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.stats import chi2
+from scipy.special import chdtri
 from torch import Tensor
 
 from sphereorient.cameras import Camera, Rays, nearest_point
@@ -191,7 +191,7 @@ def places_of(matches: Sequence[Match], cameras: Mapping[str, Camera], diameter_
 
 def _most(chosen: Numbers) -> Floats:
     """Return the largest chi2 (N,) of a match, by its degrees of freedom."""
-    return np.asarray(chi2.isf(MISSED, np.maximum(2 * (chosen >= 0).sum(1) - 3, 1)))
+    return np.asarray(chdtri(np.maximum(2 * (chosen >= 0).sum(1) - 3, 1), MISSED))
 
 
 def _misfit(chosen: Numbers, disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -> Floats:
