@@ -39,7 +39,7 @@ GRID = 360  # rows of latitude from which the look-up maps are interpolated: hal
 ROUNDS, AGAIN = 5, 1  # of Gauss-Newton from an even light, from one of the lab
 INDEPENDENT = 0.1  # share of the pixels that tell of the light: neighbours err alike; with it other frames fit best
 # Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
-LEVEL, SLOPES, GLOSS = 3.0, 0.2, 1.0  # the mean, all others, those of the mirrored light: lamps are brighter than paint
+LEVEL, SLOPES, GLOSS = 3.0, 0.2, 3.0  # the mean, all others, those of the mirrored light: lamps are brighter than paint
 THROUGH, FACE = 0.2, 0.3  # of the cover's two functions at a knot, the second relative
 TINT = (0.15, 0.08, 0.08)  # of a frame's own light, relative, by order
 SHADE = (0.04, 0.02)  # of its own offset, in units of white less black paint
