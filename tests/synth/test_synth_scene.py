@@ -169,4 +169,5 @@ def test_a_movie_is_its_frames_one_by_one():  # the batch law, also where rays a
         np.testing.assert_array_equal(exposure.light, alone.light)
         np.testing.assert_array_equal(exposure.cover, alone.cover)
         wider = exposure.within(7)
-        np.testing.assert_array_equal(wider.before(3.0), exposure.before(3.0))
+        # The optics blur whole windows: sums of floats in another order.
+        np.testing.assert_allclose(wider.before(3.0), exposure.before(3.0), rtol=1e-6)
