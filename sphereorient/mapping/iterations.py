@@ -234,7 +234,7 @@ def _with_light(state: State) -> State:
 
 
 def _lit_in_the_lab(state: State) -> State:
-    """Return the state with one light in the lab for all cameras, where that explains held-out instants better."""
+    """Return the state with one light in the lab for all cameras, unless that explains held-out instants less."""
     some, fitter = state.where(evenly_spread(torch.arange(len(state.use)), LAB_FRAMES)), state.map_fitter()
     fit = fitter.fit(some.pixels, some.start(), fitter.optics.fine, 1)
     if fitter.light.linear:

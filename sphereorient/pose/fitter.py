@@ -83,16 +83,11 @@ class Fitter:
     def left(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
     ) -> float:
-        """Return the mean of `logs_left`: the pictures of one camera may be left ten times as much as of another."""
-        return float(self.logs_left(pixels, fit, use, level, iterations).mean())
-
-    def logs_left(
-        self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
-    ) -> Tensor:
-        """Return the logarithm of what poses fitted anew leave in each picture of `use`, (n,), see `scores_of`."""
+        """Return the mean of `logs_left` of poses fitted anew: the pictures of one camera may be left ten times as much
+        as of another.
+        """
         begin = PoseStart(fit.position_lab_mm, fit.R_lab_body, use)
-        score = self.fit(pixels, begin, level or self.optics.fine, iterations).score
-        return (1.0 - score)[use].clamp_min(LEAST_LEFT).log()
+        return float(logs_left(self.fit(pixels, begin, level or self.optics.fine, iterations), use).mean())
 
     def on(self, device: torch.device) -> "Fitter":
         """Return a fitter that computes on another device."""
@@ -240,6 +235,11 @@ class Fitter:
             on = begin.after(fit).of(torch.tensor(rows))
             fit = fit.with_rows(rows, self._settled([frames[k] for k in rows], on, first=False))
         return fit
+
+
+def logs_left(fit: FittedPoses, use: Tensor) -> Tensor:
+    """Return the logarithm of what fitted poses leave in each picture of `use`, (n,), see `scores_of`."""
+    return (1.0 - fit.score)[use].clamp_min(LEAST_LEFT).log()
 
 
 def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTable, blur_px: float) -> Fitter:

@@ -11,7 +11,6 @@ from sphereorient.follow.appearance.light import (
     check_white,
     darkest_white,
     light_and_blur,
-    lit_in_the_lab,
     without_occluders,
 )
 from sphereorient.follow.appearance.map_odds import FEW, map_odds
@@ -33,6 +32,7 @@ from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import CameraView, Optics, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
+from sphereorient.pose.lights.kinds import lit_in_the_lab
 from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -76,8 +76,8 @@ def estimate_appearance(
         studied, sharper = with_motion(studied, search, sample.frame, following, others)
     check_white(studied.fitter)
     moves = studied.fitter.instants > 1
-    studied, rivals = lit_in_the_lab(studied)
-    studied = without_occluders(studied)
+    fitter, fit, rivals = lit_in_the_lab(studied.fitter, studied.pixels, studied.fit, studied.use)
+    studied = without_occluders(replace(studied, fitter=fitter, fit=fit))
     score_min = _score_min(studied, still.right_score if moves else studied.right_score, best, wrong)
     sure = [frames[k] for k in proven(found)] if among is None else []
     alone = among is None and sample.camera is None  # a ball, and all cameras together

@@ -19,8 +19,6 @@ from sphereorient.pose.camera_view import FINEST_PX, Optics, level_of, widest_px
 from sphereorient.pose.fit import USUALLY_HIDDEN
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import limb_wider_px
-from sphereorient.pose.lights import kinds
-from sphereorient.pose.lights.kinds import Rivals
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.sphere.texture_table import TextureTable
@@ -132,14 +130,6 @@ def check_white(fitter: Fitter) -> None:
     if (inverted := darkest_white(fitter)) is not None:
         got, do = f"white paint darker than black in {inverted}", "exchange black and white of the map"
         raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
-
-
-def lit_in_the_lab(studied: Studied) -> tuple[Studied, Rivals]:
-    """Let light be a function of directions in the lab unless that explains less; return also the fits of two models
-    that explain about as much as each other.
-    """
-    fitter, fit, rivals = kinds.lit_in_the_lab(studied.fitter, studied.pixels, studied.fit, studied.use)
-    return replace(studied, fitter=fitter, fit=fit), rivals
 
 
 def without_occluders(studied: Studied) -> Studied:

@@ -1,4 +1,4 @@
-"""Which light a movie has: one in the lab where that explains the pictures better than maps of each disk."""
+"""Which light a movie has: one in the lab unless maps of each disk explain the pictures better."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.fitter import Fitter, logs_left
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.lights.lab import LabLight, lab_light
 from sphereorient.pose.model import Light, even_light
@@ -39,8 +39,9 @@ def lit_in_the_lab(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor
     every = torch.arange(len(use))
     learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
     maps, lit = fitter.with_light_of(*learning), replace(fitter, light=lab_light(*learning, fitter.model()))
-    gain = float((maps.logs_left(*held) - lit.logs_left(*held)).mean())
-    rivals = (maps.again(*held), lit.again(*held), held[2]) if abs(gain) < ALIKE else None
+    by_maps, by_lit, held_use = maps.again(*held), lit.again(*held), held[2]
+    gain = float((logs_left(by_maps, held_use) - logs_left(by_lit, held_use)).mean())
+    rivals = (by_maps, by_lit, held_use) if abs(gain) < ALIKE else None
     if gain < -CHANGED:
         return fitter, fit, rivals
     for _ in range(3):  # the poses, too, were found with the maps
