@@ -3,6 +3,7 @@
    Built for several instruction sets without fused or reordered arithmetic: all of them give the same bits. Stages over
    blocks of pixels keep their data in the first cache. Pictures in single precision, sums in double. */
 
+#include <float.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -647,23 +648,26 @@ static void gather(const Task *t, const Disk *at, Sums *of, const double *coeffi
 
 /* Fit a disk of smooth grey levels to every fourth place; return how much better the painted sphere explains them than
    that does, or the empty scene, as `scores_of`. */
-static double score_of(const Task *t, const Disk *at, const Sums *of) {
+static double score_of(const Task *t, const Disk *at, int64_t k) {
     const int64_t P = t->places;
+    const float *seen = t->grey + k * P;
+    const uint8_t *clipped = t->clipped + k * P;
     double matrix[TINTS * TINTS], smooth[TINTS], (*sums)[LANES] = at->sums;
     double cover = 0, share = 0, some = 0, mean = 0, spread = 0, left[3] = {0};
     float tints[TINTS][BLOCK], weighted[BLOCK], by[TINTS];
     float covered[BLOCK], counted[BLOCK], grey[BLOCK], disk[BLOCK], beside[BLOCK], residual[BLOCK], x[BLOCK], y[BLOCK];
+    uint8_t full[BLOCK];
     memset(sums, 0, sizeof(double) * LANES * (TINTS * (TINTS + 3) / 2));
     for (int64_t p = 0; p < P; p++) cover += at->cover[p], share += at->counts[p] ? at->cover[p] : 0.0f;
     for (int pass = 0; pass < 3; pass++) { /* each needs the sums of the one before */
         for (int64_t from = 0; from < P; from += EVERY * BLOCK) {
             const int64_t rest = (P - from + EVERY - 1) / EVERY;
             const int n = (int)(rest < BLOCK ? rest : BLOCK);
-            for (int i = 0; i < BLOCK; i++) covered[i] = counted[i] = grey[i] = disk[i] = beside[i] = residual[i] = x[i] = y[i] = 0;
+            for (int i = 0; i < BLOCK; i++) full[i] = 0, covered[i] = counted[i] = grey[i] = disk[i] = beside[i] = residual[i] = x[i] = y[i] = 0;
             for (int i = 0; i < n; i++) {
                 const int64_t p = from + EVERY * i;
                 covered[i] = at->cover[p], counted[i] = at->counts[p] ? at->cover[p] : 0.0f, residual[i] = at->residual[p];
-                grey[i] = of->expected[p] + residual[i], beside[i] = at->beside[p], x[i] = at->x[p], y[i] = at->y[p];
+                grey[i] = seen[p], full[i] = clipped[p], beside[i] = at->beside[p], x[i] = at->x[p], y[i] = at->y[p];
                 disk[i] = grey[i] - (1.0f - covered[i]) * beside[i];
             }
             if (pass != 1) {
@@ -685,10 +689,12 @@ static double score_of(const Task *t, const Disk *at, const Sums *of) {
                 for (int a = 0; a < TINTS; a++)
                     for (int i = 0; i < BLOCK; i++) disk[i] -= by[a] * tints[a][i];
                 for (int i = 0; i < BLOCK; i++) {
-                    const float other = grey[i] - beside[i];
+                    /* a saturated pixel tells only that its grey level is at least this one */
+                    const float lowest = full[i] ? 0.0f : -FLT_MAX;
+                    const float smoothly = most(disk[i], lowest), empty = most(grey[i] - beside[i], lowest);
                     left[0] += counted[i] * least(residual[i] * residual[i], limit);
-                    left[1] += counted[i] * least(disk[i] * disk[i], limit);
-                    left[2] += counted[i] * least(other * other, limit);
+                    left[1] += counted[i] * least(smoothly * smoothly, limit);
+                    left[2] += counted[i] * least(empty * empty, limit);
                 }
             }
         }
@@ -710,7 +716,7 @@ static double score_of(const Task *t, const Disk *at, const Sums *of) {
 }
 
 /* Tell how well the disk is explained: score, loss, median step from black to white paint. */
-static void tell(const Task *t, const Disk *at, Sums *of, float deviation) {
+static void tell(const Task *t, const Disk *at, Sums *of, int64_t k, float deviation) {
     const int64_t P = t->places;
     const float scale = logf(most(deviation, 1.0f)), sixth = t->tukey2 / 6.0f, limit = t->tukey2;
     double *told = of->told, loss = 0;
@@ -728,7 +734,7 @@ static void tell(const Task *t, const Disk *at, Sums *of, float deviation) {
         for (int i = 0; i < n; i++) all[i] = of->kept[from + i] ? 1.0f : 0.0f;
         loss += product(all, part);
     }
-    told[0] = score_of(t, at, of);
+    told[0] = score_of(t, at, k);
     told[1] = loss;
     for (int64_t p = 0; p < t->inner; p++) at->sorted[p] = most(at->lit[p], 0.0f); /* below 1 all count alike */
     told[3] = 0;
@@ -872,7 +878,7 @@ static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
         if (!t->iterations) return;
     }
     gather(t, at, of, coefficients);
-    if (of->last) tell(t, at, of, deviation);
+    if (of->last) tell(t, at, of, k, deviation);
     without_light(t, of);
 }
 

@@ -176,27 +176,29 @@ def loss_of(at: Residuals, inside: Tensor) -> Tensor:
     return (loss * inside).sum(-1).double()
 
 
-def scores_of(at: Residuals) -> Tensor:
+def scores_of(at: Residuals, pixels: Pixels) -> Tensor:
     """Return how much better the painted sphere explains L disks than what has no paint does, (L,), -1 .. 1.
     1 - painted / min(smooth, scene), of the mean squares that three models leave in every fourth pixel: the sphere at
     this pose; a disk whose grey level is a polynomial of order `SMOOTH`; the empty scene. An outlier counts up to a
-    limit. 0 of a disk that shows hardly any known paint.
+    limit; a saturated pixel that a model expects brighter is explained by it. 0 of a disk that shows hardly any known
+    paint.
     """
     cover, counted = at.view.coverage, at.inside
     known = (cover * counted).sum(-1) > KNOWN * cover.sum(-1)
     some = slice(None, None, EVERY)
     cover, share, residual = cover[:, some], (cover * counted)[:, some], at.residual[:, some]
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
-    grey = at.model[:, some] + residual
+    grey, clipped = pixels.grey[:, some], pixels.clipped[:, some]
     disk, beside = grey - (1.0 - cover) * at.beside[:, some], at.beside[:, some]
     columns = cover[:, None] * polynomials(at.view.across[..., some], SMOOTH)
     weighted = columns * share[:, None]
     normal, right = (weighted @ columns.mT).double(), (weighted @ disk[..., None])[..., 0].double()
     smooth = (solve_damped(normal, right, ridge=1e-7).to(columns.dtype)[:, None] @ columns)[:, 0]
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
-    models = torch.stack([residual, disk - smooth, grey - beside])
-    painted, *others = (share * torch.minimum(models.square(), OUTLIERS * spread[:, None])).sum(-1)
-    score = 1.0 - painted / torch.minimum(*others).clamp_min(1e-9)
+    others = torch.stack([disk - smooth, grey - beside])
+    models = torch.cat([residual[None], torch.where(clipped, others.clamp_min(0.0), others)])
+    painted, smoothly, empty = (share * torch.minimum(models.square(), OUTLIERS * spread[:, None])).sum(-1)
+    score = 1.0 - painted / torch.minimum(smoothly, empty).clamp_min(1e-9)
     return torch.where((spread > 1e-6) & known, score.clamp_min(-1.0), torch.zeros_like(score))
 
 

@@ -157,7 +157,7 @@ def followed_poses(
         turns = torch.stack(
             [
                 torch.stack([beside(known.fitter, [m[k] for m in movies], found[1][k], place, by) for by in errors])
-                for k in range(2, 40, 9)
+                for k in range(0, 40, 2)
             ]
         )
     return place, found[0], found[1], errors, turns
@@ -181,7 +181,7 @@ def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, camer
     assert float(errors[1].norm(dim=1).median()) < 0.92 * float(errors[0].norm(dim=1).median())
     assert float(steps[1]) < 0.92 * float(steps[0])
     expected = beside_mm @ place.follows_rad_mm.mT
-    assert float((turns.mean(0) - expected).norm()) < 0.15 * float(expected.norm())
+    assert float((turns.mean(0) - expected).norm()) < 0.12 * float(expected.norm())
     covariance = torch.stack([poses.covariance[0, :3, :3] for poses in held])
     away = (errors[1][:, None] @ torch.linalg.solve(covariance, errors[1][..., None]))[:, 0, 0]
     assert 0.3 < float(away.mean()) / 3 < 4, "and the attitudes' errors are as their covariances say"

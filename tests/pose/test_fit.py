@@ -62,24 +62,24 @@ def truth(count: int = COUNT) -> tuple[Tensor, Tensor]:
 
 
 @cache
-def shares(kind: str = "patches") -> tuple[Tensor, Tensor]:
-    return share_pictures(rig(), kind, *truth())
+def shares(kind: str = "patches", count: int = COUNT) -> tuple[Tensor, Tensor]:
+    return share_pictures(rig(), kind, *truth(count))
 
 
-def pictures(cameras: str = "two", kind: str = "patches") -> Tensor:
-    paint, ball = shares(kind)
+def pictures(cameras: str = "two", kind: str = "patches", count: int = COUNT) -> Tensor:
+    paint, ball = shares(kind, count)
     clean = BEHIND + (BLACK - BEHIND) * ball + (WHITE - BLACK) * paint
     return noisy(clean, SIGMA, 1)[:, : len(RIGS[cameras])]
 
 
 @cache
-def disks(cameras: str = "two", kind: str = "patches") -> Pixels:
-    return cut(rig(cameras), pictures(cameras, kind), truth()[0])
+def disks(cameras: str = "two", kind: str = "patches", count: int = COUNT) -> Pixels:
+    return cut(rig(cameras), pictures(cameras, kind, count), truth(count)[0])
 
 
 @cache
-def from_truth(cameras: str = "two", kind: str = "patches") -> FittedPoses:
-    return fitted(rig(cameras), kind, disks(cameras, kind), *truth(), SIGMA)
+def from_truth(cameras: str = "two", kind: str = "patches", count: int = COUNT) -> FittedPoses:
+    return fitted(rig(cameras), kind, disks(cameras, kind, count), *truth(count), SIGMA)
 
 
 def apart_deg(one: FittedPoses, other: FittedPoses) -> float:
@@ -335,9 +335,10 @@ def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
     mean = torch.linalg.solve(weight.sum(1), (weight @ fit.own_turn[..., None]).sum(1))[..., 0]
     assert rms(mean) < 0.3 * rms(fit.own_turn)
     # They disagree by as much as they say.
+    fit = from_truth(count=40)
     apart = (fit.own_turn[:, 0] - fit.own_turn[:, 1])[..., None]
     root = torch.linalg.cholesky(fit.own_covariance.sum(1))
-    assert 0.65 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
+    assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
 def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
@@ -497,17 +498,18 @@ def test_score_and_likelihood_tell_wrong_poses():
 @pytest.mark.slow
 def test_the_likelihood_falls_off_as_the_covariance_says():
     # Three standard deviations from the best pose the negative logarithm is 4.5 higher; noise moves its minimum.
-    fit = from_truth()
+    count = 40
+    fit = from_truth(count=count)
     root = torch.linalg.cholesky(fit.covariance)
-    at_best = fitted(rig(), "patches", disks(), fit.position_lab_mm, fit.R_lab_body, SIGMA, iterations=1).nll
+    at_best = fitted(rig(), "patches", disks(count=count), fit.position_lab_mm, fit.R_lab_body, SIGMA, iterations=1).nll
     rise = []
     for i in range(6):
         for side in (3.0, -3.0):
             step = side * root[:, :, i]
             X, R = fit.position_lab_mm + step[:, 3:], so3.exp(step[:, :3]) @ fit.R_lab_body
-            rise.append(fitted(rig(), "patches", disks(), X, R, SIGMA, iterations=1).nll - at_best)
-    mean = torch.stack(rise).reshape(6, 2, COUNT).mean((1, 2))
-    assert ((mean > 2.5) & (mean < 8)).all()
+            rise.append(fitted(rig(), "patches", disks(count=count), X, R, SIGMA, iterations=1).nll - at_best)
+    mean = torch.stack(rise).reshape(6, 2, count).mean((1, 2))
+    assert ((mean > 2.5) & (mean < 7)).all()
 
 
 @pytest.mark.slow

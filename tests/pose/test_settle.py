@@ -96,6 +96,7 @@ def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 def test_coded_pictures_are_measured_by_their_light(scene, kind):
     fitter, pictures, X, R = scene
+    pictures = pictures.clip(max=190.0)  # no camera records more than its full scale
     code, begin = Response(gamma=2.2), start(X, R)
 
     def coded(light):
@@ -109,7 +110,7 @@ def test_coded_pictures_are_measured_by_their_light(scene, kind):
     found = replace(fitter, views=views).settled(frames, begin)
     expected = fitter.settled([list(row) for row in pictures], begin)
     off = so3.geodesic_distance(found.R_lab_body, expected.R_lab_body)
-    assert float((off / expected.covariance.diagonal(dim1=-2, dim2=-1)[:, :3].sum(-1).sqrt()).max()) < 0.6  # sigmas
+    assert float((off / expected.covariance.diagonal(dim1=-2, dim2=-1)[:, :3].sum(-1).sqrt()).max()) < 0.4  # sigmas
     as_linear = so3.geodesic_distance(fitter.settled(frames, begin).R_lab_body, expected.R_lab_body)
     assert float(off.median()) < 0.3 * float(as_linear.median())
 
