@@ -33,6 +33,11 @@ class Moments:
     samples: int
     segments: int
 
+    @property
+    def noisy(self) -> bool:
+        """Whether more than 10 % of a component's variance is noise."""
+        return bool(np.any(self.noise_share.value[:3] > WARN_SHARE))
+
 
 def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Mapping[str, Moments]:
     """Return the moments of v, a, omega and alpha in lab and body, by name; the paper's Table I."""

@@ -37,6 +37,7 @@ from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
+SELDOM = 0.25  # share of the frames with poses; fewer proven ones may be chance, and are judged as few pictures are
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 
 
@@ -106,13 +107,18 @@ def _chosen(
 ) -> tuple[Initialiser, list[Poses], ProvenPoses, float | None]:
     """Return the search, the poses of all frames, those of them that are studied, and the map's log odds, None where
     there are more than a few frames.
+
+    Raises:
+        ExperimentError: chance, or the map's mirror image, explains as much of the few frames or of those proven.
     """
     search, found = find_poses(search, frames) if among is None else (search, list(among.found))
+    sure, posed, few = proven(found), [k for k, poses in enumerate(found) if len(poses)], len(frames) <= FEW
     log_odds = None
-    if len(frames) <= FEW:
-        odds = map_odds(search, frames, found, only=among is None)
-        odds.check([view.name for view in search.fitter.views], found=bool(proven(found)))
-        log_odds = float(odds.log_odds.sum())
+    if few or len(sure) < SELDOM * len(posed):
+        told = range(len(frames)) if few else (sure or posed)[:FEW]
+        odds = map_odds(search, [frames[k] for k in told], [found[k] for k in told], only=among is None)
+        odds.check([view.name for view in search.fitter.views], found=bool(sure))
+        log_odds = float(odds.log_odds.sum()) if few else None
     sample = agreeing_poses(search, frames, found) if among is None else proven_poses(found)
     return search, found, sample, log_odds
 
