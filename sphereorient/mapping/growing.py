@@ -322,7 +322,7 @@ def _judged(state: State, optics: Optics) -> tuple[Appearance, FixedCentre, bool
         score_min=0.5 * (right + min(wrong, right)),
         right_score=right,
     )
-    return appearance, centre_of(fitter, state.pixels, fit, use, X[0]), right > wrong + NO_BETTER
+    return appearance, centre_of(fitter, state.pixels, fit, use, X[0]), right > max(wrong, 0.0) + NO_BETTER
 
 
 def _wrong_score(fitter: Fitter, state: State) -> float:

@@ -13,7 +13,7 @@ from sphereorient.calibration.comparison import Seen, limits_of
 from sphereorient.calibration.contradictions import compare_cameras, majority
 from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, Reason, refusal
-from sphereorient.follow.appearance.presence import nothing, proven
+from sphereorient.follow.appearance.presence import nothing, proven, seldom
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import Picture, widest_px
@@ -83,7 +83,7 @@ def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found
     if len(fitter.views) == 1 and not proven(found):
         raise nothing(found)
     gain, gap_px = _apart(fitter, [[shot.picture for shot in frame] for frame in frames], found)
-    if gain <= APART_GAIN and gap_px <= APART_PX:
+    if gain <= APART_GAIN and gap_px <= APART_PX and not (len(fitter.views) > 1 and seldom(found)):
         return proven_poses(found)
     alone = [replace(search, fitter=fitter.of(k)) for k in range(len(fitter.views))]
     each = [one.all_poses([[frame[k]] for frame in frames]) for k, one in enumerate(alone)]

@@ -21,6 +21,7 @@ from sphereorient.follow.appearance.presence import (
     for_blur,
     proven,
     second_ball,
+    seldom,
     with_least_merit,
 )
 from sphereorient.follow.appearance.record import Among, Appearance, Following, Studied, clear_of, soft
@@ -37,7 +38,6 @@ from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
-SELDOM = 0.25  # share of the frames with poses; fewer proven ones may be chance, and are judged as few pictures are
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 
 
@@ -112,9 +112,9 @@ def _chosen(
         ExperimentError: chance, or the map's mirror image, explains as much of the few frames or of those proven.
     """
     search, found = find_poses(search, frames) if among is None else (search, list(among.found))
-    sure, posed, few = proven(found), [k for k, poses in enumerate(found) if len(poses)], len(frames) <= FEW
-    log_odds = None
-    if few or len(sure) < SELDOM * len(posed):
+    sure, few, log_odds = proven(found), len(frames) <= FEW, None
+    if few or seldom(found):
+        posed = [k for k, poses in enumerate(found) if len(poses)]
         told = range(len(frames)) if few else (sure or posed)[:FEW]
         odds = map_odds(search, [frames[k] for k in told], [found[k] for k in told], only=among is None)
         odds.check([view.name for view in search.fitter.views], found=bool(sure))

@@ -20,6 +20,7 @@ BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
 TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
 LOOK_ALIKE = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
+SELDOM = 0.25  # share of the frames with poses; fewer proven ones may be chance
 RIVALS = 0.1  # share of the frames with two claimants, two frames at least: there is a second ball
 
 
@@ -49,6 +50,11 @@ def proven(found: Sequence[Poses]) -> list[int]:
         return []
     least = max(least, clear_of(float(right.quantile(0.75))))
     return [k for k, score in enumerate(best.tolist()) if score >= least]
+
+
+def seldom(found: Sequence[Poses]) -> bool:
+    """Return whether so few of the frames with poses are proven that these may be so by chance."""
+    return len(proven(found)) < SELDOM * sum(len(poses) > 0 for poses in found)
 
 
 def explained(found: Sequence[Poses], clear: Sequence[int]) -> tuple[float, float]:
