@@ -35,6 +35,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.pose import compiled
 from sphereorient.pose import residuals as residuals_module
 from sphereorient.pose.camera_view import Optics, PyramidLevel
 from sphereorient.pose.model import FIRST
@@ -258,6 +259,15 @@ def test_saturated_pixels_tell_only_that_their_grey_level_is_at_least_that_one()
     same = fitted(rig(), "patches", cut(rig(), pictures(), X, full_scale=1e4), X, R, SIGMA)
     for name in POSE_PARTS:
         assert_close(getattr(same, name), getattr(from_truth(), name), atol=0)
+
+
+@pytest.mark.parametrize("body", ["compiled", "torch"])
+def test_a_picture_that_is_white_all_over_is_not_explained_by_paint(body, monkeypatch):
+    if body == "torch":
+        monkeypatch.setattr(compiled, "library", lambda: None)
+    X, R = truth()
+    white = cut(rig(), torch.full_like(pictures(), 255.0), X, full_scale=255.0)
+    assert float(fitted(rig(), "patches", white, X, R, SIGMA).score.max()) < 0.1
 
 
 def test_the_deviation_of_normal_residuals_is_one_whatever_a_few_of_them_are():

@@ -34,6 +34,15 @@ def test_single_outliers_are_left_to_the_weights():
     assert not found(pictures, most=1.0)[0].any()
 
 
+def test_half_of_a_disk_may_be_hidden():
+    pictures = noisy(CLEAN, SIGMA, 1)
+    edge = round(float(RIG.cameras[0].project(X[0])[0])) + 6  # the margin adds 3 px
+    pictures[0, 0, :, edge:] += 60.0
+    hidden, pixels = found(pictures)
+    assert bool(hidden[0, pixels.place[0] > 8].all())
+    assert not hidden[0, pixels.place[0] < -2].any()
+
+
 def test_where_most_of_a_disk_differs_the_model_is_wrong():
     pictures = noisy(CLEAN, SIGMA, 1)
     pictures[:, :, :, ::12] += 60.0
