@@ -195,10 +195,10 @@ def scores_of(at: Residuals, pixels: Pixels) -> Tensor:
     normal, right = (weighted @ columns.mT).double(), (weighted @ disk[..., None])[..., 0].double()
     smooth = (solve_damped(normal, right, ridge=1e-7).to(columns.dtype)[:, None] @ columns)[:, 0]
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
-    others = torch.stack([disk - smooth, grey - beside])
-    models = torch.cat([residual[None], torch.where(clipped, others.clamp_min(0.0), others)])
-    painted, smoothly, empty = (share * torch.minimum(models.square(), OUTLIERS * spread[:, None])).sum(-1)
-    score = 1.0 - painted / torch.minimum(smoothly, empty).clamp_min(1e-9)
+    without = torch.stack([disk - smooth, grey - beside])
+    models = torch.cat([residual[None], torch.where(clipped, without.clamp_min(0.0), without)])
+    painted, *others = (share * torch.minimum(models.square(), OUTLIERS * spread[:, None])).sum(-1)
+    score = 1.0 - painted / torch.minimum(*others).clamp_min(1e-9)
     return torch.where((spread > 1e-6) & known, score.clamp_min(-1.0), torch.zeros_like(score))
 
 

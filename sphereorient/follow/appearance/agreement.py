@@ -73,8 +73,8 @@ def proven_poses(found: Sequence[Poses]) -> ProvenPoses:
 
 
 def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]) -> ProvenPoses:
-    """Return the proven poses of n frames: of all cameras together, or of each alone where they disagree, since a pose
-    between those of disagreeing cameras would give a wrong light.
+    """Return the proven poses of n frames: of all cameras together, or of each alone where they disagree, or prove
+    hardly any frame together, since a pose between those of disagreeing cameras would give a wrong light.
 
     Raises:
         ExperimentError: no pose is proven, or cameras contradict each other so that nothing can be measured.
