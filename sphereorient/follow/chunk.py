@@ -21,9 +21,6 @@ Floats = NDArray[np.float64]
 LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the shorter one tells no rate
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
-# Frames from one look for a ball that is away to the next: it moves by less than its diameter meanwhile. One that comes
-# wholly into view shows half of its disk at a look.
-LOOKS = int(2 / MOVE_SHARE)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,17 +53,9 @@ class Chunk:
     """One chunk in progress, with its last poses."""
 
     first: int
-    last: int  # + 1
     time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
     turns: deque[Floats] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
-    in_vain: float = -math.inf  # frame, not the first without the ball, of a look that found no blob of its size
-
-    def rests(self, frame: int) -> bool:
-        """Return whether a frame is not looked at: shortly before, no ball was there. One that has come by the next
-        look, at the latest at the chunk's end, is followed back from there.
-        """
-        return frame < min(self.in_vain + LOOKS, self.last - 1)
 
     def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> Expected | None:
         """Extrapolate position and rotation, to second order where three frames are known."""
@@ -141,9 +130,6 @@ class Chunk:
 
     def saw(self, frame: int, poses: Poses, turn: Floats) -> None:
         """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
-        just_lost = len(self.past) > 0 and self.past[-1][0] == frame - 1
-        if not (len(poses) or just_lost or self.rests(frame)) and set(poses.reason) == {Reason.NOT_FOUND}:
-            self.in_vain = frame
         if supported(poses):
             if self.past:
                 self.turns.append(turn)
@@ -172,4 +158,4 @@ def regained(seen: Sequence[bool]) -> bool:
 def mirrored(spans: Sequence[range], time_s: Sequence[float]) -> list[Chunk]:
     """Return the chunks of some frames for the same motion from the last frame to the first: frame n is -n there."""
     back_s = {-k: -time_s[k] for span in spans for k in span}
-    return [Chunk(1 - span.stop, 1 - span.start, back_s) for span in spans]
+    return [Chunk(1 - span.stop, back_s) for span in spans]

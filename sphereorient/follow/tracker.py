@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.errors import Reason
 from sphereorient.files.threads import side_by_side
 from sphereorient.follow.ball import BallTracker
 from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirrored, regained
@@ -16,7 +15,7 @@ from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
 from sphereorient.pose.neighbours import Neighbours, joined
-from sphereorient.pose.poses import Poses, no_pose, supported
+from sphereorient.pose.poses import Poses, supported
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
 
@@ -60,10 +59,7 @@ class Tracker:
         frames.
         """
         firsts = list(accumulate([0, *batch[:-1]]))
-        chunks = {
-            name: [Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
-            for name in self.balls
-        }
+        chunks = {name: [Chunk(first, time_s) for first in firsts] for name in self.balls}
         found: dict[int, dict[str, Poses]] = {}
         for k in range(max(batch)):
             now = [n for n, length in enumerate(batch) if k < length]
@@ -167,8 +163,7 @@ class Tracker:
             }
             for n, row in enumerate(done)
         ]
-        rests = [all(of_ball[n].rests(of_ball[n].first + k) for of_ball in chunks.values()) for n in range(len(frames))]
-        return list(side_by_side(self._completed, zip(done, known, frames, past, rests, strict=True)))
+        return list(side_by_side(self._completed, zip(done, known, frames, past, strict=True)))
 
     def _followed(
         self,
@@ -188,13 +183,10 @@ class Tracker:
 
     def _completed(
         self,
-        frame: tuple[dict[str, Poses], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead], bool],
+        frame: tuple[dict[str, Poses], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead]],
     ) -> dict[str, Poses]:
-        """Return the poses of all balls of a frame: those followed, and those that a search finds unless it rests."""
-        done, known, shots, past, rests = frame
-        if rests:
-            reason = [Reason.NOT_FOUND if shot.readable else shot.read for shot in shots]
-            return dict.fromkeys(self.balls, no_pose(len(shots), reason))
+        """Return the poses of all balls of a frame: those followed, and those that a search finds."""
+        done, known, shots, past = frame
         lost = [name for name in self.balls if name not in done]
         if not lost:
             return done

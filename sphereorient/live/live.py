@@ -42,7 +42,7 @@ class OnlineTracker:
         self.appearance = appearance
         self._tracker = tracker
         self._time_s: dict[int, float] = {}  # of the last frames
-        self._chunk = Chunk(0, 0, self._time_s)
+        self._chunk = Chunk(0, self._time_s)
         self._number = 0
         self._last: Poses | None = None  # of the last frame, before it is remembered
 
