@@ -23,6 +23,8 @@ ORDER = (
     *("preflight", "report", "tools", "live", "bench", "cli"),
 )
 
+LONG, MANY = "functions over 60 lines", "functions of over 6 arguments"
+
 
 def modules() -> dict[str, Path]:
     """Return the modules of the package by dotted name without the package's."""
@@ -135,6 +137,31 @@ def too_large() -> list[str]:
     return [f"{name}: {size} lines, at most {most[name]}" for name, size in sizes.items() if size > most[name]]
 
 
+def counts() -> dict[str, int]:
+    """Return how many arrows, long functions, functions of many arguments and number constants the package has."""
+    found = {"arrows": sum(map(len, arrows().values())), LONG: 0, MANY: 0, "number constants": 0}
+    for path in modules().values():
+        tree = ast.parse(path.read_text())
+        found["number constants"] += sum(_numbers(node) for node in tree.body)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                found[LONG] += (node.end_lineno or node.lineno) - node.lineno >= 60
+                found[MANY] += len([one for one in every if one.arg not in ("self", "cls")]) > 6
+    return found
+
+
+def _numbers(node: ast.stmt) -> int:
+    """Return how many names a statement of a module gives to numbers, or to tuples and tables of numbers."""
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    leaves = [leaf for leaf in ast.walk(node.value) if isinstance(leaf, ast.Constant | ast.Name)] if targets else []
+    if not any(isinstance(leaf, ast.Constant) and type(leaf.value) in (int, float) for leaf in leaves):
+        return 0
+    if not all(isinstance(leaf, ast.Constant) and type(leaf.value) in (int, float) for leaf in leaves):
+        return 0
+    return sum(isinstance(name, ast.Name) for target in targets for name in ast.walk(target))
+
+
 def write_list() -> None:
     """Write the list of rooms into CONTRIBUTING.md; ceilings stay."""
     path, most = REPO / "CONTRIBUTING.md", ceilings()
@@ -192,6 +219,7 @@ def main() -> int:
     if "--write" in sys.argv[1:]:
         write_list()
         draw(REPO / "docs" / "rooms.png")
+    print("; ".join(f"{what}: {number}" for what, number in counts().items()))
     wrong, round_, large = downward(), circles(), too_large()
     for arrow in wrong:
         print(f"downward: {arrow}")
