@@ -20,6 +20,7 @@ ROUND_ENOUGH = 0.3  # a scale that changes by less, as a logarithm, changes no c
 START_DEG = (0.1, 0.5, 2.0)  # changes of the rotation from frame to frame, one of which is near enough to begin with
 CHANGE_MAX_DEG = 10.0  # of the rotation from frame to frame: the largest acceleration that is tried
 SAMPLES, SAMPLE_FRAMES = 3, 100  # parts of the movie from which the start is chosen
+MOSTLY_SURE = 0.5  # share of the frames with one candidate, from which these tell the acceleration
 FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration is not seen in one frame interval
 
 
@@ -139,7 +140,13 @@ def _bounds(rows: CandidateRows) -> tuple[float, float]:
 
 
 def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> SecondOrderCost:
-    """Return the cost with the acceleration under which parts of the movie show a motion most clearly."""
+    """Return the cost with the acceleration of the frames with one candidate each where most are such ones, else with
+    the one under which parts of the movie show a motion most clearly.
+    """
+    sure = _sure(rows)
+    if (sure.row >= 0).mean() > MOSTLY_SURE:
+        middle = replace(cost, acceleration_rad_s2=math.sqrt(math.prod(_bounds(rows))))
+        return replace(cost, acceleration_rad_s2=_acceleration(rows, [(rows, sure)], middle))
     frames, parts = len(rows.time_s), [rows]
     if frames > SAMPLES * SAMPLE_FRAMES:
         firsts = np.linspace(0, frames - SAMPLE_FRAMES, SAMPLES).astype(np.int64).tolist()
@@ -154,6 +161,18 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
         if evidence > most_evidence:
             best, most_evidence = replace(trial, acceleration_rad_s2=_acceleration(rows, searched, trial)), evidence
     return best
+
+
+def _sure(rows: CandidateRows) -> Histories:
+    """Return the history of the frames with one candidate each: a motion through those that follow each other."""
+    single = np.diff(rows.offset) == 1
+    row = np.where(single, rows.offset[:-1], -1)
+    begins = np.ones(len(row), np.bool_)
+    begins[1:] = ~(single[1:] & single[:-1]) | (rows.zones(np.diff(rows.time_s)) > 1)
+    angle, axis = rotation_between(rows.R_lab_body[np.roll(row, 1)], rows.R_lab_body[row])
+    turn = np.where(begins[:, None], np.nan, angle[:, None] * axis)
+    none = np.zeros(len(rows.variance))
+    return Histories(row=row, begins=begins, breaks=begins, turn_rad=turn, posterior=none, evidence=0.0)
 
 
 def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
