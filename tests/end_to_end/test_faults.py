@@ -36,17 +36,18 @@ def rows_of(*more: str) -> dict[str, dict[str, Any]]:
     return {row["fault"]: row | {"clean_worst_deg": told["clean_worst_deg"]} for row in told["rows"]}
 
 
+def most_worse(fault: str) -> float:
+    """Return the largest ratio of the worst errors with and without a fault; a camera that goes on alone has more."""
+    return 2.5 if max(EXPECTED[fault][0].get("cam2", {}).values(), default=0) > 20 else 2.0
+
+
 def check(row: dict[str, Any], frames: int = 96) -> None:
     reasons, valid = EXPECTED[row["fault"]]
     assert {camera: why for camera, why in row["reasons"].items() if why} == reasons
     assert (row["valid_before"], row["valid"]) == (frames, valid - 96 + frames)
     assert row["good_lost"] == 0
     assert row["reasons_elsewhere"] == 0
-    # One camera that goes on alone for 20 frames or more has more errors than two.
-    assert (
-        row["worst_deg"]
-        < (2.5 if max(reasons.get("cam2", {}).values(), default=0) > 20 else 2.0) * row["clean_worst_deg"]
-    )
+    assert row["worst_deg"] < most_worse(row["fault"]) * row["clean_worst_deg"]
     assert row["same"]  # with what the clean run had learnt: the same bits in all blocks without the fault
 
 
@@ -78,7 +79,7 @@ def test_good_frames_are_the_same_to_a_tenth_of_a_sigma_when_all_is_learnt_anew(
     rms_sigma, most_sigma = bars.get(name, (0.11, 0.3))
     assert everything[name]["anew_rms_sigma"] <= rms_sigma
     assert everything[name]["anew_most_sigma"] <= most_sigma
-    assert everything[name]["worst_anew_deg"] < 2 * everything[name]["clean_worst_deg"]
+    assert everything[name]["worst_anew_deg"] < most_worse(name) * everything[name]["clean_worst_deg"]
 
 
 @pytest.mark.slow

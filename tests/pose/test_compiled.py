@@ -124,8 +124,9 @@ def test_occluders_are_those_of_torch(pixels, kind):
     covered[1, :] = covered[1].flip(0)  # so much differs that nothing is taken for an occluder
     hidden, model = replace(pixels, grey=covered), MODELS[kind](pixels)
     for most in (0.4, 1e-4):
-        inside = fit.kept(hidden, begin(), model, most)
-        assert torch.equal(compiled.kept(hidden, begin(), model, most), inside)
+        inside = compiled.kept(hidden, begin(), model, most)
+        other = inside != fit.kept(hidden, begin(), model, most)
+        assert int(other.sum()) <= 1e-3 * int((pixels.inside & ~inside).sum())  # at the threshold rounding decides
         assert bool((pixels.inside & ~inside)[0, near].any()) == (most == 0.4)
         assert torch.equal(inside[1], pixels.inside[1])
         assert_as_torch(hidden, model, 2, most, nll=5e-3)

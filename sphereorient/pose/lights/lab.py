@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import torch
 from scipy.special import sph_legendre_p_all
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from sphereorient.files.threads import side_by_side
 from sphereorient.pose.model import (
@@ -24,7 +25,7 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves, residuals
 from sphereorient.so3 import inverse_damped
-from sphereorient.sphere.texture import sample_texture
+from sphereorient.sphere.texture import closed_texture, texel_coordinates
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import polynomials
 
@@ -65,8 +66,10 @@ class LabLight(Light):
     @cached_property
     def _map(self) -> Tensor:
         """Return difference, black and gloss in cells of directions, (SIDE^2, 3)."""
-        scattered = [_cells(part, SCATTERED) for part in (self.difference, self.black)]
-        return torch.stack([*scattered, _cells(self.gloss, MIRRORED)], dim=-1).to(self.gloss.device)
+        parts = ((self.difference, SCATTERED), (self.black, SCATTERED), (self.gloss, MIRRORED))
+        grids = torch.stack([closed_texture(_on_grid(*part)) for part in parts])
+        found = grid_sample(grids[None], _cells_on_grid(), align_corners=True)[0, :, 0].mT
+        return found.float().contiguous().to(self.gloss.device)
 
     @cached_property
     def _cover(self) -> Tensor:
@@ -149,17 +152,28 @@ def _meridian(degree: int) -> Tensor:
     return harmonics(torch.stack([polar.sin(), torch.zeros_like(polar), polar.cos()], dim=-1), degree)
 
 
-def _cells(coefficients: Tensor, degree: int) -> Tensor:
-    """Return a sum of harmonics in cells of directions, (SIDE^2,) float32."""
-    order = torch.tensor([m for n in range(degree + 1) for m in range(-n, n + 1)])
-    meridian, given = _meridian(degree), coefficients.double().cpu()
-    # Of the orders m and -m the meridian y = 0 shows that of the cosine; both have the same latitudes.
-    place = torch.tensor([n * n + n + abs(m) for n in range(degree + 1) for m in range(-n, n + 1)])
-    rows = meridian[:, place] * given
+@lru_cache(maxsize=2)
+def _longitudes(degree: int) -> Tensor:
+    """Return the factor of each order, -degree .. degree, along a grid of longitudes, (2 degree + 1, 2 GRID)."""
+    order = torch.arange(-degree, degree + 1)
     longitude = math.pi * (torch.arange(2 * GRID, dtype=torch.float64) + 0.5) / GRID - math.pi
     turn = order[:, None] * longitude
-    grid = rows @ torch.where(order[:, None] < 0, (-turn).sin(), turn.cos())
-    return sample_texture(grid, octahedral_directions(SIDE)).float()
+    return torch.where(order[:, None] < 0, (-turn).sin(), turn.cos())
+
+
+def _on_grid(coefficients: Tensor, degree: int) -> Tensor:
+    """Return a sum of harmonics on a grid of latitudes and longitudes, (GRID, 2 GRID)."""
+    degrees, orders = torch.tensor([(n, m) for n in range(degree + 1) for m in range(-n, n + 1)]).T
+    # Of the orders m and -m the meridian y = 0 shows that of the cosine; both have the same latitudes.
+    each = _meridian(degree)[:, degrees * (degrees + 1) + orders.abs()] * coefficients.double().cpu()
+    return each.new_zeros(GRID, 2 * degree + 1).index_add(1, orders + degree, each) @ _longitudes(degree)
+
+
+@cache
+def _cells_on_grid() -> Tensor:
+    """Return where the cells of directions lie in a closed grid, (1, 1, SIDE^2, 2), -1 .. 1 from edge to edge."""
+    column, row = texel_coordinates(octahedral_directions(SIDE), GRID)
+    return torch.stack([(column + 1) / (GRID + 0.5) - 1, 2 * (row + 1) / (GRID + 1) - 1], dim=-1)[None, None]
 
 
 def lab_light(
@@ -229,9 +243,8 @@ def _better(
     now, sizes = torch.cat(unknown).double(), [len(part) for part in unknown]
     normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
     difference, black, gloss, through, mirrored = light.shown(view, pixels)
-    shown, ground = light.at(view, pixels)
     cover = view.coverage * light.gain.repeat(len(gloss) // cameras)[:, None]
-    learnt = view.coverage * (view.paint * shown + ground)
+    learnt = cover * (through * (view.paint * difference + black) + mirrored * gloss)
     left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
     tints = polynomials(view.across, 2)
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
