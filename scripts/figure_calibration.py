@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration import DotPlate, calibrate_cameras
 from sphereorient.calibration.calibrated import summary
+from sphereorient.calibration.plates import calibrate_cameras
+from sphereorient.calibration.targets import DotPlate
 from sphereorient.cameras import Port, PortCamera, TsaiCamera, triangulate
 from sphereorient.files.whole_file import writing
 from sphereorient.report import calibration_figure

@@ -23,7 +23,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from sphereorient.calibration import DotPlate, PlateView, disk_centre_shift, plate_from_entry, see_plate
+from sphereorient.calibration.boards import see_plate
+from sphereorient.calibration.bundle import disk_centre_shift
+from sphereorient.calibration.targets import DotPlate, PlateView, plate_from_entry
 from sphereorient.cameras import Camera, load_cameras
 
 RIM = 64  # points of a dot's rim that must all be in the picture

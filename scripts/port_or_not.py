@@ -22,7 +22,8 @@ from matplotlib.figure import Figure
 
 from sphereorient import so3
 from sphereorient.bench import Score, score_track
-from sphereorient.calibration import calibrate_cameras, load_calibration
+from sphereorient.calibration.document import load_calibration
+from sphereorient.calibration.plates import calibrate_cameras
 from sphereorient.cameras import Camera, triangulate
 from sphereorient.experiment import load_experiment
 from sphereorient.run.stages import track_movies

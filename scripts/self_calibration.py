@@ -19,8 +19,7 @@ from pathlib import Path
 import torch
 
 from sphereorient import so3
-from sphereorient.calibration import check_cameras
-from sphereorient.calibration.self_calibration import observations_of, self_calibrate
+from sphereorient.calibration.self_calibration import check_cameras, observations_of, self_calibrate
 from sphereorient.cameras import Camera
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.experiment import load_experiment

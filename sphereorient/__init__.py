@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sphereorient import cameras, so3, sphere, synth
     from sphereorient.assemble import PathLayer
-    from sphereorient.calibration import calibrate_cameras as calibrate
+    from sphereorient.calibration.plates import calibrate_cameras as calibrate
     from sphereorient.experiment import Experiment, load_experiment
     from sphereorient.methods.map import learn_map
     from sphereorient.methods.settings import Settings, load_settings
@@ -27,7 +27,7 @@ _HOMES = {
     "TemplateBank": ("search", "TemplateBank"),
     "Tracks": ("trajectory", "Tracks"),
     "Trajectory": ("trajectory", "Trajectory"),
-    "calibrate": ("calibration", "calibrate_cameras"),
+    "calibrate": ("calibration.plates", "calibrate_cameras"),
     "cameras": ("cameras", ""),
     "check": ("preflight", "preflight"),
     "learn_map": ("methods.map", "learn_map"),

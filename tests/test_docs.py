@@ -22,8 +22,7 @@ import yaml
 from conftest import REPO
 from packaging.requirements import Requirement
 
-from sphereorient.calibration import load_calibration
-from sphereorient.calibration.document import CalibrationKeys
+from sphereorient.calibration.document import CalibrationKeys, load_calibration
 from sphereorient.calibration.targets import KINDS, target_keys
 from sphereorient.cameras import load_cameras
 from sphereorient.cameras.io.cameras_yaml import ENTRIES, MODELS, PortEntry

@@ -34,7 +34,7 @@ def calibrate(
         _repair(source, refine_with, out, quiet)
         return
     check_writable(picture)
-    from sphereorient.calibration import calibrate_cameras
+    from sphereorient.calibration.plates import calibrate_cameras
     from sphereorient.cameras import save_cameras
     from sphereorient.report import calibration_figure
 
@@ -56,8 +56,7 @@ def calibrate(
 
 
 def _repair(cameras: Path, track: Path, out: Path, quiet: bool) -> None:
-    from sphereorient.calibration import refine_with_track
-    from sphereorient.calibration.self_calibration import repair_lines
+    from sphereorient.calibration.self_calibration import refine_with_track, repair_lines
     from sphereorient.cameras import load_cameras, save_cameras
 
     result = refine_with_track(cameras, track)
@@ -76,8 +75,7 @@ def check_cameras_command(
     quiet: Annotated[bool, Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Report how far the cameras' lines of sight to the sphere miss each other, over a movie."""
-    from sphereorient.calibration import check_cameras
-    from sphereorient.calibration.self_calibration import check_lines, contradiction_lines
+    from sphereorient.calibration.self_calibration import check_cameras, check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
     from sphereorient.run.stages import track_movies
     from sphereorient.trajectory import Tracks

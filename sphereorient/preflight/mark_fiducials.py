@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.calibration import DotPlate, load_calibration
-from sphereorient.calibration.document import Picture, checked_clicks
+from sphereorient.calibration.document import Picture, checked_clicks, load_calibration
 from sphereorient.calibration.dots import Dots, find_dots
 from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.plates import read_plate_picture
-from sphereorient.calibration.targets import FIDUCIALS
+from sphereorient.calibration.targets import FIDUCIALS, DotPlate
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import eight_bits
 from sphereorient.preflight.mark import Json, Marking, png

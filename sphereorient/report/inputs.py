@@ -11,7 +11,7 @@ import torch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from sphereorient.calibration import Calibrated, PictureReport
+from sphereorient.calibration.calibrated import Calibrated, PictureReport
 from sphereorient.calibration.comparison import LATEST
 from sphereorient.files.picture import decoded_grey
 from sphereorient.movies import Movie

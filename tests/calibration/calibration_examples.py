@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration import DotPlate, PlateView, disk_centre_shift
-from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
+from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, disk_centre_shift, fitted_parameters, gathered
 from sphereorient.calibration.document import CalibrationDocument, CalibrationKeys
+from sphereorient.calibration.targets import DotPlate, PlateView
 from sphereorient.calibration.tsai_method import guess_rig
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera

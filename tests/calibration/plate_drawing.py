@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.calibration import DotPlate
+from sphereorient.calibration.targets import DotPlate
 from sphereorient.cameras import PinholeCamera
 
 SIZE = (480, 400)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sphereorient.calibration import PlateView, placed, plate_from_entry, see_plate
-from sphereorient.calibration.targets import CharucoBoard, Chessboard, CircleGrid
+from sphereorient.calibration.boards import see_plate
+from sphereorient.calibration.targets import CharucoBoard, Chessboard, CircleGrid, PlateView, placed, plate_from_entry
 from sphereorient.errors import CameraError
 
 SIZE = (640, 480)

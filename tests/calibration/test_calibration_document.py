@@ -8,8 +8,7 @@ import yaml
 from calibrate_examples import document, write
 from conftest import assert_close
 
-from sphereorient.calibration import load_calibration
-from sphereorient.calibration.document import read_points
+from sphereorient.calibration.document import load_calibration, read_points
 from sphereorient.errors import CameraError
 
 PORT = {"normal": [0, 0, 1], "offset": 100.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}

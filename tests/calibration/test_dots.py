@@ -13,7 +13,7 @@ from conftest import assert_close
 from plate_drawing import PLATE, SIZE, Scene
 from scipy.integrate import dblquad
 
-from sphereorient.calibration import disk_centre_shift
+from sphereorient.calibration.bundle import disk_centre_shift
 from sphereorient.calibration.dots import Dots, DotSettings, find_dots
 from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import CameraError, ShapeError

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plate_drawing import PLATE, Scene
 
-from sphereorient.calibration import DotPlate, PlateView, placed, plate_from_entry, see_plate
+from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.dots import Dots, find_dots
 from sphereorient.calibration.lattice import index_dots
-from sphereorient.calibration.targets import quarter_turned
+from sphereorient.calibration.targets import DotPlate, PlateView, placed, plate_from_entry, quarter_turned
 from sphereorient.errors import CameraError
 
 
@@ -264,7 +264,7 @@ def test_pictures_of_a_laboratory_are_told_right_to_the_last_dot(folder: str) ->
     import torch
     import yaml
 
-    from sphereorient.calibration import disk_centre_shift
+    from sphereorient.calibration.bundle import disk_centre_shift
     from sphereorient.cameras import load_cameras
 
     place = SHARED / folder / "calibration"

@@ -13,9 +13,9 @@ from conftest import SHARED
 from rich.console import Console
 
 from sphereorient import so3
-from sphereorient.calibration import calibrate_cameras, load_calibration
 from sphereorient.calibration.calibrated import parameters_table, pictures_table, summary
-from sphereorient.calibration.plates import see_pictures, tie_floating
+from sphereorient.calibration.document import load_calibration
+from sphereorient.calibration.plates import calibrate_cameras, see_pictures, tie_floating
 from sphereorient.cameras import load_cameras, load_covariance, save_cameras, triangulate
 from sphereorient.errors import CameraError, SphereOrientError
 from sphereorient.report import calibration_figure

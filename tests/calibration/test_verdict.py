@@ -14,9 +14,10 @@ from calibration_examples import PLATE, cameras, document, planted, port, views
 from conftest import SHARED
 
 from sphereorient import cli
-from sphereorient.calibration import calibrate_cameras, plates
+from sphereorient.calibration import plates
 from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubts
 from sphereorient.calibration.document import Picture
+from sphereorient.calibration.plates import calibrate_cameras
 from sphereorient.calibration.targets import seen as seen_points
 from sphereorient.cameras import ParameterCovariance, load_cameras
 from sphereorient.errors import CameraError

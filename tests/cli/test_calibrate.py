@@ -11,8 +11,14 @@ from calibrate_examples import F_PX, PITCH, document, true_cameras, write
 from conftest import REPO
 
 from sphereorient import cli, so3
-from sphereorient.calibration import check_cameras, refine_with_track
-from sphereorient.calibration.self_calibration import check_lines, contradiction_lines, observations_of, repair_lines
+from sphereorient.calibration.self_calibration import (
+    check_cameras,
+    check_lines,
+    contradiction_lines,
+    observations_of,
+    refine_with_track,
+    repair_lines,
+)
 from sphereorient.cameras import TsaiCamera, load_cameras, save_cameras
 from sphereorient.cameras.parameters import with_parameters
 from sphereorient.errors import CameraError, TrackError

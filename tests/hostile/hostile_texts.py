@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 from pydantic import BaseModel
 
-from sphereorient.calibration import load_calibration
-from sphereorient.calibration.document import read_points
+from sphereorient.calibration.document import load_calibration, read_points
 from sphereorient.cameras import load_cameras, load_covariance
 from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par

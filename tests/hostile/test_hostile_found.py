@@ -14,8 +14,7 @@ from hostile_files import bomb_png, encoded, pattern, png, tiff
 from hostile_kinds import BOMBS
 from hostile_texts import OPENCV, ORI, PAR, PINHOLE, calibration_documents, camera, cameras_documents, points_family
 
-from sphereorient.calibration import load_calibration
-from sphereorient.calibration.document import read_points
+from sphereorient.calibration.document import load_calibration, read_points
 from sphereorient.cameras import Camera, load_cameras
 from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par

@@ -15,7 +15,7 @@ from mark_examples import ask, opened, place, served
 from plate_drawing import PLATE, SIZE, Scene
 from typer.testing import CliRunner
 
-from sphereorient.calibration import load_calibration
+from sphereorient.calibration.document import load_calibration
 from sphereorient.calibration.plates import see_pictures
 from sphereorient.cli import app
 from sphereorient.errors import CameraError
