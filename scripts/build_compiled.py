@@ -36,7 +36,7 @@ class Compiled(BuildHookInterface):
         compiler, on = [os.environ.get("CC", "cc")], platform.machine().lower()
         tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         if wanted:
-            compiler, on = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[wanted]], wanted
+            compiler, on = [sys.executable, "-m", "ziglang", "cc", "-s", "-target", TARGETS[wanted]], wanted
             tag = wanted
         kinds = {"default": [], **(X86 if on.endswith(("x86_64", "amd64")) else {})}
         for source, (kind, flags) in product(SOURCES, kinds.items()):
