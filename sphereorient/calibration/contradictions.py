@@ -61,7 +61,7 @@ class Consistency:
     def __str__(self) -> str:
         parts = {f"lines of sight {self.gap_px:.2f} px apart": self.gap_px}
         parts |= {f"attitudes {self.turn_deg:.2g} degrees apart": self.turn_deg}
-        parts |= {f"size {100 * self.size:+.1f} %": self.size}
+        parts |= {f"size {round(100 * self.size, 1) + 0.0:+.1f} %": self.size}
         return ", ".join(words for words, value in parts.items() if math.isfinite(value))
 
 
