@@ -136,11 +136,13 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     parts = torch.cat([inside[:, None], (inside * at.residual)[:, None], inside[:, None] * others], dim=1)
     sums = parts.new_zeros(*parts.shape[:2], cells)
     sums.scatter_add_(2, (row * GLINTS + column)[:, None].expand(parts.shape), parts)
+    there = sums[:, 0].any(0).nonzero()[:, 0]  # the others are beyond the limb, or hidden in every picture
+    sums = sums[..., there]
     weight, pull = (by_pose(sums[:, k], cameras) for k in range(2))  # (B, C, cells)
     whole = weight.sum(0).clamp_min(1e-30)
     mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
     error2 = (pull - weight * mean).square().sum(0) / whole.square() * number / (number - 1)
-    told, now = number > 1, known.reshape(cameras, cells).double()
+    told, now = number > 1, known.reshape(cameras, cells)[:, there].double()
     signal2 = torch.where(told, (now + mean).square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
     drawn = torch.where(told, whole * error2 / signal2.clamp_min(1e-12)[:, None], math.inf).nan_to_num(posinf=1e30)
     weighted = others * precision[:, None]
@@ -149,7 +151,8 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     mixed = torch.einsum("bcip,bcpj->cij", taken, by_pose(sums[:, 2:], cameras))
     left = by_pose((weighted @ at.residual.double()[..., None])[..., 0], cameras)
     force = pull.sum(0) - torch.einsum("bcip,bcp->ci", taken, left) - drawn * now
-    found: Tensor = now + torch.linalg.solve(torch.diag_embed(weight.sum(0) + drawn) - mixed, force)
+    found = now.new_zeros(cameras, cells)
+    found[:, there] = now + torch.linalg.solve(torch.diag_embed(weight.sum(0) + drawn) - mixed, force)
     return found.reshape(known.shape).float()
 
 
