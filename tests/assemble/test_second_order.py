@@ -321,6 +321,14 @@ def test_uneven_times_are_no_change_of_omega(rng):
     assert not path.flags.any()
 
 
+def test_frames_with_one_candidate_tell_the_acceleration_without_a_search(rng, monkeypatch):
+    runs, run = [], beam.BeamSearch.run
+    monkeypatch.setattr(beam.BeamSearch, "run", lambda search: runs.append(search) or run(search))
+    path = physical_path(pooled(seen(turning(60), rng)), times(60), SETTINGS)
+    assert len(runs) == 1
+    assert path.choice.tolist() == [0] * 60
+
+
 def test_the_acceleration_is_learnt_from_the_track(rng):
     frames, change = 400, math.radians(1.0)
     steps = torch.cat([torch.full((1, 3), 0.1), change * torch.randn(frames - 1, 3, generator=rng)]).double()
