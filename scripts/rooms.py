@@ -155,9 +155,7 @@ def _numbers(node: ast.stmt) -> int:
     """Return how many names a statement of a module gives to numbers, or to tuples and tables of numbers."""
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     leaves = [leaf for leaf in ast.walk(node.value) if isinstance(leaf, ast.Constant | ast.Name)] if targets else []
-    if not any(isinstance(leaf, ast.Constant) and type(leaf.value) in (int, float) for leaf in leaves):
-        return 0
-    if not all(isinstance(leaf, ast.Constant) and type(leaf.value) in (int, float) for leaf in leaves):
+    if not leaves or any(isinstance(leaf, ast.Name) or type(leaf.value) not in (int, float) for leaf in leaves):
         return 0
     return sum(isinstance(name, ast.Name) for target in targets for name in ast.walk(target))
 

@@ -142,16 +142,15 @@ def closed_texture(texture: Tensor) -> Tensor:
 
 def sample_closed(closed: Tensor, direction_body: Tensor) -> Tensor:
     """Return the grey of `sample_texture`, of a map that is sampled more than once."""
+    return sample_at(closed[None], *texel_coordinates(direction_body, len(closed) - 2))[0]
+
+
+def sample_at(closed: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Return the grey (n, ...) of n closed maps (n, H + 2, 2 H + 2) at `texel_coordinates` (...)."""
     from kornia.geometry.transform import remap  # late: half a second, and tables that are kept do without it
 
-    column, row = texel_coordinates(direction_body, len(closed) - 2)
-    grey = remap(
-        closed[None, None],
-        (column + 1).reshape(1, 1, -1),
-        (row + 1).reshape(1, 1, -1),
-        align_corners=True,
-    )
-    return grey.reshape(column.shape)
+    grey = remap(closed[None], (column + 1).reshape(1, 1, -1), (row + 1).reshape(1, 1, -1), align_corners=True)
+    return grey.reshape(len(closed), *column.shape)
 
 
 def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ def rows_of(*more: str) -> dict[str, dict[str, Any]]:
 
 def most_worse(fault: str) -> float:
     """Return the largest ratio of the worst errors with and without a fault; a camera that goes on alone has more."""
-    return 2.5 if max(EXPECTED[fault][0].get("cam2", {}).values(), default=0) > 20 else 2.0
+    return 2.25 if max(EXPECTED[fault][0].get("cam2", {}).values(), default=0) > 20 else 2.0
 
 
 def check(row: dict[str, Any], frames: int = 96) -> None:
@@ -57,7 +57,7 @@ def test_a_fault_costs_its_own_frames_only():
     row = rows_of("--frames", "48", "--only", "black, cam1")["black, cam1"]
     check(row, 48)
     # What 42 frames tell in place of 48 differs by sqrt(6 / 42) of what lasts, half a sigma: 0.19.
-    assert row["anew_rms_sigma"] <= 0.15
+    assert row["anew_rms_sigma"] <= 0.13
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_each_fault_costs_its_own_frames_only(everything, name):
 @pytest.mark.parametrize("name", [name for name in EXPECTED if name != "cam2 a frame late from here on"])
 def test_good_frames_are_the_same_to_a_tenth_of_a_sigma_when_all_is_learnt_anew(everything, name):
     # A frame beside lost ones knows less of the path that its orientation follows; cam2 tells of 21 frames less.
-    bars = {"out of view": (0.125, 0.4), "truncated movie, cam2": (0.11, 0.5)}
+    bars = {"out of view": (0.125, 0.4), "truncated movie, cam2": (0.11, 0.45)}
     rms_sigma, most_sigma = bars.get(name, (0.11, 0.3))
     assert everything[name]["anew_rms_sigma"] <= rms_sigma
     assert everything[name]["anew_most_sigma"] <= most_sigma

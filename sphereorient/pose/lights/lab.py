@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from scipy.special import sph_legendre_p_all
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from sphereorient.files.threads import side_by_side
 from sphereorient.pose.model import (
@@ -25,7 +24,7 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves, residuals
 from sphereorient.so3 import inverse_damped
-from sphereorient.sphere.texture import closed_texture, texel_coordinates
+from sphereorient.sphere.texture import closed_texture, sample_at, texel_coordinates
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import polynomials
 
@@ -68,8 +67,7 @@ class LabLight(Light):
         """Return difference, black and gloss in cells of directions, (SIDE^2, 3)."""
         parts = ((self.difference, SCATTERED), (self.black, SCATTERED), (self.gloss, MIRRORED))
         grids = torch.stack([closed_texture(_on_grid(*part)) for part in parts])
-        found = grid_sample(grids[None], _cells_on_grid(), align_corners=True)[0, :, 0].mT
-        return found.float().contiguous().to(self.gloss.device)
+        return sample_at(grids, *_cells_on_grid()).mT.float().contiguous().to(self.gloss.device)
 
     @cached_property
     def _cover(self) -> Tensor:
@@ -170,10 +168,9 @@ def _on_grid(coefficients: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _cells_on_grid() -> Tensor:
-    """Return where the cells of directions lie in a closed grid, (1, 1, SIDE^2, 2), -1 .. 1 from edge to edge."""
-    column, row = texel_coordinates(octahedral_directions(SIDE), GRID)
-    return torch.stack([(column + 1) / (GRID + 0.5) - 1, 2 * (row + 1) / (GRID + 1) - 1], dim=-1)[None, None]
+def _cells_on_grid() -> tuple[Tensor, Tensor]:
+    """Return column and row of the cells of directions in that grid, (SIDE^2,) each."""
+    return texel_coordinates(octahedral_directions(SIDE), GRID)
 
 
 def lab_light(
