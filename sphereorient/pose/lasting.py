@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.lights.disk import RIDGE, light_columns
-from sphereorient.pose.model import SphereModel, by_pose
+from sphereorient.pose.lights.disk import RIDGE, glint_cells, glint_shares, light_columns
+from sphereorient.pose.model import IN_SIGHT, SphereModel, by_pose
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.residuals import fitted_residuals
@@ -66,10 +66,10 @@ def lasting_errors(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel | None = None
 ) -> Lasting:
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
-    One turn and move of all poses, with the light of each camera, the place and width of its limb and, with a model of
-    `wider` blur, that of the paint and its response, are fitted to all frames but for one tile of one camera's disk: by
-    how much that changes them from tile to tile. What is wrong in a place of every picture shows, and what light or
-    limb could take of it; of few frames their noise as well.
+    One turn and move of all poses, with the light of each camera, its glints, the place and width of its limb and, with
+    a model of `wider` blur, that of the paint and its response, are fitted to all frames but for one tile of one
+    camera's disk: by how much that changes them from tile to tile. What is wrong in a place of every picture shows, and
+    what light, glints or limb could take of it; of few frames their noise as well.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     normal, right, ridge = _by_tile(pixels, fit, use, model, wider)
@@ -147,9 +147,9 @@ def _by_tile(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
-    the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
-    tiles of its own; the last two unknowns are its place and width, px; with a model of `wider` blur there follow the
-    share of that and the logarithm of the power of the light.
+    the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated, and the glints
+    that all share. The limb has tiles of its own; the last two unknowns are its place and width, px; with a model of
+    `wider` blur there follow the share of that and the logarithm of the power of the light.
     """
     cameras, at = use.shape[1], fitted_residuals(pixels, fit, model)
     precision = at.weight / at.variance * use.reshape(-1, 1)
@@ -170,18 +170,34 @@ def _by_tile(
     columns = columns - mixed.to(columns.dtype) @ at.design[:, 6:]
     column, row = ((at.view.across + 1.0) * (0.5 * TILES)).long().clamp(0, TILES - 1).unbind(1)
     tile = (row * TILES + column) * 2 + (at.view.coverage < WHOLE).long()
-    count = columns.shape[1]
+    cell, in_cells = glint_cells(at.view.across), precision * (at.view.coverage > IN_SIGHT)
+    shares = glint_shares(at, use, model.light.mirrors(at.view, pixels)).to(columns)
+    columns, count = torch.cat([columns, at.residual[:, None]], dim=1), columns.shape[1]
     normal = columns.new_zeros(cameras, 2 * TILES**2, count, count)
     right = normal.new_zeros(normal.shape[:3])
     for camera in range(cameras):
         own = slice(camera, None, cameras)
         values = columns[own].transpose(1, 2).contiguous()
+        values -= _of_cells(values, in_cells[own], cell[own], shares[camera])
         for k in range(normal.shape[1]):
             there = tile[own] == k
             here = values[there]
-            pulls = here * precision[own][there][:, None]
-            normal[camera, k], right[camera, k] = pulls.mT @ here, at.residual[own][there] @ pulls
+            pulls = here[:, :count] * precision[own][there][:, None]
+            both = pulls.mT @ here
+            normal[camera, k], right[camera, k] = both[:, :count], both[:, count]
     return normal.double(), right.double(), torch.diag_embed(RIDGE * size)
+
+
+def _of_cells(values: Tensor, weight: Tensor, cell: Tensor, shares: Tensor) -> Tensor:
+    """Return what to take off values (B, P, n) so that their sums of products are those with a coefficient for each
+    cell eliminated, (B, P, n); weight and cell (B, P), shares (cells,) as `glint_shares`.
+    Source: random effects by partial demeaning, Fuller and Battese 1974.
+    """
+    flat, of = values.flatten(0, 1), cell.flatten()
+    whole = values.new_zeros(len(shares)).index_add_(0, of, weight.flatten())
+    means = values.new_zeros(len(shares), values.shape[-1]).index_add_(0, of, flat * weight.flatten()[:, None])
+    means *= ((1.0 - (1.0 - shares).clamp_min(0.0).sqrt()) / whole.clamp_min(1e-30))[:, None]
+    return means.index_select(0, of).reshape(values.shape) * (weight > 0)[..., None]
 
 
 def by_power(light: Tensor, scale: Tensor) -> Tensor:

@@ -127,6 +127,10 @@ class Light(ABC):
     def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
         """Return difference and black, grey levels, (L, P) each, of L disks, the C cameras of a pose side by side."""
 
+    @abstractmethod
+    def mirrors(self, view: SphereView, pixels: Pixels) -> Tensor:
+        """Return what of the pixels of L disks the surface mirrors, whatever the paint, grey levels (L, P)."""
+
     @property
     @abstractmethod
     def tables(self) -> LightTables:

@@ -29,8 +29,12 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.pose.lasting import Lasting, by_power, lasting_errors, limb_wider_px, of_left_out
+from sphereorient.pose.lasting import Lasting, _of_cells, by_power, lasting_errors, limb_wider_px, of_left_out
+from sphereorient.pose.lights.disk import glint_shares
+from sphereorient.pose.model import SphereModel
+from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.pose.residuals import fitted_residuals
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y
@@ -38,10 +42,8 @@ RIG = rig_of()
 
 
 @cache
-def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, FittedPoses, Lasting]:
-    """Errors (B, 6), rad and mm, of fits to pictures with a reflection, and what lasts of them; without `glints` no
-    model knows it.
-    """
+def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPoses, Tensor, SphereModel]:
+    """Fits to pictures with a reflection; without `glints` no model knows it."""
     X, R = balls(count, 4)
     pictures = pictures_of(RIG, "patches", X, R)
     row, column = torch.meshgrid(*(torch.arange(size) for size in pictures.shape[-2:]), indexing="ij")
@@ -57,6 +59,14 @@ def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, 
         model = replace(model, light=model.light.learnt(pixels, fit, use, model, glints=glints))
         begin = PoseStart(fit.position_lab_mm, fit.R_lab_body, use)
         fit = refined(pixels, begin, model, 3)
+    return pixels, fit, use, model
+
+
+@cache
+def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, FittedPoses, Lasting]:
+    """Errors (B, 6), rad and mm, of such fits, and what lasts of them."""
+    X, R = balls(count, 4)
+    pixels, fit, use, model = studied(count, lobe, glints=glints)
     found = lasting_errors(pixels, fit, use, model)
     off = torch.cat([so3.log(fit.R_lab_body @ R.mT), fit.position_lab_mm - X], dim=-1)
     return off, fit, found
@@ -90,6 +100,41 @@ def test_a_mat_ball_has_no_glints():
     calm, fit, _ = measured(COUNT, 0.0)
     _, learnt, _ = measured(COUNT, 0.0, glints=True)
     assert so3.geodesic_distance(fit.R_lab_body, learnt.R_lab_body).max() < 0.1 * calm[:, :3].norm(dim=1).mean()
+
+
+@pytest.mark.parametrize("count", [2, COUNT])
+def test_a_glint_follows_its_pixels_and_a_mat_ball_has_none(count: int):
+    medians = []
+    for lobe in (0.0, LOBE):
+        pixels, fit, use, model = studied(count, lobe, glints=True)
+        at = fitted_residuals(pixels, fit, model)
+        shares = glint_shares(at, use, model.light.mirrors(at.view, pixels))
+        assert bool(((shares >= 0.0) & (shares <= 1.0)).all())
+        medians.append(float(shares[shares > 0.0].median()) if bool((shares > 0.0).any()) else 0.0)
+    assert medians[0] < 0.5 < 0.8 < medians[1]
+
+
+def test_one_frame_tells_no_glints():
+    pixels, fit, use, model = studied(1, LOBE, glints=True)
+    at = fitted_residuals(pixels, fit, model)
+    assert glint_shares(at, use, model.light.mirrors(at.view, pixels)).max() < 1e-6
+
+
+def test_cells_are_eliminated_as_far_as_they_may_change():
+    rng = torch.Generator().manual_seed(3)
+    values = torch.randn(3, 50, 4, generator=rng, dtype=torch.float64)
+    weight = torch.rand(3, 50, generator=rng, dtype=torch.float64)
+    weight[0, :5] = 0.0  # beyond the limb
+    cell = torch.randint(0, 6, (3, 50), generator=rng)
+    prior = torch.tensor([1e-9, 0.1, 1.0, 10.0, 1e9, 1.0], dtype=torch.float64)
+    whole = torch.zeros(6, dtype=torch.float64).index_add_(0, cell.flatten(), weight.flatten())
+    left = values - _of_cells(values, weight, cell, whole / (whole + prior))
+    found = torch.einsum("bpi,bp,bpj->ij", left, weight, left)
+    rows = torch.nn.functional.one_hot(cell, 6).double()
+    columns = torch.cat([values, rows], dim=-1).flatten(0, 1)
+    normal = columns.mT @ (weight.flatten()[:, None] * columns) + torch.cat([torch.zeros(4), prior]).diag()
+    exact = normal[:4, :4] - normal[:4, 4:] @ torch.linalg.solve(normal[4:, 4:], normal[4:, :4])
+    torch.testing.assert_close(found, exact, rtol=1e-6, atol=1e-9)
 
 
 def test_of_one_frame_more_may_last_than_of_many():

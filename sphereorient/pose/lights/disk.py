@@ -75,6 +75,11 @@ class DiskLight(Light):
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
 
+    def mirrors(self, view: SphereView, pixels: Pixels) -> Tensor:
+        """Return the glints, grey levels; see `Light.mirrors`."""
+        disks = len(view.across) // len(self.glints)
+        return view.coverage * glints_at(self.glints.repeat(disks, 1, 1), view.across.mT)
+
     def learnt(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
     ) -> "DiskLight":
@@ -85,7 +90,7 @@ class DiskLight(Light):
         at = fitted_residuals(pixels, fit, model)
         stray = learn_stray(at, pixels, use, self.stray)
         found = learn_glints(at, use, self.glints) if glints else no_glints(cameras)
-        mirrored = at.view.coverage * glints_at(found.repeat(len(use), 1, 1), at.view.across.mT)
+        mirrored = replace(self, glints=found).mirrors(at.view, pixels)
         lit = replace(pixels, behind=scene_beside(at.view, pixels, stray), grey=pixels.grey - mirrored)
         columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
         normal, right = light_sums(columns, at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
@@ -124,36 +129,69 @@ def glints_at(glints: Tensor, across: Tensor) -> Tensor:
 def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     """Estimate what the surface mirrors, (C, G, G), see `Light`, from what B * C disks, those of `use` (B, C), leave
     in the same cell of the disk, but for its limb; each disk's pose and own light may change with it, else they keep
-    what they took of it. `known` (C, G, G) is the one that the residuals hold. By how much a cell is drawn to 0
-    follows from the scatter over the disks: of a mat ball all are.
-    Source: empirical Bayes, James and Stein 1961.
+    what they took of it. `known` (C, G, G) is the one that the residuals hold.
     """
-    cameras, cells = use.shape[1], GLINTS**2
-    column, row = ((at.view.across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
+    cameras, others = use.shape[1], at.design.double()
+    precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
+    there, weight, pull, by_others = _in_cells(at, use, others)
+    now = known.reshape(cameras, -1)[:, there].double()
+    drawn = _drawn(weight, pull, now + pull.sum(0) / weight.sum(0).clamp_min(1e-30))
+    weighted = others * precision[:, None]
+    own = inverse_damped(weighted @ others.mT)
+    taken = by_pose(by_others.mT @ own, cameras)
+    mixed = torch.einsum("bcip,bcpj->cij", taken, by_pose(by_others, cameras))
+    left = by_pose((weighted @ at.residual.double()[..., None])[..., 0], cameras)
+    force = pull.sum(0) - torch.einsum("bcip,bcp->ci", taken, left) - drawn * now
+    found = now.new_zeros(cameras, GLINTS**2)
+    found[:, there] = now + torch.linalg.solve(torch.diag_embed(weight.sum(0) + drawn) - mixed, force)
+    return found.reshape(known.shape).float()
+
+
+def glint_shares(at: Residuals, use: Tensor, mirrored: Tensor) -> Tensor:
+    """Return by how much of what B * C disks, those of `use` (B, C), would leave in a cell its glint changes with it,
+    (C, G * G), 0 .. 1: by nothing where the light has none. `mirrored` (L, P) is what the light mirrors there.
+    """
+    there, weight, pull, sums = _in_cells(at, use, mirrored[:, None].double())
+    now = by_pose(sums[:, 0], use.shape[1]).sum(0) / weight.sum(0).clamp_min(1e-30)
+    shares = weight.new_zeros(use.shape[1], GLINTS**2)
+    shares[:, there] = 1.0 / (1.0 + _drawn(weight, pull, now) / weight.sum(0).clamp_min(1e-30))
+    return shares
+
+
+def glint_cells(across: Tensor) -> Tensor:
+    """Return the cells of places across the disk, (L, 2, P): (L, P)."""
+    column, row = ((across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
+    return row * GLINTS + column
+
+
+def _in_cells(at: Residuals, use: Tensor, others: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return n cells that some disk tells of (the rest is beyond the limb, or hidden in every picture), the sums there
+    of precision, residuals (B, C, n) and others (L, k, P): (L, k, n). Pixels that the limb cuts are out.
+    """
     precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
     inside = precision * (at.view.coverage > IN_SIGHT)
-    others = at.design.double()
     parts = torch.cat([inside[:, None], (inside * at.residual)[:, None], inside[:, None] * others], dim=1)
-    sums = parts.new_zeros(*parts.shape[:2], cells)
-    sums.scatter_add_(2, (row * GLINTS + column)[:, None].expand(parts.shape), parts)
-    there = sums[:, 0].any(0).nonzero()[:, 0]  # the others are beyond the limb, or hidden in every picture
+    sums = parts.new_zeros(*parts.shape[:2], GLINTS**2)
+    sums.scatter_add_(2, glint_cells(at.view.across)[:, None].expand(parts.shape), parts)
+    there = sums[:, 0].any(0).nonzero()[:, 0]
     sums = sums[..., there]
-    weight, pull = (by_pose(sums[:, k], cameras) for k in range(2))  # (B, C, cells)
+    weight, pull = (by_pose(sums[:, k], use.shape[1]) for k in range(2))
+    return there, weight, pull, sums[:, 2:]
+
+
+def _drawn(weight: Tensor, pull: Tensor, glint: Tensor) -> Tensor:
+    """Return the precision with which the n cells of a glint are known to be 0, (C, n): it follows from how large they
+    are (C, n), beside the scatter over the disks of what these leave, precision and its product with residuals
+    (B, C, n). Of a mat ball nothing else counts.
+    Source: empirical Bayes, James and Stein 1961.
+    """
     whole = weight.sum(0).clamp_min(1e-30)
     mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
     error2 = (pull - weight * mean).square().sum(0) / whole.square() * number / (number - 1)
-    told, now = number > 1, known.reshape(cameras, cells)[:, there].double()
-    signal2 = torch.where(told, (now + mean).square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
-    drawn = torch.where(told, whole * error2 / signal2.clamp_min(1e-12)[:, None], math.inf).nan_to_num(posinf=1e30)
-    weighted = others * precision[:, None]
-    own = inverse_damped(weighted @ others.mT)
-    taken = by_pose(sums[:, 2:].mT @ own, cameras)
-    mixed = torch.einsum("bcip,bcpj->cij", taken, by_pose(sums[:, 2:], cameras))
-    left = by_pose((weighted @ at.residual.double()[..., None])[..., 0], cameras)
-    force = pull.sum(0) - torch.einsum("bcip,bcp->ci", taken, left) - drawn * now
-    found = now.new_zeros(cameras, cells)
-    found[:, there] = now + torch.linalg.solve(torch.diag_embed(weight.sum(0) + drawn) - mixed, force)
-    return found.reshape(known.shape).float()
+    told = number > 1
+    signal2 = torch.where(told, glint.square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
+    drawn = torch.where(told, whole * error2 / signal2.clamp_min(1e-12)[:, None], math.inf)
+    return drawn.nan_to_num(posinf=1e30)
 
 
 def light_columns(view: SphereView) -> Tensor:

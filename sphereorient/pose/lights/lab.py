@@ -95,6 +95,11 @@ class LabLight(Light):
         gain = self.gain.repeat(len(gloss) // len(self.gain))[:, None]
         return gain * through * difference, gain * (through * black + mirrored * gloss)
 
+    def mirrors(self, view: SphereView, pixels: Pixels) -> Tensor:
+        """Return what the cover mirrors, grey levels; see `Light.mirrors`."""
+        _, _, gloss, _, mirrored = self.shown(view, pixels)
+        return view.coverage * self.gain.repeat(len(gloss) // len(self.gain))[:, None] * mirrored * gloss
+
     def learnt(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
     ) -> "LabLight":
