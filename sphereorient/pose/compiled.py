@@ -19,12 +19,13 @@ from torch import Tensor
 from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
 from sphereorient.pose import fit
+from sphereorient.pose import residuals as in_torch
 from sphereorient.pose.camera_view import CameraView, FrameDisks
 from sphereorient.pose.fit import COVERED, FIRST_EVERY, LEAST_OF_WINDOW, MARGIN_PX, MORE, MOST_EACH, NEAR_RAD, WINDOW_PX
-from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel
+from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel, SphereView
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
 from sphereorient.pose.poses import FittedPoses, PoseStart, pose_arrays
-from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY
+from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY, Residuals
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
@@ -33,6 +34,12 @@ SOURCE = Path(__file__).with_name("refine")
 _Table, _Task, _Stencil, _Scene, _Shot, Near = (
     record(SOURCE, name) for name in ("Table", "Task", "Stencil", "Scene", "Shot", "Near")
 )
+# What `linearise` tells of each place, in this order, with their numbers.
+TOLD = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
+TOLD |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
+TOLD |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
+OF_VIEW = tuple(TOLD)[:8]
+VECTORS = tuple(name for name, count in TOLD.items() if count > 1)
 
 
 def library() -> ctypes.CDLL | None:
@@ -61,8 +68,54 @@ def _refined(
     pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int, most_hidden: float
 ) -> tuple[FittedPoses, Tensor]:
     """Fit poses, without meaning where there are no iterations; return also the places that count."""
+    kept = torch.empty_like(pixels.inside)
+    task, _alive = _task_on(pixels, begin, model)
+    task.iterations, task.most_hidden, task.kept = iterations, most_hidden, kept.data_ptr()
+    fit = _into(task, begin.use)
+    _run("refine", task, len(begin.use))
+    return fit, kept
+
+
+def residuals(
+    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
+) -> Residuals:
+    """Linearise pictures as `residuals.residuals`, by compiled code where that is able to; it has no gradients."""
+    cameras = len(model.light.noise)
+    begin = PoseStart(X, R, torch.ones(len(X), cameras, dtype=torch.bool))
+    if body_of(begin) is IN_TORCH or pixels.grey.dtype != torch.float32:
+        return in_torch.residuals(pixels, X, R, state, model)
+    (L, P), counts = pixels.grey.shape, torch.empty_like(pixels.inside)
+    task, at = _task_on(pixels, begin, model)
+    task.kept = counts.data_ptr()
+    told = torch.empty(L, sum(TOLD.values()), P)
+    coefficients = torch.empty(L, sum(model.shading.counts), dtype=torch.float64)
+    deviation = torch.empty(L, dtype=torch.float64)
+    task.told, task.coefficients, task.deviation = told.data_ptr(), coefficients.data_ptr(), deviation.data_ptr()
+    if state is not None:
+        task.expected, task.weight = at(state[0], torch.float32), at(state[1], torch.float32)
+    _run("linearise", task, len(X))
+    parts = dict(zip(TOLD, torch.split(told, list(TOLD.values()), 1), strict=True))
+    parts = {name: part if name in VECTORS else part[:, 0] for name, part in parts.items()}
+    distance = (X.repeat_interleave(cameras, 0) - pixels.origin[..., 0].double()).norm(dim=-1)
+    blur = model.blur_px * (pixels.pitch_mm + pixels.pitch_rad * distance).float() / model.radius_mm
+    hidden = pixels.inside & ~counts
+    known = ~hidden if model.paint.unseen is not None or bool(hidden.any()) else None
+    view = SphereView(**{name: parts[name] for name in OF_VIEW}, known=known, blur=blur[:, None])
+    light = parts["difference"], parts["black"], parts["beside"]
+    others = {name: parts[name] for name in ("residual", "model", "variance", "weight")}
+    others |= {"deviation": deviation.float(), "inside": counts}
+    return in_torch.with_design(view, light, model.shading, coefficients.float(), **others)
+
+
+def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
+    """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
+    return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
+
+
+def _task_on(pixels: Pixels, begin: PoseStart, model: SphereModel) -> tuple[ctypes.Structure, "_Addresses"]:
+    """Return a record of pixels that are cut out, with model and start."""
     L, P = pixels.grey.shape
-    kept = torch.empty(L, P, dtype=torch.bool)
     task, at = _task_of(begin, model, pixels.instants)
     task.disks, task.places, task.inner = L, P, pixels.inner
     task.tiles, task.origins = int(pixels.tile.max()) + 1 if P else 1, pixels.origin.shape[-1]
@@ -70,10 +123,7 @@ def _refined(
         setattr(task, name, at(getattr(pixels, name)))
     task.tile, task.place = at(pixels.tile), at(pixels.place)
     task.moved = at(pixels.moved, torch.float64) if pixels.instants > 1 else None
-    task.iterations, task.most_hidden, task.kept = iterations, most_hidden, kept.data_ptr()
-    fit = _into(task, begin.use)
-    _run("refine", task, len(begin.use))
-    return fit, kept
+    return task, at
 
 
 def _task_of(begin: PoseStart, model: SphereModel, instants: int) -> tuple[ctypes.Structure, "_Addresses"]:

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.pose.compiled import fitted_residuals
 from sphereorient.pose.lights.disk import RIDGE, glint_cells, glint_shares, light_columns
 from sphereorient.pose.model import IN_SIGHT, SphereModel, by_pose
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import fitted_residuals
 from sphereorient.so3 import inverse_damped, solve_damped
 
 TILES = 4  # along each axis of the disk: errors of light are wide

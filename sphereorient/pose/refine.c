@@ -64,6 +64,11 @@ typedef struct {
     float most_hidden, covered, most_each, least_of_window;
     int64_t window, margin;        /* half widths, px */
     const int64_t *place;          /* (2, places), px to the right and below */
+    /* of `linearise`: expected grey levels and weights of an earlier call, (disks, places), or none; what it tells of
+       each place, (disks, FLOATS + 2, places), as `Disk`, then expected and weight; and of each disk */
+    const float *expected, *weight;
+    float *told;
+    double *coefficients, *deviation; /* (disks, n_difference + n_black), (disks) */
     /* results: places that count, (disks, places), and the parts of `FittedPoses` */
     uint8_t *kept;
     double *position, *rotation, *covariance, *own_turn, *own_covariance, *own_move, *own_sigma, *limb_coverage, *excess;
@@ -78,6 +83,7 @@ typedef struct {
     int first, last;                   /* whether these are unknown; whether scores and `told` are asked for */
     double *scores;                    /* (tiles, n), n = 6 + n_difference + n_black */
     double normal[COLUMNS * COLUMNS], gradient[COLUMNS];
+    double coefficients[COLUMNS], deviation;
     double information[36], pull[6];
     double told[4];      /* share of variance explained, loss, median step from black to white, limb that counts, 1/mm */
     double to_centre[3]; /* from the camera, mm */
@@ -585,11 +591,11 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
 }
 
 /* Sum the normal equations of pose and light, and where asked for the scores of tiles. */
-static void gather(const Task *t, const Disk *at, Sums *of, const double *coefficients) {
+static void gather(const Task *t, const Disk *at, Sums *of) {
     const int64_t P = t->places, nd = t->n_difference;
     const int n_all = 6 + (int)(nd + t->n_black);
     const float *weight = of->weight;
-    double *normal = of->normal, *gradient = of->gradient, *scores = of->scores;
+    double *normal = of->normal, *gradient = of->gradient, *scores = of->scores, *coefficients = of->coefficients;
     float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], precision[BLOCK], left[BLOCK];
     float score[BLOCK][COLUMNS];
     double(*sums)[LANES] = at->sums;
@@ -865,20 +871,18 @@ static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
     for (int64_t p = 0; p < t->places; p++) /* a limb in shadow does not count */
         at->known[p] &= at->difference[p] >= dark || at->cover[p] >= t->in_sight;
     const uint8_t *clipped = t->clipped + k * t->places;
-    double coefficients[COLUMNS];
-    float deviation = 0;
     for (int seek = of->first && t->most_hidden > 0; seek >= 0; seek--) { /* without occluders, anew */
         for (int64_t p = 0; p < t->places; p++) at->counts[p] = of->kept[p] && at->known[p];
         if (of->first) { /* the first weights come from the picture itself, bubbles included; a second round does without */
             memcpy(of->expected, t->grey + k * t->places, sizeof(float) * (size_t)t->places);
             for (int64_t p = 0; p < t->places; p++) of->weight[p] = (float)(at->counts[p] && !clipped[p]);
         }
-        for (int round = 0; round < (of->first ? 2 : 1); round++) deviation = light_up(t, at, of, k, coefficients);
+        for (int round = 0; round < (of->first ? 2 : 1); round++) of->deviation = light_up(t, at, of, k, of->coefficients);
         if (seek && !uncover(t, at, of, k)) seek = 0; /* all is as before: once is enough */
         if (!t->iterations) return;
     }
-    gather(t, at, of, coefficients);
-    if (of->last) tell(t, at, of, k, deviation);
+    gather(t, at, of);
+    if (of->last) tell(t, at, of, k, (float)of->deviation);
     without_light(t, of);
 }
 
@@ -1112,6 +1116,34 @@ int refine(const Task *t, int64_t begin, int64_t end) {
     Work work;
     const int without = open_work(t, &work);
     for (int64_t pose = begin; pose < end && !without; pose++) fit(t, &work.at, work.sums, pose);
+    close_work(&work);
+    return without;
+}
+
+/* Tell of each place what the linear problem of poses where they stand consists of, as `residuals`; returns as above. */
+int linearise(const Task *t, int64_t begin, int64_t end) {
+    const int64_t P = t->places, padded = (P + BLOCK - 1) / BLOCK * BLOCK, own = t->n_difference + t->n_black;
+    Work work;
+    const int without = open_work(t, &work);
+    for (int64_t k = begin * t->cameras; k < end * t->cameras && !without; k++) {
+        const int64_t pose = k / t->cameras;
+        Sums *of = work.sums;
+        of->position = t->start + pose * 3, of->rotation = t->start_rotation + pose * 9;
+        of->kept = t->kept + k * P, of->first = !t->expected, of->last = 0;
+        memcpy(of->kept, t->inside + k * P, (size_t)P);
+        if (t->expected) {
+            memcpy(of->expected, t->expected + k * P, sizeof(float) * (size_t)P);
+            memcpy(of->weight, t->weight + k * P, sizeof(float) * (size_t)P);
+        }
+        sum_disk(t, &work.at, of, k);
+        float *told = t->told + k * (FLOATS + 2) * P;
+        for (int64_t c = 0; c < FLOATS; c++) memcpy(told + c * P, work.floats + c * padded, sizeof(float) * (size_t)P);
+        memcpy(told + FLOATS * P, of->expected, sizeof(float) * (size_t)P);
+        memcpy(told + (FLOATS + 1) * P, of->weight, sizeof(float) * (size_t)P);
+        memcpy(of->kept, work.at.counts, (size_t)P);
+        memcpy(t->coefficients + k * own, of->coefficients, sizeof(double) * (size_t)own);
+        t->deviation[k] = of->deviation;
+    }
     close_work(&work);
     return without;
 }

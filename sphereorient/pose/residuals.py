@@ -13,6 +13,7 @@ from torch import Tensor
 from sphereorient.pose.model import (
     EVERY,
     IN_SIGHT,
+    Shading,
     SphereModel,
     SphereView,
     leaning,
@@ -20,7 +21,6 @@ from sphereorient.pose.model import (
     stray_basis,
 )
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.view import sphere_view
 from sphereorient.so3 import solve_damped
 from sphereorient.sphere.view import polynomials
@@ -61,12 +61,6 @@ def disk_sums(at: Residuals) -> tuple[Tensor, Tensor, Tensor]:
     return without_light((weighted @ at.design.mT).double(), (weighted @ at.residual[..., None])[..., 0].double())
 
 
-def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
-    """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
-    return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
-
-
 def residuals(
     pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
 ) -> Residuals:
@@ -80,10 +74,7 @@ def residuals(
     shadow = (difference < model.light.dark.to(difference).repeat(len(X))[:, None]) & (view.coverage < IN_SIGHT)
     if bool(shadow.any()):
         view = replace(view, known=~shadow if view.known is None else view.known & ~shadow)
-    tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
-    n, n_black = model.shading.counts
-    learnt = (view.coverage * (view.paint * difference + black))[:, None]
-    columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
+    columns = own_columns(view, difference, black, model.shading)
     beside = scene_beside(view, pixels, model.light.stray)
     beyond = (1.0 - view.coverage) * beside
     noise = model.light.noise.repeat(len(X), 1)
@@ -107,24 +98,36 @@ def residuals(
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
         weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (inside & ~silent)
         rounds = grey, weight
+    parts = {"residual": residual, "model": grey, "variance": variance, "weight": weight, "deviation": deviation}
+    return with_design(view, (difference, black, beside), model.shading, coefficients, inside=inside, **parts)
+
+
+def with_design(
+    view: SphereView,
+    light: tuple[Tensor, Tensor, Tensor],
+    shading: Shading,
+    coefficients: Tensor,
+    **others: Tensor,
+) -> Residuals:
+    """Return the linear problem with its derivatives: the frame's own `coefficients` (L, K) of a light that is learnt,
+    difference, black, and what is beside the sphere, grey levels (L, P); `others`: the rest of `Residuals`.
+    """
+    (difference, black, beside), (n, n_black) = light, shading.counts
+    tints = polynomials(view.across, max(shading.difference, shading.black))
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
     offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
     step, ground = difference * gain, black * gain + offset
     lit = view.coverage * step
     over = view.paint * step + ground - beside
-    return Residuals(
-        view=view,
-        design=torch.cat([grey_by_pose(view, lit, over), columns], dim=1),
-        residual=residual,
-        model=grey,
-        variance=variance,
-        weight=weight,
-        inside=inside,
-        deviation=deviation,
-        lit=lit,
-        over=over,
-        beside=beside,
-    )
+    design = torch.cat([grey_by_pose(view, lit, over), own_columns(view, difference, black, shading)], dim=1)
+    return Residuals(view=view, design=design, lit=lit, over=over, beside=beside, **others)
+
+
+def own_columns(view: SphereView, difference: Tensor, black: Tensor, shading: Shading) -> Tensor:
+    """Return what each coefficient of a frame's own light adds to L disks, (L, K, P), grey levels."""
+    tints, (n, n_black) = polynomials(view.across, max(shading.difference, shading.black)), shading.counts
+    learnt = (view.coverage * (view.paint * difference + black))[:, None]
+    return torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
 
 
 def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sphereorient.pose.compiled import fitted_residuals
 from sphereorient.pose.model import UNSEEN, SphereModel, surface_normals
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import fitted_residuals
 from sphereorient.sphere.texture import map_directions, unseen_share
 from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, texture_table
 

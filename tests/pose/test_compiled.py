@@ -22,7 +22,7 @@ from refine_examples import (
 
 from sphereorient import so3
 from sphereorient.files.compiled import built_for
-from sphereorient.pose import compiled, fit
+from sphereorient.pose import compiled, fit, residuals
 from sphereorient.pose.lights.lab import lab_light
 from sphereorient.pose.model import FIRST, LATER, SphereModel
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
@@ -114,6 +114,37 @@ def test_of_lines_of_sight_that_start_at_different_places(pixels):
     along = torch.linspace(-3, 3, pixels.grey.shape[1])  # as behind a wall
     origin = pixels.origin + pixels.direction * along
     assert_as_torch(replace(pixels, origin=origin, pitch_mm=pixels.pitch_mm + 0.01), model_of())
+
+
+@pytest.mark.parametrize("kind", [*MODELS, "moving", "behind a wall"])
+def test_residuals_and_what_they_consist_of_are_those_of_torch(pixels, kind):
+    model = MODELS.get(kind, learnt)(pixels)
+    if kind == "moving":
+        moves = torch.randn(10, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.03
+        pixels = pixels.exposed(moves, 3)
+    if kind == "behind a wall":
+        origin = pixels.origin + pixels.direction * torch.linspace(-3, 3, pixels.grey.shape[1])
+        pixels = replace(pixels, origin=origin, pitch_mm=pixels.pitch_mm + 0.01)
+    start = begin()
+    given = pixels, start.position_lab_mm, start.R_lab_body
+    first = residuals.residuals(*given, None, model)
+    for state in (None, (first.model, first.weight)):
+        found, expected = (body(*given, state, model) for body in (compiled.residuals, residuals.residuals))
+        counts = expected.inside & (expected.view.coverage > 1e-3)
+        assert float((found.inside != expected.inside).float().mean()) < 1e-3  # at the threshold rounding decides
+        assert (found.view.known is None) == (expected.view.known is None)
+        pairs = {name: (getattr(found, name), part) for name, part in vars(expected).items()}
+        pairs |= {name: (getattr(found.view, name), part) for name, part in vars(expected.view).items()}
+        for name, (one, other) in pairs.items():
+            if name in ("view", "known", "inside"):
+                continue
+            assert one.shape == other.shape and one.dtype == other.dtype, name
+            apart = (one - other).abs()
+            if apart.shape[-1] == counts.shape[-1]:
+                apart = apart.movedim(-1, 1)[counts]
+            size = float(other.abs().max())
+            assert float((apart > 2e-3 * size).float().mean()) < 1e-3, name  # look-ups on the border of two cells
+            assert float(apart.square().mean().sqrt()) < 1e-3 * size, name
 
 
 @pytest.mark.parametrize("kind", ["light in the lab", "unseen paint"])

@@ -29,12 +29,12 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
+from sphereorient.pose.compiled import fitted_residuals
 from sphereorient.pose.lasting import Lasting, _of_cells, by_power, lasting_errors, limb_wider_px, of_left_out
 from sphereorient.pose.lights.disk import glint_shares
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart
-from sphereorient.pose.residuals import fitted_residuals
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y

@@ -1,7 +1,9 @@
 """Paint that differs from the map: found where the pictures say so in both halves of the movie, and not used."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
+from statistics import mean
 
 import torch
 from torch import Tensor
@@ -10,17 +12,22 @@ from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.camera_view import Optics, widest_px
 from sphereorient.pose.fitter import Fitter
-from sphereorient.pose.lights.kinds import FEWEST_LIT, some_of
+from sphereorient.pose.lights.kinds import some_of
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.worn import CHANGED, without, worn_cells, worn_share
 
+FEWEST_VIEWS = 8  # rows of poses in which worn paint is looked for
 # By how much paint differs that is not used, round by round: while poses are wrong, so do the borders of right paint.
 WORN_ROUNDS = (0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2, CHANGED, CHANGED)
 FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.1 to 2.7; of a warped map 4.2
 # By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
 # 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
 WORN_GAIN = 1.2
+FIRST_ROUNDS, FIRST_GAIN = (
+    3,
+    0.2,
+)  # after these it is 0.5 to 1.5 in worn balls, 0.0 in others: then no more is looked for
 WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which it is not looked for
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 
@@ -31,16 +38,18 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
     `given`: as in `light_and_blur`.
     """
     fitter, pixels, fit, use = studied.fitter, studied.pixels, studied.fit, studied.use
-    if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
+    if len(use) < FEWEST_VIEWS:  # of each patch, to tell paint from light
         return studied, None
     # Of a ball that turns little glints take the place of worn paint.
     bare = fitter.with_light_of(pixels, fit, use, glints=False)
     if worn_share(worn_cells(pixels, fit, use, bare.model())) < WORN_SEEN:
         return studied, None
 
-    def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor | None]:
+    def found(
+        pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: Sequence[float] = WORN_ROUNDS
+    ) -> tuple[Fitter, FittedPoses, Tensor | None]:
         now, worn = bare, None
-        for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
+        for changed in rounds:  # worn paint bends the light and the poses that it is found with
             worn = worn_cells(pixels, fit, use, now.model(), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
             optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views), fitter.optics.limb_blur_px)
@@ -50,11 +59,12 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
 
     every, middle = torch.arange(len(use)), len(use) // 2
     halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
-    gain = [
-        bare.with_light_of(*half, glints=False).left(*held) - found(*half)[0].left(*held)
-        for half, held in permutations(halves, 2)
-    ]
-    if sum(gain) / 2 < WORN_GAIN:
+    pairs = list(permutations(halves, 2))
+    before = [bare.with_light_of(*half, glints=False).left(*held) for half, held in pairs]
+    half, held = pairs[0]
+    if before[0] - found(*half, WORN_ROUNDS[:FIRST_ROUNDS])[0].left(*held) < FIRST_GAIN:
+        return studied, None
+    if mean(before) - mean(found(*half)[0].left(*held) for half, held in pairs) < WORN_GAIN:
         return studied, None
     lit, fitted, worn = found(pixels, fit, use)
     wrong = float(fitted.excess[use].median()) > FITS  # the paint that is left is not the map's either

@@ -7,6 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from sphereorient.pose.compiled import fitted_residuals
 from sphereorient.pose.model import (
     IN_SIGHT,
     Light,
@@ -19,7 +20,7 @@ from sphereorient.pose.model import (
 )
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import Residuals, fitted_residuals, learn_stray, noise_curves
+from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves
 from sphereorient.so3 import inverse_damped
 from sphereorient.sphere.view import polynomials
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.pose.fitter import Fitter, logs_left
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.lights.lab import LabLight, lab_light
@@ -15,6 +16,7 @@ from sphereorient.pose.poses import FittedPoses
 
 KINDS: tuple[type[Light], ...] = (DiskLight, LabLight)
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
+TURNED_RAD = 0.2  # mean angle between them: the finest details of light are as wide, and of less turn they take paint
 # Shares of the variance: which it may leave more, and within which two lights explain about as much.
 CHANGED, ALIKE = 0.01, 0.05
 
@@ -34,7 +36,8 @@ def lit_in_the_lab(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor
     Both are learnt from every other row of `use` (B, C); what counts is what they leave in the pictures of the rows
     between. Return the fits of these rows by both where they explain about as much.
     """
-    if len(use) < FEWEST_LIT:
+    R = fit.R_lab_body
+    if len(use) < FEWEST_LIT or so3.geodesic_distance(R[:, None], R).mean() < TURNED_RAD:
         return fitter, fit, None
     every = torch.arange(len(use))
     learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))

@@ -10,6 +10,7 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
+from sphereorient.pose.compiled import residuals
 from sphereorient.pose.model import (
     LATER,
     Light,
@@ -22,7 +23,7 @@ from sphereorient.pose.model import (
 )
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
-from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves, residuals
+from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves
 from sphereorient.so3 import inverse_damped
 from sphereorient.sphere.texture import closed_texture, sample_at, texel_coordinates
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
