@@ -214,6 +214,8 @@ def scene_beside(view: SphereView, pixels: Pixels, stray: Tensor) -> Tensor:
     """Return what L disks show beside the sphere, grey levels (L, P): the empty scene, and stray light (C, K) of the
     C cameras, which only pixels that the limb may reach are asked for.
     """
+    if not bool(stray.any()):
+        return pixels.behind
     outer = slice(pixels.inner, None)
     more = stray.repeat(len(view.across) // len(stray), 1)[:, None] @ stray_basis(view.across[..., outer])
     return torch.cat([pixels.behind[:, : pixels.inner], pixels.behind[:, outer] + more[:, 0]], dim=1)

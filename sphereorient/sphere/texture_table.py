@@ -1,8 +1,10 @@
 """Tables of the texture map over directions: paint for banks, value and slope for fits."""
 
+import ctypes
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient.cameras import Rays
+from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import side_by_side
 from sphereorient.sphere.renderer import see_sphere
 from sphereorient.sphere.texture import closed_texture, reduced_texture, sample_closed
@@ -35,6 +38,8 @@ WIDER = 1.6  # most of a step of blur: the 9-point rule is exact if the map is s
 CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
 
+SOURCE = Path(__file__).with_suffix("")
+_Widening = record(SOURCE, "Widening")
 Cells = tuple[Tensor, Tensor, Tensor]  # directions and two tangents of each, (M, 3) float64
 
 
@@ -152,6 +157,8 @@ class TextureTable:
 
         def rows(cells: Cells) -> Tensor:
             centre = cells[0]
+            if (code := compiled(SOURCE, _Widening)) is not None:
+                return _widened_by(code, self.rows, added, cells)
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
             for share, _, at in _disk_nodes(cells, added, SQUARE_9):
                 v, g = self.sample(at.T[None])
@@ -180,6 +187,16 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
         return _rows(value, slope, centre.float())
 
     return TextureTable(_in_chunks(rows, side), finest, hidden).blurred(blur_rad)
+
+
+def _widened_by(code: ctypes.CDLL, rows: Tensor, width: float, cells: Cells) -> Tensor:
+    """Return what compiled code makes of a table's rows: those of some cells of one that is blurred more."""
+    found, nodes = torch.empty(len(cells[0]), 4), torch.tensor(SQUARE_9, dtype=torch.float64)
+    sizes = math.isqrt(len(rows)), len(found), len(nodes)
+    parts = rows.float().contiguous(), *(part.contiguous() for part in cells), nodes
+    first, *others = (part.data_ptr() for part in parts)
+    code.widen(ctypes.byref(_Widening(first, *sizes, *others, width, found.data_ptr())))
+    return found
 
 
 def _in_chunks(rows: Callable[[Cells], Tensor], side: int) -> Tensor:

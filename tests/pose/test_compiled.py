@@ -138,7 +138,7 @@ def test_residuals_and_what_they_consist_of_are_those_of_torch(pixels, kind):
         for name, (one, other) in pairs.items():
             if name in ("view", "known", "inside"):
                 continue
-            assert one.shape == other.shape and one.dtype == other.dtype, name
+            assert (one.shape, one.dtype) == (other.shape, other.dtype), name
             apart = (one - other).abs()
             if apart.shape[-1] == counts.shape[-1]:
                 apart = apart.movedim(-1, 1)[counts]

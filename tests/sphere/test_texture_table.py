@@ -11,10 +11,13 @@ from conftest import assert_close, slow
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.files.compiled import WITHOUT, compiled
 from sphereorient.sphere import DirectionTable, orthographic_view, sample_texture
 from sphereorient.sphere.texture_table import (
     BASE_RAD,
+    SOURCE,
     TextureTable,
+    _Widening,
     octahedral_cells,
     octahedral_directions,
     texture_table,
@@ -189,6 +192,22 @@ def test_blurring_twice_is_blurring_once_by_the_root_of_the_sum_of_squares(kind)
     assert (slope - slope_2).square().mean().sqrt() < 0.03 * steepest
     # The wrong sum, 0.025 + 0.06, is another picture.
     assert (value - looked(base_of(kind).blurred(0.085), at)[0]).square().mean().sqrt() > 0.02
+
+
+@pytest.mark.parametrize("blur_rad", [1.01 * BASE_RAD, 0.012, 0.05])
+def test_compiled_code_and_torch_blur_alike(blur_rad: float, monkeypatch: pytest.MonkeyPatch):
+    if compiled(SOURCE, _Widening) is None:
+        pytest.skip("needs the compiled tables: `make setup` with a compiler")
+    unseen = torch.rand(HEIGHT, 2 * HEIGHT, generator=torch.Generator().manual_seed(1)) < 0.01
+    base = texture_table(map_of("blobs"), BASE_RAD, unseen=unseen)
+    found = base.blurred(blur_rad)
+    monkeypatch.setenv(WITHOUT, "1")
+    compiled.cache_clear()
+    expected = TextureTable.of(base.arrays()).blurred(blur_rad)
+    compiled.cache_clear()
+    for one, other in ((found, expected), (found.unseen, expected.unseen)):
+        assert one.side == other.side
+        assert torch.equal(one.rows, other.rows)
 
 
 def test_a_table_is_not_made_sharper():

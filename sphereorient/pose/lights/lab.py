@@ -247,21 +247,26 @@ def _better(
     normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
     difference, black, gloss, through, mirrored = light.shown(view, pixels)
     cover = view.coverage * light.gain.repeat(len(gloss) // cameras)[:, None]
-    learnt = cover * (through * (view.paint * difference + black) + mirrored * gloss)
+    shown = view.paint * difference + black
+    learnt = cover * (through * shown + mirrored * gloss)
     left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
     tints = polynomials(view.across, 2)
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
     counts = (precision > 0).any(1)
+    last = ((view.coverage > 0).any(0) * torch.arange(1, view.coverage.shape[1] + 1)).amax()
+    there = slice(int(last))  # places lie in order of distance from the disk's middle
     factor = torch.zeros(len(left), len(now) + 1, dtype=torch.float64)
 
     def of_disk(k: int) -> tuple[Tensor, Tensor, Tensor]:
-        over_normal, over_mirror, over_depth = (basis[k] for basis in bases)
-        scattered = (cover[k] * through[k]) * over_normal
-        columns = [view.paint[k] * scattered, scattered, (cover[k] * mirrored[k]) * over_mirror]
-        columns += [(cover[k] * part) * over_depth for part in (view.paint[k] * difference[k] + black[k], gloss[k])]
-        whole, others = torch.cat([*columns, left[k : k + 1]]), torch.cat([own[k], at.design[k, :6]])
-        weighted, own_weighted = whole * precision[k], others * precision[k]
-        return (weighted @ whole.T).double(), (own_weighted @ whole.T).double(), (own_weighted @ others.T).double()
+        over_normal, over_mirror, over_depth = (basis[k, :, there] for basis in bases)
+        share, paint = cover[k, there], view.paint[k, there]
+        scattered = (share * through[k, there]) * over_normal
+        columns = [paint * scattered, scattered, (share * mirrored[k, there]) * over_mirror]
+        columns += [(share * part[k, there]) * over_depth for part in (shown, gloss)]
+        whole, weight = torch.cat([*columns, left[k : k + 1, there]]), precision[k, there]
+        others = torch.cat([own[k, :, there], at.design[k, :6, there]])
+        own_weighted = others * weight
+        return _products(whole, weight), (own_weighted @ whole.T).double(), (own_weighted @ others.T).double()
 
     def of_pose(b: int) -> tuple[int, Tensor, Tensor]:
         """The cameras of a pose share it, and each has a light of its own."""
@@ -294,6 +299,19 @@ def _better(
     gain = torch.where(number > 0, light.gain * shared / shared[first], light.gain)
     parts = dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True))
     return replace(light, gain=gain, **parts | {name: parts[name] * shared[first] for name in UNKNOWN[:3]})
+
+
+def _products(rows: Tensor, weight: Tensor) -> Tensor:
+    """Return the weighted products of all pairs of rows (n, P), (n, n) float64: of two of its four quarters one is the
+    other's mirror image.
+    """
+    half = len(rows) // 2
+    upper, lower, weighted = rows[:half], rows[half:], rows * weight
+    aside = weighted[half:] @ upper.T
+    found = rows.new_empty(len(rows), len(rows), dtype=torch.float64)
+    found[:half, :half], found[half:, half:] = weighted[:half] @ upper.T, weighted[half:] @ lower.T
+    found[half:, :half], found[:half, half:] = aside, aside.T
+    return found
 
 
 def _beforehand(unit: float) -> tuple[Tensor, Tensor]:
