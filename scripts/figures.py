@@ -69,8 +69,8 @@ FIGURES: dict[str, Figure] = {
     ),
     "stated-parts": Figure(
         pages=("accuracy.md",),
-        command=f"stated_errors.py {SHARED} --only sets movies both",
-        tables=("stated-sets", "stated-one", "stated-two"),
+        command=f"stated_errors.py {SHARED} --only sets movies both stills --stills 60",
+        tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
     ),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls"),

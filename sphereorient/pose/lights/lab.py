@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
+from itertools import product
 
 import numpy as np
 import torch
@@ -38,6 +39,7 @@ BASIS_SIDE = 128  # the same of the harmonics that light is learnt with: 20 MB
 DEPTHS = 1024  # entries of the look-up of the cover's functions
 GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
 ROUNDS, AGAIN = 5, 1  # of Gauss-Newton from an even light, from one of the lab
+AT_ONCE = 4  # poses whose products are summed in single precision
 INDEPENDENT = 0.1  # share of the pixels that tell of the light: neighbours err alike; with it other frames fit best
 # Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
 LEVEL, SLOPES, GLOSS = 3.0, 0.2, 3.0  # the mean, all others, those of the mirrored light: lamps are brighter than paint
@@ -238,62 +240,15 @@ def _better(
     light: LabLight, at: Residuals, pixels: Pixels, used: Tensor, bases: tuple[Tensor, Tensor, Tensor]
 ) -> LabLight:
     """Return the light after one step of Gauss-Newton; `used` (L, 1) bool."""
-    unit, view = float(light.difference[0]), at.view
-    precision = INDEPENDENT * (at.weight / at.variance).where(used, 0.0)
-    cameras = len(light.gain)
-    tied = torch.tensor([TINT[0]] + [TINT[1]] * 2 + [TINT[2]] * 3 + [unit * SHADE[0]] + [unit * SHADE[1]] * 2)
+    unit, cameras, used = float(light.difference[0]), len(light.gain), used & (at.weight > 0).any(1, keepdim=True)
     unknown = [getattr(light, name) for name in UNKNOWN]
     now, sizes = torch.cat(unknown).double(), [len(part) for part in unknown]
-    normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
-    difference, black, gloss, through, mirrored = light.shown(view, pixels)
-    cover = view.coverage * light.gain.repeat(len(gloss) // cameras)[:, None]
-    shown = view.paint * difference + black
-    learnt = cover * (through * shown + mirrored * gloss)
-    left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
-    tints = polynomials(view.across, 2)
-    own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
-    counts = (precision > 0).any(1)
-    last = ((view.coverage > 0).any(0) * torch.arange(1, view.coverage.shape[1] + 1)).amax()
-    there = slice(int(last))  # places lie in order of distance from the disk's middle
-    factor = torch.zeros(len(left), len(now) + 1, dtype=torch.float64)
-
-    def of_disk(k: int) -> tuple[Tensor, Tensor, Tensor]:
-        over_normal, over_mirror, over_depth = (basis[k, :, there] for basis in bases)
-        share, paint = cover[k, there], view.paint[k, there]
-        scattered = (share * through[k, there]) * over_normal
-        columns = [paint * scattered, scattered, (share * mirrored[k, there]) * over_mirror]
-        columns += [(share * part[k, there]) * over_depth for part in (shown, gloss)]
-        whole, weight = torch.cat([*columns, left[k : k + 1, there]]), precision[k, there]
-        others = torch.cat([own[k, :, there], at.design[k, :6, there]])
-        own_weighted = others * weight
-        return _products(whole, weight), (own_weighted @ whole.T).double(), (own_weighted @ others.T).double()
-
-    def of_pose(b: int) -> tuple[int, Tensor, Tensor]:
-        """The cameras of a pose share it, and each has a light of its own."""
-        tints, count = len(tied), cameras * len(tied)
-        sums, mixed = torch.zeros(len(now) + 1, len(now) + 1).double(), torch.zeros(count + 6, len(now) + 1).double()
-        others = torch.cat([tied.double().pow(-2).repeat(cameras), torch.zeros(6)]).diag()
-        for c in range(cameras):
-            if not bool(counts[b * cameras + c]):
-                continue
-            place = torch.cat([torch.arange(tints) + c * tints, torch.arange(6) + count])
-            more, more_mixed, more_others = of_disk(b * cameras + c)
-            sums += more
-            mixed[place] += more_mixed
-            others[place[:, None], place] += more_others
-        taken = inverse_damped(others) @ mixed
-        return b, sums - mixed.T @ taken, taken[:count:tints]
-
-    # A few poses at a time: the columns of all would fill the memory.
-    for b, sums, own_part in side_by_side(of_pose, by_pose(counts, cameras).any(1).nonzero()[:, 0].tolist()):
-        factor[b * cameras : (b + 1) * cameras] = own_part
-        normal += sums[:-1, :-1]
-        right += sums[:-1, -1]
+    sums, factor = _sums(light, at, pixels, used, bases)
     expected, deviation = _beforehand(unit)
     known = deviation.double() ** -2
-    step = torch.linalg.solve(normal + known.diag(), right + known * (expected - now))
+    step = torch.linalg.solve(sums[:-1, :-1] + known.diag(), sums[:-1, -1] + known * (expected - now))
     # What all frames share of their own factor is of the light, what those of a camera share beside it is its gain.
-    own_factor, number = factor[:, -1] - factor[:, :-1] @ step, by_pose(counts, cameras).sum(0)
+    own_factor, number = factor[:, -1] - factor[:, :-1] @ step, by_pose(used[:, 0], cameras).sum(0)
     shared = (1.0 + by_pose(own_factor, cameras).sum(0) / number.clamp_min(1)).float()
     first = int((number > 0).int().argmax())
     gain = torch.where(number > 0, light.gain * shared / shared[first], light.gain)
@@ -301,17 +256,82 @@ def _better(
     return replace(light, gain=gain, **parts | {name: parts[name] * shared[first] for name in UNKNOWN[:3]})
 
 
-def _products(rows: Tensor, weight: Tensor) -> Tensor:
-    """Return the weighted products of all pairs of rows (n, P), (n, n) float64: of two of its four quarters one is the
-    other's mirror image.
+def _sums(
+    light: LabLight, at: Residuals, pixels: Pixels, used: Tensor, bases: tuple[Tensor, Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the products of all pairs of unknowns and of what is left, (n + 1, n + 1) float64, poses and the frames'
+    own lights eliminated; and by how much each disk's own factor of the light changes with them, (L, n + 1).
     """
-    half = len(rows) // 2
-    upper, lower, weighted = rows[:half], rows[half:], rows * weight
-    aside = weighted[half:] @ upper.T
-    found = rows.new_empty(len(rows), len(rows), dtype=torch.float64)
-    found[:half, :half], found[half:, half:] = weighted[:half] @ upper.T, weighted[half:] @ lower.T
-    found[half:, :half], found[:half, half:] = aside, aside.T
-    return found
+    unit, view, cameras = float(light.difference[0]), at.view, len(light.gain)
+    precision = INDEPENDENT * (at.weight / at.variance).where(used, 0.0)
+    tied = torch.tensor([TINT[0]] + [TINT[1]] * 2 + [TINT[2]] * 3 + [unit * SHADE[0]] + [unit * SHADE[1]] * 2)
+    difference, black, gloss, through, mirrored = light.shown(view, pixels)
+    cover = view.coverage * light.gain.repeat(len(gloss) // cameras)[:, None]
+    shown = view.paint * difference + black
+    learnt = cover * (through * shown + mirrored * gloss)
+    left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
+    tints = polynomials(view.across, 2)
+    own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
+    last = ((view.coverage > 0).any(0) * torch.arange(1, view.coverage.shape[1] + 1)).amax()
+    there = slice(int(last))  # places lie in order of distance from the disk's middle
+    width = sum(len(getattr(light, name)) for name in UNKNOWN) + 1
+
+    def of_disk(k: int) -> tuple[Tensor, Tensor, Tensor]:
+        over_normal, over_mirror, over_depth = (basis[k, :, there] for basis in bases)
+        share, paint = cover[k, there], view.paint[k, there]
+        scattered = (share * through[k, there]) * over_normal
+        columns = [paint * scattered, scattered, (share * mirrored[k, there]) * over_mirror]
+        columns += [(share * part[k, there]) * over_depth for part in (shown, gloss)]
+        whole = torch.cat([*columns, left[k : k + 1, there]])
+        return whole, torch.cat([own[k, :, there], at.design[k, :6, there]]), precision[k, there]
+
+    def of_poses(some: list[int]) -> tuple[list[int], Tensor, Tensor]:
+        """The cameras of a pose share it, and each has a light of its own."""
+        tints, count = len(tied), cameras * len(tied)
+        sums = _SymmetricSums(width)
+        mixed = torch.zeros(len(some), count + 6, width, dtype=torch.float64)
+        others = torch.cat([tied.double().pow(-2).repeat(cameras), torch.zeros(6)]).diag().repeat(len(some), 1, 1)
+        for (row, b), c in product(enumerate(some), range(cameras)):
+            if not bool(used[b * cameras + c]):
+                continue
+            place = torch.cat([torch.arange(tints) + c * tints, torch.arange(6) + count])
+            whole, beside, weight = of_disk(b * cameras + c)
+            sums.add(whole, weight)
+            weighted = beside * weight
+            mixed[row, place] += (weighted @ whole.T).double()
+            others[row, place[:, None], place] += (weighted @ beside.T).double()
+        taken = inverse_damped(others) @ mixed
+        whole = sums.matrix().double() - mixed.flatten(0, 1).T @ taken.flatten(0, 1)
+        return some, whole, taken[:, :count:tints]
+
+    # A few poses at a time: the columns of all would fill the memory.
+    told = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
+    whole, factor = torch.zeros(width, width).double(), torch.zeros(len(used), width).double()
+    for some, sums, own_part in side_by_side(of_poses, [part.tolist() for part in told]):
+        by_pose(factor, cameras)[some] = own_part
+        whole += sums
+    return whole, factor
+
+
+class _SymmetricSums:
+    """Sums of the weighted products of all pairs of n rows: of its four quarters two are mirror images."""
+
+    def __init__(self, count: int) -> None:
+        half, rest = count // 2, count - count // 2
+        self._quarters = torch.zeros(half, half), torch.zeros(rest, half), torch.zeros(rest, rest)
+
+    def add(self, rows: Tensor, weight: Tensor) -> None:
+        """Add those of places: rows (n, P), weight (P,)."""
+        upper, beside, lower = self._quarters
+        first, last, weighted = rows[: len(upper)].T, rows[len(upper) :].T, rows * weight
+        upper.addmm_(weighted[: len(upper)], first)
+        beside.addmm_(weighted[len(upper) :], first)
+        lower.addmm_(weighted[len(upper) :], last)
+
+    def matrix(self) -> Tensor:
+        """Return the sums (n, n)."""
+        upper, beside, lower = self._quarters
+        return torch.cat([torch.cat([upper, beside.T], dim=1), torch.cat([beside, lower], dim=1)])
 
 
 def _beforehand(unit: float) -> tuple[Tensor, Tensor]:
