@@ -120,6 +120,11 @@ def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
     return _of_rows(movie.readable, rows)
 
 
+def parts_of(pool: Executor, movie: Movie, rows: NDArray[np.int64]) -> Iterator[Shown | None]:
+    """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
+    return _of_rows(partial(movie.on_demand, pool), rows)
+
+
 def _of_rows(read: Callable[[int, int], Iterator[Read | None]], rows: NDArray[np.int64]) -> Iterator[Read | None]:
     found = _read(read, rows[rows != NONE].tolist())
     for row in rows.tolist():

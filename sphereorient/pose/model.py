@@ -195,7 +195,9 @@ def leaning(view: SphereView, pixels: Pixels, model: SphereModel) -> SphereView:
 
 def stray_basis(across: Tensor) -> Tensor:
     """Return the harmonics over the angle about the disk, (..., K, P), at places (..., 2, P): 1, cos, sin, cos 2 .."""
-    cos, sin = torch.nn.functional.normalize(across, dim=-2).unbind(-2)
+    x, y = across.unbind(-2)
+    length = torch.hypot(x, y).clamp_min(1e-12)
+    cos, sin = x / length, y / length
     columns = [torch.ones_like(cos), cos, sin]
     for _ in range(STRAY_ORDER - 1):
         last_cos, last_sin = columns[-2:]

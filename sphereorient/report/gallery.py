@@ -5,6 +5,7 @@ import io
 import math
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sphereorient.experiment import Experiment
+from sphereorient.experiment.recording import Shown
 from sphereorient.files.whole_file import check_ending, put_aside
-from sphereorient.movies import Grey
 from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_page as ink
-from sphereorient.report.overlay import pictures_by_row, prepared
+from sphereorient.report.overlay import parts_by_row, prepared
 from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes, draw_outline, draw_pictures
 from sphereorient.trajectory import Trajectory
 
@@ -72,7 +73,8 @@ def gallery(
     rows, frames = np.array(sorted(why), dtype=np.int64), {}
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, None, opened)
-        for done, (k, pictures) in enumerate(pictures_by_row(streams, rows), start=1):
+        pool = opened.enter_context(ThreadPoolExecutor(1))
+        for done, (k, pictures) in enumerate(parts_by_row(streams, rows, pool), start=1):
             canvas, jpeg = Canvas(*_pairs_size(page)), io.BytesIO()
             _draw_pairs(canvas, page, k, pictures, (0, 0))
             # No subsampling: it blurs thin coloured lines.
@@ -152,7 +154,8 @@ def worst_frames(
         about += "the measured pose with body axes (x orange, y green, z blue; dotted: away)"
         canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
         corner = {k: (BETWEEN + i % columns * across, HEAD + i // columns * down) for i, k in enumerate(bad)}
-        for done, (k, pictures) in enumerate(pictures_by_row(streams, np.array(sorted(bad), np.int64)), start=1):
+        chosen, pool = np.array(sorted(bad), np.int64), opened.enter_context(ThreadPoolExecutor(1))
+        for done, (k, pictures) in enumerate(parts_by_row(streams, chosen, pool), start=1):
             left, top = corner[k]
             canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {track.time[k]:.4f} s", 14)
             _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
@@ -174,7 +177,7 @@ def _pairs_size(page: Page) -> tuple[int, int]:
 
 
 def _draw_pairs(
-    canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Grey | None], corner: tuple[int, int]
+    canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Shown | None], corner: tuple[int, int]
 ) -> None:
     """Draw crop and re-rendered sphere of each camera; the whole frame if the centre is unknown."""
     (ball,) = page.balls

@@ -1,9 +1,11 @@
 """The movie with the measurement drawn on it, and the re-rendered sphere beside it."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import av
@@ -13,11 +15,11 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, OutputError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
-from sphereorient.experiment.recording import CameraStream, given_mask, pictures_of
+from sphereorient.experiment.recording import CameraStream, Read, Shown, given_mask, parts_of, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
-from sphereorient.movies import Grey
+from sphereorient.movies import Grey, Movie
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
 from sphereorient.report.plots.style import spread
@@ -140,7 +142,20 @@ def streams_of(
 
 def pictures_by_row(streams: Mapping[str, CameraStream], rows: Rows) -> Iterator[tuple[int, dict[str, Grey | None]]]:
     """Yield increasing rows of a track with the picture of each camera, None for missing ones."""
-    readers = [pictures_of(stream.movie, stream.rows[rows]) for stream in streams.values()]
+    return _by_row(streams, rows, pictures_of)
+
+
+def parts_by_row(
+    streams: Mapping[str, CameraStream], rows: Rows, pool: Executor
+) -> Iterator[tuple[int, dict[str, Shown | None]]]:
+    """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
+    return _by_row(streams, rows, partial(parts_of, pool))
+
+
+def _by_row(
+    streams: Mapping[str, CameraStream], rows: Rows, read: Callable[[Movie, Rows], Iterator[Read | None]]
+) -> Iterator[tuple[int, dict[str, Read | None]]]:
+    readers = [read(stream.movie, stream.rows[rows]) for stream in streams.values()]
     for k, *pictures in zip(rows.tolist(), *readers, strict=True):
         yield k, dict(zip(streams, pictures, strict=True))
 

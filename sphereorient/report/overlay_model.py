@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.cameras import Camera
-from sphereorient.movies import Grey
+from sphereorient.cameras import Camera, sphere_disk_px
+from sphereorient.experiment.recording import Shown
+from sphereorient.files.picture import OnDemand
 from sphereorient.pose.lights.disk import DiskLight, light_basis, solved_light
 from sphereorient.pose.worn import LIMB
 from sphereorient.preflight.cameras import expected_outline_px
@@ -20,6 +21,7 @@ from sphereorient.trajectory import Trajectory
 Floats = NDArray[np.float64]
 MARGIN = 1.3  # half the side of a crop, in radii of the sphere
 FINE = 2  # samples along each side of a pixel
+NEAR = 1.1  # radii about the disk's middle, within which the sphere is, also by a distorted picture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,10 +88,15 @@ class CropWindow:
         return np.stack([u, v], axis=-1)
 
 
-def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
+def crop(picture: Shown, window: CropWindow) -> NDArray[np.float32]:
     """Return a picture within a window, (side, side) grey levels; NaN outside the picture."""
-    u, v = window.grid_px().astype(np.float32).transpose(2, 0, 1)
-    grey = picture.astype(np.float32)
+    grid, (height, width) = window.grid_px(), picture.shape
+    ends = np.array([[width - 1, height - 1]])
+    low, high = np.floor(grid[0, 0] - 1), np.ceil(grid[-1, -1] + 1)
+    (left, top), (right, bottom) = np.clip([low, high], 0, ends).astype(int).tolist()
+    whole = picture.part(left, top, right, bottom) if isinstance(picture, OnDemand) else picture
+    grey = whole[top : bottom + 1, left : right + 1].astype(np.float32)
+    u, v = (grid - (left, top)).astype(np.float32).transpose(2, 0, 1)
     found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
     return np.asarray(found, np.float32)
 
@@ -117,15 +124,20 @@ class Model:
     def look(self, k: int, window: CropWindow) -> SeenDisk:
         """Return paint and places in a window of frame k, the mean of finer samples, ports included."""
         assert self.texture is not None  # without a map no light is fitted, and nothing is rendered
-        rays = self.camera.rays(torch.from_numpy(window.grid_px(FINE)))
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
+        middle_px, radius_px = sphere_disk_px(self.camera, centre, self.path.radius_mm)
+        samples = (window.side, FINE, window.side, FINE, 2)
+        grid_px = torch.from_numpy(window.grid_px(FINE)).reshape(samples).transpose(1, 2).flatten(2, 3)
+        near = ~((grid_px.mean(2) - middle_px).norm(dim=-1) > NEAR * radius_px + 1)  # the rest shows no sphere
+        rays = self.camera.rays(grid_px[near])
         seen = see_sphere(rays, centre, R, self.texture, self.path.radius_mm)
         along = (seen.normal * rays.direction_lab).sum(-1, keepdim=True)
         across = (seen.normal - along * rays.direction_lab) @ self.camera.R_cam_lab[:2].mT
         parts = torch.cat([seen.paint[..., None], across], dim=-1)
-        parts = torch.where(seen.depth2[..., None] > 0, parts, torch.nan)
-        mean = parts.reshape(window.side, FINE, window.side, FINE, 3).mean((1, 3)).numpy().astype(np.float32)
-        return SeenDisk(paint=mean[..., 0], across=mean[..., 1:])
+        mean = torch.full((window.side, window.side, 3), torch.nan, dtype=parts.dtype)
+        mean[near] = torch.where(seen.depth2[..., None] > 0, parts, torch.nan).mean(1)
+        shown = mean.numpy().astype(np.float32)
+        return SeenDisk(paint=shown[..., 0], across=shown[..., 1:])
 
     def window(self, k: int, half_px: float, side: int) -> CropWindow:
         """Return the window around the sphere in frame k."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from sphereorient.experiment.recording import Shown
 from sphereorient.movies import Grey
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags, stated_error
@@ -363,7 +364,7 @@ def draw_pictures(
     panels: Sequence[Panel],
     view: OverlayView,
     k: int,
-    picture: Grey | None,
+    picture: Shown | None,
     window: CropWindow,
     others: Sequence[OverlayView] = (),
 ) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import torch
 from torch import Tensor
@@ -53,12 +53,7 @@ class DiskLight(Light):
     @cached_property
     def _map(self) -> Tensor:
         """Return difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
-        at = (torch.arange(MAP_SIDE, dtype=torch.float32, device=self.difference.device) + 0.5) * (2.0 / MAP_SIDE) - 1.0
-        y, x = torch.meshgrid(at, at, indexing="ij")
-        across = torch.stack([x, y]).reshape(2, -1)
-        # Cells that the limb cuts take their value on the disk.
-        across = across / across.norm(dim=0).clamp_min(1.0)
-        basis = light_basis(across)
+        across, basis = (part.to(self.difference.device) for part in _on_map())
         black = self.black @ basis + glints_at(self.glints, across.mT.expand(len(self.glints), -1, -1))
         return torch.stack([self.difference @ basis, black], dim=-1).reshape(-1, 2)
 
@@ -112,6 +107,16 @@ def light_basis(across: Tensor) -> Tensor:
     """Return the basis of light maps, (..., K, P): polynomials in the normal's components, which fit grazing lamps."""
     depth = (1.0 - across.square().sum(-2)).clamp_min(0).sqrt()
     return torch.cat([polynomials(across, ORDER), polynomials(across, DEPTH_ORDER) * depth[..., None, :]], dim=-2)
+
+
+@cache
+def _on_map() -> tuple[Tensor, Tensor]:
+    """Return the places of a look-up map, (2, S * S), radii, and the basis of light maps there."""
+    at = (torch.arange(MAP_SIDE, dtype=torch.float32) + 0.5) * (2.0 / MAP_SIDE) - 1.0
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    # Cells that the limb cuts take their value on the disk.
+    across = (torch.stack([x, y]) / torch.hypot(x, y).clamp_min(1.0)).reshape(2, -1)
+    return across, light_basis(across)
 
 
 def no_glints(cameras: int) -> Tensor:

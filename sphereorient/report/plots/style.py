@@ -110,6 +110,7 @@ def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ..
     for each in paths:
         with put_aside(each) as aside:
             figure.savefig(aside, dpi=dpi, metadata=undated.get(each.suffix.lower()))
+        figure.set_layout_engine("none")  # laid out once, for all files alike
     return paths
 
 
