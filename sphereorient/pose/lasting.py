@@ -178,7 +178,7 @@ def _by_tile(
     for camera in range(cameras):
         own = slice(camera, None, cameras)
         values = columns[own].transpose(1, 2).contiguous()
-        values -= _of_cells(values, in_cells[own], cell[own], shares[camera])
+        values -= cell_means(values, in_cells[own], cell[own], shares[camera])
         for k in range(normal.shape[1]):
             there = tile[own] == k
             here = values[there]
@@ -188,7 +188,7 @@ def _by_tile(
     return normal.double(), right.double(), torch.diag_embed(RIDGE * size)
 
 
-def _of_cells(values: Tensor, weight: Tensor, cell: Tensor, shares: Tensor) -> Tensor:
+def cell_means(values: Tensor, weight: Tensor, cell: Tensor, shares: Tensor) -> Tensor:
     """Return what to take off values (B, P, n) so that their sums of products are those with a coefficient for each
     cell eliminated, (B, P, n); weight and cell (B, P), shares (cells,) as `glint_shares`.
     Source: random effects by partial demeaning, Fuller and Battese 1974.

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Shown
+from sphereorient.experiment.recording import Shown, parts_of
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_page as ink
-from sphereorient.report.overlay import parts_by_row, prepared
+from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes, draw_outline, draw_pictures
 from sphereorient.trajectory import Trajectory
 
@@ -73,12 +74,11 @@ def gallery(
     rows, frames = np.array(sorted(why), dtype=np.int64), {}
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, None, opened)
-        pool = opened.enter_context(ThreadPoolExecutor(1))
-        for done, (k, pictures) in enumerate(parts_by_row(streams, rows, pool), start=1):
+        parts = partial(parts_of, opened.enter_context(ThreadPoolExecutor(1)))
+        for done, (k, pictures) in enumerate(pictures_by_row(streams, rows, parts), start=1):
             canvas, jpeg = Canvas(*_pairs_size(page)), io.BytesIO()
             _draw_pairs(canvas, page, k, pictures, (0, 0))
             # No subsampling: it blurs thin coloured lines.
-            # Of the JPEG.
             Image.fromarray(canvas.finished()).save(jpeg, "JPEG", quality=85, subsampling=0, optimize=True)
             frames[k] = GalleryFrame(k=k, words=why[k], jpeg=jpeg.getvalue())
             progress(done, len(rows))
@@ -154,8 +154,8 @@ def worst_frames(
         about += "the measured pose with body axes (x orange, y green, z blue; dotted: away)"
         canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
         corner = {k: (BETWEEN + i % columns * across, HEAD + i // columns * down) for i, k in enumerate(bad)}
-        chosen, pool = np.array(sorted(bad), np.int64), opened.enter_context(ThreadPoolExecutor(1))
-        for done, (k, pictures) in enumerate(parts_by_row(streams, chosen, pool), start=1):
+        chosen, parts = np.array(sorted(bad), np.int64), partial(parts_of, opened.enter_context(ThreadPoolExecutor(1)))
+        for done, (k, pictures) in enumerate(pictures_by_row(streams, chosen, parts), start=1):
             left, top = corner[k]
             canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {track.time[k]:.4f} s", 14)
             _draw_pairs(canvas, page, k, pictures, (left, top + TITLE))

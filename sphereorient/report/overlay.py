@@ -1,12 +1,11 @@
 """The movie with the measurement drawn on it, and the re-rendered sphere beside it."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -15,11 +14,11 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, OutputError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
-from sphereorient.experiment.recording import CameraStream, Read, Shown, given_mask, parts_of, pictures_of
+from sphereorient.experiment.recording import CameraStream, given_mask, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
-from sphereorient.movies import Grey, Movie
+from sphereorient.movies import Movie
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
 from sphereorient.report.plots.style import spread
@@ -140,24 +139,13 @@ def streams_of(
     return known.number[at], streams
 
 
-def pictures_by_row(streams: Mapping[str, CameraStream], rows: Rows) -> Iterator[tuple[int, dict[str, Grey | None]]]:
-    """Yield increasing rows of a track with the picture of each camera, None for missing ones."""
-    return _by_row(streams, rows, pictures_of)
-
-
-def parts_by_row(
-    streams: Mapping[str, CameraStream], rows: Rows, pool: Executor
-) -> Iterator[tuple[int, dict[str, Shown | None]]]:
-    """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
-    return _by_row(streams, rows, partial(parts_of, pool))
-
-
-def _by_row(
-    streams: Mapping[str, CameraStream], rows: Rows, read: Callable[[Movie, Rows], Iterator[Read | None]]
-) -> Iterator[tuple[int, dict[str, Read | None]]]:
+def pictures_by_row(
+    streams: Mapping[str, CameraStream], rows: Rows, read: Callable[[Movie, Rows], Iterator[Any]] = pictures_of
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield increasing rows of a track with the picture of each camera as `read` yields it, None for missing ones."""
     readers = [read(stream.movie, stream.rows[rows]) for stream in streams.values()]
-    for k, *pictures in zip(rows.tolist(), *readers, strict=True):
-        yield k, dict(zip(streams, pictures, strict=True))
+    for k, *found in zip(rows.tolist(), *readers, strict=True):
+        yield k, dict(zip(streams, found, strict=True))
 
 
 def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:

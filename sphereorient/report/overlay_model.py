@@ -90,15 +90,12 @@ class CropWindow:
 
 def crop(picture: Shown, window: CropWindow) -> NDArray[np.float32]:
     """Return a picture within a window, (side, side) grey levels; NaN outside the picture."""
-    grid, (height, width) = window.grid_px(), picture.shape
-    ends = np.array([[width - 1, height - 1]])
-    low, high = np.floor(grid[0, 0] - 1), np.ceil(grid[-1, -1] + 1)
-    (left, top), (right, bottom) = np.clip([low, high], 0, ends).astype(int).tolist()
-    whole = picture.part(left, top, right, bottom) if isinstance(picture, OnDemand) else picture
-    grey = whole[top : bottom + 1, left : right + 1].astype(np.float32)
-    u, v = (grid - (left, top)).astype(np.float32).transpose(2, 0, 1)
-    found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
-    return np.asarray(found, np.float32)
+    grid, last = window.grid_px(), np.array(picture.shape[::-1]) - 1
+    low, high = np.clip([np.floor(grid[0, 0] - 1), np.ceil(grid[-1, -1] + 1)], 0, last).astype(int)
+    whole = picture.part(*low.tolist(), *high.tolist()) if isinstance(picture, OnDemand) else picture
+    grey = whole[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float32)
+    u, v = (grid - low).astype(np.float32).transpose(2, 0, 1)
+    return np.asarray(cv2.remap(grey, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, np.nan), np.float32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,11 +123,10 @@ class Model:
         assert self.texture is not None  # without a map no light is fitted, and nothing is rendered
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
         middle_px, radius_px = sphere_disk_px(self.camera, centre, self.path.radius_mm)
-        samples = (window.side, FINE, window.side, FINE, 2)
-        grid_px = torch.from_numpy(window.grid_px(FINE)).reshape(samples).transpose(1, 2).flatten(2, 3)
+        grid_px = torch.from_numpy(window.grid_px(FINE)).reshape(window.side, FINE, window.side, FINE, 2)
+        grid_px = grid_px.transpose(1, 2).flatten(2, 3)
         near = ~((grid_px.mean(2) - middle_px).norm(dim=-1) > NEAR * radius_px + 1)  # the rest shows no sphere
-        rays = self.camera.rays(grid_px[near])
-        seen = see_sphere(rays, centre, R, self.texture, self.path.radius_mm)
+        seen = see_sphere(rays := self.camera.rays(grid_px[near]), centre, R, self.texture, self.path.radius_mm)
         along = (seen.normal * rays.direction_lab).sum(-1, keepdim=True)
         across = (seen.normal - along * rays.direction_lab) @ self.camera.R_cam_lab[:2].mT
         parts = torch.cat([seen.paint[..., None], across], dim=-1)

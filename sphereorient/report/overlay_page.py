@@ -421,7 +421,6 @@ def draw_axes(panel: Panel, view: OverlayView, k: int, letters: bool = True) -> 
     for tip, towards, colour, letter in zip(tips, near, AXES, "xyz", strict=True):
         panel.line(np.stack([centre, tip]), colour, 2, dotted=not towards)
         if letters:
-            # Of the sphere's radius: letters of the axes.
             panel.text(centre + 1.16 * (tip - centre), letter, 15, colour)
 
 

@@ -39,7 +39,7 @@ CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
 
 SOURCE = Path(__file__).with_suffix("")
-_Widening = record(SOURCE, "Widening")
+Widening = record(SOURCE, "Widening")
 Cells = tuple[Tensor, Tensor, Tensor]  # directions and two tangents of each, (M, 3) float64
 
 
@@ -157,7 +157,7 @@ class TextureTable:
 
         def rows(cells: Cells) -> Tensor:
             centre = cells[0]
-            if (code := compiled(SOURCE, _Widening)) is not None:
+            if (code := compiled(SOURCE, Widening)) is not None:
                 return _widened_by(code, self.rows, added, cells)
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
             for share, _, at in _disk_nodes(cells, added, SQUARE_9):
@@ -195,7 +195,7 @@ def _widened_by(code: ctypes.CDLL, rows: Tensor, width: float, cells: Cells) -> 
     sizes = math.isqrt(len(rows)), len(found), len(nodes)
     parts = rows.float().contiguous(), *(part.contiguous() for part in cells), nodes
     first, *others = (part.data_ptr() for part in parts)
-    code.widen(ctypes.byref(_Widening(first, *sizes, *others, width, found.data_ptr())))
+    code.widen(ctypes.byref(Widening(first, *sizes, *others, width, found.data_ptr())))
     return found
 
 

@@ -30,7 +30,7 @@ from sphereorient import so3
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.compiled import fitted_residuals
-from sphereorient.pose.lasting import Lasting, _of_cells, by_power, lasting_errors, limb_wider_px, of_left_out
+from sphereorient.pose.lasting import Lasting, by_power, cell_means, lasting_errors, limb_wider_px, of_left_out
 from sphereorient.pose.lights.disk import glint_shares
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
@@ -128,7 +128,7 @@ def test_cells_are_eliminated_as_far_as_they_may_change():
     cell = torch.randint(0, 6, (3, 50), generator=rng)
     prior = torch.tensor([1e-9, 0.1, 1.0, 10.0, 1e9, 1.0], dtype=torch.float64)
     whole = torch.zeros(6, dtype=torch.float64).index_add_(0, cell.flatten(), weight.flatten())
-    left = values - _of_cells(values, weight, cell, whole / (whole + prior))
+    left = values - cell_means(values, weight, cell, whole / (whole + prior))
     found = torch.einsum("bpi,bp,bpj->ij", left, weight, left)
     rows = torch.nn.functional.one_hot(cell, 6).double()
     columns = torch.cat([values, rows], dim=-1).flatten(0, 1)

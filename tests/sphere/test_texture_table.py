@@ -17,7 +17,7 @@ from sphereorient.sphere.texture_table import (
     BASE_RAD,
     SOURCE,
     TextureTable,
-    _Widening,
+    Widening,
     octahedral_cells,
     octahedral_directions,
     texture_table,
@@ -196,7 +196,7 @@ def test_blurring_twice_is_blurring_once_by_the_root_of_the_sum_of_squares(kind)
 
 @pytest.mark.parametrize("blur_rad", [1.01 * BASE_RAD, 0.012, 0.05])
 def test_compiled_code_and_torch_blur_alike(blur_rad: float, monkeypatch: pytest.MonkeyPatch):
-    if compiled(SOURCE, _Widening) is None:
+    if compiled(SOURCE, Widening) is None:
         pytest.skip("needs the compiled tables: `make setup` with a compiler")
     unseen = torch.rand(HEIGHT, 2 * HEIGHT, generator=torch.Generator().manual_seed(1)) < 0.01
     base = texture_table(map_of("blobs"), BASE_RAD, unseen=unseen)
