@@ -24,10 +24,7 @@ FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.
 # By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
 # 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
 WORN_GAIN = 1.2
-FIRST_ROUNDS, FIRST_GAIN = (
-    3,
-    0.2,
-)  # after these it is 0.5 to 1.5 in worn balls, 0.0 in others: then no more is looked for
+FIRST_ROUNDS, FIRST_GAIN = 5, 0.15  # after these rounds it is 0.5 to 2.2 in worn balls, below 0.05 in others
 WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which it is not looked for
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 
