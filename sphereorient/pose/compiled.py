@@ -1,5 +1,5 @@
-"""Who computes a fit of poses: compiled code, refine.c, where it was built, on the CPU in float; else torch (fit.py),
-which defines it and has gradients.
+"""Who computes a fit of poses, and residuals: compiled code, refine.c, where it was built, on the CPU in float; else
+torch (fit.py, residuals.py), which defines them and has gradients.
 """
 
 import ctypes
