@@ -69,7 +69,7 @@ FIGURES: dict[str, Figure] = {
     ),
     "stated-parts": Figure(
         pages=("accuracy.md",),
-        command=f"stated_errors.py {SHARED} --only sets movies both stills --stills 60",
+        command=f"stated_errors.py {SHARED} --only sets movies both stills",
         tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
     ),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
