@@ -38,8 +38,7 @@ _Table, _Task, _Stencil, _Scene, _Shot, Near = (
 TOLD = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
 TOLD |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
 TOLD |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
-OF_VIEW = tuple(TOLD)[:8]
-VECTORS = tuple(name for name, count in TOLD.items() if count > 1)
+OF_VIEW, OF_FIT = tuple(TOLD)[:8], ("residual", "model", "variance", "weight")
 
 
 def library() -> ctypes.CDLL | None:
@@ -86,25 +85,25 @@ def residuals(
         return in_torch.residuals(pixels, X, R, state, model)
     (L, P), counts = pixels.grey.shape, torch.empty_like(pixels.inside)
     task, at = _task_on(pixels, begin, model)
-    task.kept = counts.data_ptr()
     told = torch.empty(L, sum(TOLD.values()), P)
     coefficients = torch.empty(L, sum(model.shading.counts), dtype=torch.float64)
     deviation = torch.empty(L, dtype=torch.float64)
-    task.told, task.coefficients, task.deviation = told.data_ptr(), coefficients.data_ptr(), deviation.data_ptr()
+    task.kept, task.told = counts.data_ptr(), told.data_ptr()
+    task.coefficients, task.deviation = coefficients.data_ptr(), deviation.data_ptr()
     if state is not None:
         task.expected, task.weight = at(state[0], torch.float32), at(state[1], torch.float32)
     _run("linearise", task, len(X))
-    parts = dict(zip(TOLD, torch.split(told, list(TOLD.values()), 1), strict=True))
-    parts = {name: part if name in VECTORS else part[:, 0] for name, part in parts.items()}
+    each = torch.split(told, list(TOLD.values()), 1)
+    parts = {name: part.squeeze(1) for name, part in zip(TOLD, each, strict=True)}
     distance = (X.repeat_interleave(cameras, 0) - pixels.origin[..., 0].double()).norm(dim=-1)
     blur = model.blur_px * (pixels.pitch_mm + pixels.pitch_rad * distance).float() / model.radius_mm
     hidden = pixels.inside & ~counts
     known = ~hidden if model.paint.unseen is not None or bool(hidden.any()) else None
     view = SphereView(**{name: parts[name] for name in OF_VIEW}, known=known, blur=blur[:, None])
     light = parts["difference"], parts["black"], parts["beside"]
-    others = {name: parts[name] for name in ("residual", "model", "variance", "weight")}
-    others |= {"deviation": deviation.float(), "inside": counts}
-    return in_torch.with_design(view, light, model.shading, coefficients.float(), **others)
+    others = {name: parts[name] for name in OF_FIT} | {"deviation": deviation.float(), "inside": counts}
+    own = in_torch.own_columns(view, *light[:2], model.shading), coefficients.float()
+    return in_torch.with_design(view, light, own, model.shading, **others)
 
 
 def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:

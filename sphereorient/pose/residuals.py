@@ -99,27 +99,28 @@ def residuals(
         weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (inside & ~silent)
         rounds = grey, weight
     parts = {"residual": residual, "model": grey, "variance": variance, "weight": weight, "deviation": deviation}
-    return with_design(view, (difference, black, beside), model.shading, coefficients, inside=inside, **parts)
+    light, own = (difference, black, beside), (columns, coefficients)
+    return with_design(view, light, own, model.shading, inside=inside, **parts)
 
 
 def with_design(
     view: SphereView,
     light: tuple[Tensor, Tensor, Tensor],
+    own: tuple[Tensor, Tensor],
     shading: Shading,
-    coefficients: Tensor,
     **others: Tensor,
 ) -> Residuals:
-    """Return the linear problem with its derivatives: the frame's own `coefficients` (L, K) of a light that is learnt,
-    difference, black, and what is beside the sphere, grey levels (L, P); `others`: the rest of `Residuals`.
+    """Return the linear problem with its derivatives. `light`: difference, black, and what is beside the sphere, grey
+    levels (L, P); `own`: `own_columns` and their coefficients (L, K); `others`: the rest of `Residuals`.
     """
-    (difference, black, beside), (n, n_black) = light, shading.counts
+    (difference, black, beside), (columns, coefficients), (n, n_black) = light, own, shading.counts
     tints = polynomials(view.across, max(shading.difference, shading.black))
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
     offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
     step, ground = difference * gain, black * gain + offset
     lit = view.coverage * step
     over = view.paint * step + ground - beside
-    design = torch.cat([grey_by_pose(view, lit, over), own_columns(view, difference, black, shading)], dim=1)
+    design = torch.cat([grey_by_pose(view, lit, over), columns], dim=1)
     return Residuals(view=view, design=design, lit=lit, over=over, beside=beside, **others)
 
 

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import permutations
-from statistics import mean
 
 import torch
 from torch import Tensor
@@ -43,9 +41,9 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
         return studied, None
 
     def found(
-        pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: Sequence[float] = WORN_ROUNDS
+        now: Fitter, rounds: Sequence[float], pixels: Pixels, fit: FittedPoses, use: Tensor
     ) -> tuple[Fitter, FittedPoses, Tensor | None]:
-        now, worn = bare, None
+        worn = None
         for changed in rounds:  # worn paint bends the light and the poses that it is found with
             worn = worn_cells(pixels, fit, use, now.model(), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
@@ -55,15 +53,17 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
         return now, fit, worn
 
     every, middle = torch.arange(len(use)), len(use) // 2
-    halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
-    pairs = list(permutations(halves, 2))
-    before = [bare.with_light_of(*half, glints=False).left(*held) for half, held in pairs]
-    half, held = pairs[0]
-    if before[0] - found(*half, WORN_ROUNDS[:FIRST_ROUNDS])[0].left(*held) < FIRST_GAIN:
+    one, other = (some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:]))
+    before = bare.with_light_of(*one, glints=False).left(*other)
+    begun, begun_fit, _ = found(bare, WORN_ROUNDS[:FIRST_ROUNDS], *one)
+    if before - begun.left(*other) < FIRST_GAIN:
         return studied, None
-    if mean(before) - mean(found(*half)[0].left(*held) for half, held in pairs) < WORN_GAIN:
+    of_one, *_ = found(begun, WORN_ROUNDS[FIRST_ROUNDS:], one[0], begun_fit, one[2])
+    of_other, *_ = found(bare, WORN_ROUNDS, *other)
+    gain = before - of_one.left(*other) + bare.with_light_of(*other, glints=False).left(*one) - of_other.left(*one)
+    if gain / 2 < WORN_GAIN:
         return studied, None
-    lit, fitted, worn = found(pixels, fit, use)
+    lit, fitted, worn = found(bare, WORN_ROUNDS, pixels, fit, use)
     wrong = float(fitted.excess[use].median()) > FITS  # the paint that is left is not the map's either
     if wrong or worn is None or worn_share(worn) < WORN_LEAST:
         return studied, None

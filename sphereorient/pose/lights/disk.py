@@ -139,7 +139,7 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
     """
     cameras, others = use.shape[1], at.design.double()
     precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
-    there, weight, pull, by_others = _in_cells(at, use, others)
+    there, weight, pull, by_others = _in_cells(at, precision, cameras, others)
     now = known.reshape(cameras, -1)[:, there].double()
     drawn = _drawn(weight, pull, now + pull.sum(0) / weight.sum(0).clamp_min(1e-30))
     weighted = others * precision[:, None]
@@ -157,9 +157,10 @@ def glint_shares(at: Residuals, use: Tensor, mirrored: Tensor) -> Tensor:
     """Return by how much of what B * C disks, those of `use` (B, C), would leave in a cell its glint changes with it,
     (C, G * G), 0 .. 1: by nothing where the light has none. `mirrored` (L, P) is what the light mirrors there.
     """
-    there, weight, pull, sums = _in_cells(at, use, mirrored[:, None].double())
-    now = by_pose(sums[:, 0], use.shape[1]).sum(0) / weight.sum(0).clamp_min(1e-30)
-    shares = weight.new_zeros(use.shape[1], GLINTS**2)
+    cameras, precision = use.shape[1], (at.weight / at.variance * use.reshape(-1, 1)).double()
+    there, weight, pull, sums = _in_cells(at, precision, cameras, mirrored[:, None].double())
+    now = by_pose(sums[:, 0], cameras).sum(0) / weight.sum(0).clamp_min(1e-30)
+    shares = weight.new_zeros(cameras, GLINTS**2)
     shares[:, there] = 1.0 / (1.0 + _drawn(weight, pull, now) / weight.sum(0).clamp_min(1e-30))
     return shares
 
@@ -170,18 +171,17 @@ def glint_cells(across: Tensor) -> Tensor:
     return row * GLINTS + column
 
 
-def _in_cells(at: Residuals, use: Tensor, others: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _in_cells(at: Residuals, precision: Tensor, cameras: int, others: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return n cells that some disk tells of (the rest is beyond the limb, or hidden in every picture), the sums there
-    of precision, residuals (B, C, n) and others (L, k, P): (L, k, n). Pixels that the limb cuts are out.
+    of precision (L, P), residuals (B, C, n) and others (L, k, P): (L, k, n). Pixels that the limb cuts are out.
     """
-    precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
     inside = precision * (at.view.coverage > IN_SIGHT)
     parts = torch.cat([inside[:, None], (inside * at.residual)[:, None], inside[:, None] * others], dim=1)
     sums = parts.new_zeros(*parts.shape[:2], GLINTS**2)
     sums.scatter_add_(2, glint_cells(at.view.across)[:, None].expand(parts.shape), parts)
     there = sums[:, 0].any(0).nonzero()[:, 0]
     sums = sums[..., there]
-    weight, pull = (by_pose(sums[:, k], use.shape[1]) for k in range(2))
+    weight, pull = (by_pose(sums[:, k], cameras) for k in range(2))
     return there, weight, pull, sums[:, 2:]
 
 

@@ -282,8 +282,8 @@ def _sums(
         scattered = (share * through[k, there]) * over_normal
         columns = [paint * scattered, scattered, (share * mirrored[k, there]) * over_mirror]
         columns += [(share * part[k, there]) * over_depth for part in (shown, gloss)]
-        whole = torch.cat([*columns, left[k : k + 1, there]])
-        return whole, torch.cat([own[k, :, there], at.design[k, :6, there]]), precision[k, there]
+        rows = torch.cat([*columns, left[k : k + 1, there]])
+        return rows, torch.cat([own[k, :, there], at.design[k, :6, there]]), precision[k, there]
 
     def of_poses(some: list[int]) -> tuple[list[int], Tensor, Tensor]:
         """The cameras of a pose share it, and each has a light of its own."""
@@ -295,14 +295,14 @@ def _sums(
             if not bool(used[b * cameras + c]):
                 continue
             place = torch.cat([torch.arange(tints) + c * tints, torch.arange(6) + count])
-            whole, beside, weight = of_disk(b * cameras + c)
-            sums.add(whole, weight)
+            rows, beside, weight = of_disk(b * cameras + c)
+            sums.add(rows, weight)
             weighted = beside * weight
-            mixed[row, place] += (weighted @ whole.T).double()
+            mixed[row, place] += (weighted @ rows.T).double()
             others[row, place[:, None], place] += (weighted @ beside.T).double()
         taken = inverse_damped(others) @ mixed
-        whole = sums.matrix().double() - mixed.flatten(0, 1).T @ taken.flatten(0, 1)
-        return some, whole, taken[:, :count:tints]
+        left_over = sums.matrix().double() - mixed.flatten(0, 1).T @ taken.flatten(0, 1)
+        return some, left_over, taken[:, :count:tints]
 
     # A few poses at a time: the columns of all would fill the memory.
     told = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
