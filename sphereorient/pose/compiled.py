@@ -29,6 +29,7 @@ from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUK
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
+EDGE_FAR = 4.0  # farther inside nothing is cut off, farther outside all is: there the paint takes fewer look-ups
 READABLE = {np.dtype(name) for name in ("uint8", "uint16", "float32")}  # pixels, in this machine's order of bytes
 SOURCE = Path(__file__).with_name("refine")
 _Table, _Task, _Stencil, _Scene, _Shot, Near = (
@@ -231,8 +232,8 @@ def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
     pointers |= {"noise": lit.noise, "stray": lit.stray, "limb_px": model.limb_px}
     pointers |= {"lean": lit.lean if bool(lit.lean.any()) else None, "dark": lit.dark}
     numbers = {"unseen_most": UNSEEN, "known_least": KNOWN, "cover_least": COVER_MIN, "noise_least": NOISE_MIN}
-    numbers |= {"tukey2": TUKEY**2, "outliers": OUTLIERS, "edges": EDGES, "edge_most": EDGE_MOST, "edge_px": EDGE_PX}
-    numbers["in_sight"] = IN_SIGHT
+    numbers |= {"tukey2": TUKEY**2, "outliers": OUTLIERS, "edges": EDGES, "edge_most": EDGE_MOST}
+    numbers |= {"edge_far": EDGE_FAR, "edge_px": EDGE_PX, "in_sight": IN_SIGHT}
     numbers |= {"covered": COVERED, "most_each": MOST_EACH, "least_of_window": LEAST_OF_WINDOW, "margin": MARGIN_PX}
     n_difference, n_black = model.shading.counts
     task = _Task(

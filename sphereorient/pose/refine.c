@@ -43,7 +43,7 @@ typedef struct {
     float unseen_most, known_least, cover_least, sine_most, noise_least, tukey2, outliers;
     const float *edge; /* (edges, EDGE_COLUMNS) from -edge_most to edge_most */
     int64_t edges;
-    float edge_most;
+    float edge_most, edge_far; /* the table's end; farther from the limb it cuts off nothing, or all */
     int64_t light_kind; /* see `shine`; its map: of 0 (cameras, side, side, 2), of 1 (side^2, 3) */
     const float *light;
     int64_t light_side;
@@ -56,6 +56,7 @@ typedef struct {
     const uint8_t *use;
     const double *place_precision;
     int64_t iterations; /* 0: only `kept` is asked for */
+    int64_t passing;    /* whether only the pose is asked for, to go on from */
     const float *limb_px; /* (cameras), or none */
     const float *lean;    /* (cameras, 2, SLOPES), or none */
     const float *dark;    /* (cameras) */
@@ -242,13 +243,13 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
             sight_b[b][i] = R[0][b] * d[0][i] + R[1][b] * d[1][i] + R[2][b] * d[2][i];
             out_b[b][i] = R[0][b] * out[0][i] + R[1][b] * out[1][i] + R[2][b] * out[2][i];
         }
-    int deep = 1;
-    for (int i = 0; i < n; i++) deep &= edge[i] >= t->edge_most;
+    int within = 1, beyond = !t->unseen.rows; /* the limb's paint tells whether that of a place beyond is known */
+    for (int i = 0; i < n; i++) within &= edge[i] >= t->edge_far, beyond &= edge[i] <= -t->edge_far;
     const int outer = from >= t->inner, columns = outer ? EDGE_COLUMNS : 4;
     const float *table = t->edge, edges = (float)(t->edges - 1);
     float found[EDGE_COLUMNS];
     const float per_edge = (float)(t->edges - 1) / (2.0f * t->edge_most);
-    if (deep && !outer) /* far from the limb nothing is cut off */
+    if (within && !outer) /* far from the limb nothing is cut off */
         for (int c = 0; c < columns; c++)
             for (int i = 0; i < n; i++) shape[c][i] = c == 0 || c == 3 ? 1.0f : 0.0f;
     else
@@ -266,8 +267,8 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
     }
     memset(value, 0, sizeof value), memset(radial, 0, sizeof radial), memset(hidden, 0, sizeof hidden);
     memset(flat, 0, sizeof flat), memset(turn, 0, sizeof turn);
-    const int nodes = outer ? NODES : 2;
-    const float each = 1.0f / (float)nodes, side = (float)t->paint.side;
+    const int nodes = beyond ? 0 : outer ? NODES : 2; /* no paint shows far beyond the limb */
+    const float each = 1.0f / (float)(outer ? NODES : 2), side = (float)t->paint.side;
     for (int node = 0; node < nodes; node++) {
         const float *moves = outer ? shape[4 + NODES + node] : shape[3], sign = node ? 1.0f : -1.0f;
         if (outer)
@@ -386,20 +387,26 @@ static void shine_on_disk(const Task *t, const Disk *at, int64_t k) {
 /* Look up light in the lab, as lights/lab.py. */
 static void shine_in_lab(const Task *t, const Disk *at, int64_t k) {
     const float side = (float)t->light_side, gain = t->gain[k % t->cameras], depths = (float)t->depths;
-    const float *dx = t->direction + k * 3 * t->places, *dy = dx + t->places, *dz = dy + t->places;
-    const float *out[3] = {at->out[0], at->out[1], at->out[2]}, *aside = at->aside, *light = t->light;
-    float *difference = at->difference, *black = at->black;
-    INDEPENDENT
-    for (int64_t p = 0; p < t->places; p++) {
-        const float q = aside[p], depth = sqrtf(most(1.0f - q * q, 0.0f));
-        const float nx = q * out[0][p] - depth * dx[p], ny = q * out[1][p] - depth * dy[p];
-        const float nz = q * out[2][p] - depth * dz[p];
-        const float mx = dx[p] + 2.0f * depth * nx, my = dy[p] + 2.0f * depth * ny, mz = dz[p] + 2.0f * depth * nz;
-        const float *scattered = light + 3 * octahedral_cell(nx, ny, nz, side);
-        const float gloss = light[3 * octahedral_cell(mx, my, mz, side) + 2];
-        const float *cover = t->cover + 2 * placed(depth * depths, depths);
-        difference[p] = gain * cover[0] * scattered[0];
-        black[p] = gain * (cover[0] * scattered[1] + cover[1] * gloss);
+    int32_t normal[BLOCK], mirror[BLOCK], deep[BLOCK];
+    for (int64_t from = 0; from < t->places; from += BLOCK) {
+        const int n = (int)(t->places - from < BLOCK ? t->places - from : BLOCK);
+        const float *dx = t->direction + k * 3 * t->places + from, *dy = dx + t->places, *dz = dy + t->places;
+        const float *x = at->out[0] + from, *y = at->out[1] + from, *z = at->out[2] + from, *aside = at->aside + from;
+        float *difference = at->difference + from, *black = at->black + from;
+        INDEPENDENT
+        for (int i = 0; i < n; i++) {
+            const float q = aside[i], depth = sqrtf(most(1.0f - q * q, 0.0f));
+            const float nx = q * x[i] - depth * dx[i], ny = q * y[i] - depth * dy[i], nz = q * z[i] - depth * dz[i];
+            const float mx = dx[i] + 2.0f * depth * nx, my = dy[i] + 2.0f * depth * ny, mz = dz[i] + 2.0f * depth * nz;
+            normal[i] = octahedral_cell(nx, ny, nz, side);
+            mirror[i] = octahedral_cell(mx, my, mz, side);
+            deep[i] = placed(depth * depths, depths);
+        }
+        for (int i = 0; i < n; i++) {
+            const float *scattered = t->light + 3 * normal[i], *cover = t->cover + 2 * deep[i];
+            difference[i] = gain * cover[0] * scattered[0];
+            black[i] = gain * (cover[0] * scattered[1] + cover[1] * t->light[3 * mirror[i] + 2]);
+        }
     }
 }
 
@@ -1005,7 +1012,7 @@ static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
             const int64_t k = pose * cameras + c;
             Sums *of = sums + c;
             of->position = X, of->rotation = R;
-            of->first = round == 0, of->last = round == t->iterations - 1;
+            of->first = round == 0, of->last = !t->passing && round == t->iterations - 1;
             sum_disk(t, at, of, k);
             for (int i = 0; i < 3; i++) of->to_centre[i] = X[i] - (double)t->origin[(k * 3 + i) * t->origins];
             if (!use[c] || !t->iterations) continue;
@@ -1032,7 +1039,7 @@ static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
             sums[c].to_centre[i] = X[i] - (double)t->origin[((pose * cameras + c) * 3 + i) * t->origins];
     memcpy(t->position + pose * 3, X, sizeof X), memcpy(t->rotation + pose * 9, R, sizeof R);
     memcpy(t->step + pose * 6, step, sizeof step);
-    conclude(t, sums, pose, whole, step);
+    if (!t->passing) conclude(t, sums, pose, whole, step);
 }
 
 /* What the fits of one stencil need: memory for one pose at a time. */
@@ -1177,6 +1184,7 @@ static int open_cut(const Near *n, const Stencil *stencil, const uint8_t *hidden
     Task *t = &cut->task;
     cut->hidden = hidden;
     *t = n->task;
+    t->passing = stencil == &n->some;
     const int64_t cameras = t->cameras;
     t->places = stencil->places, t->inner = stencil->inner, t->tiles = stencil->tiles;
     t->place = stencil->place, t->tile = stencil->tile, t->most_hidden = most_hidden;
