@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the shorter one tells no rate
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
+LEAST_CHANGE = 0.5  # share of a change of the turn that goes on, however much the poses scatter
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,7 +73,8 @@ class Chunk:
             if before < 1 / LONG_STEP:  # too short to tell a rate: the last two steps together do
                 on, known, rows = (t2 - t1) / (t1 - self.time_s[frame - 3]), known + self.turns[0], [rows[0], rows[2]]
         places = [one.position_lab_mm[0].numpy() for one in rows]
-        spreads = [one.covariance[0, 3:, 3:].numpy() for one in rows]
+        covariances = [one.covariance[0].numpy() for one in rows]
+        spreads, turn_spreads = ([C[k : k + 3, k : k + 3] for C in covariances] for k in (3, 0))
         X, spread = places[-1], spreads[-1]
         rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
         open_share = exposure_s / (self.time_s[frame] - self.time_s[frame - 1])
@@ -85,7 +87,9 @@ class Chunk:
             if 1 / LONG_STEP <= before <= LONG_STEP:
                 # The rate changes from the middle of one step to that of the next as it did between the two before.
                 more = (t2 - t0) / (t1 - self.time_s[frame - 3])
-                turn = (1 + more) * turn - on * before * more * self.turns[0]
+                change = more * (turn - on * before * self.turns[0])
+                scatter = sum(w * np.trace(C) for w, C in zip((1, 4, 1), turn_spreads, strict=True))
+                turn = turn + max(LEAST_CHANGE, 1 - scatter / (change @ change + scatter)) * change
                 a, b = on * (1 + more), on * before * more
                 further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * spreads[0]
                 # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.

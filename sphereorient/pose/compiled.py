@@ -5,7 +5,7 @@ torch (fit.py, residuals.py), which defines them and has gradients.
 import ctypes
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -82,7 +82,7 @@ def residuals(
     """Linearise pictures as `residuals.residuals`, by compiled code where that is able to; it has no gradients."""
     cameras = len(model.light.noise)
     begin = PoseStart(X, R, torch.ones(len(X), cameras, dtype=torch.bool))
-    if body_of(begin) is IN_TORCH or pixels.grey.dtype != torch.float32:
+    if body_of(X) is IN_TORCH or pixels.grey.dtype != torch.float32:
         return in_torch.residuals(pixels, X, R, state, model)
     (L, P), counts = pixels.grey.shape, torch.empty_like(pixels.inside)
     task, at = _task_on(pixels, begin, model)
@@ -159,6 +159,21 @@ def _run(name: str, task: ctypes.Structure, poses: int) -> None:
     others = [_threads().submit(part) for part in parts[1:]]
     if any([parts[0](), *(other.result() for other in others)]):
         raise MemoryError
+
+
+def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
+    """Return middles (C, B, 2) and radii (C, B), px, of disks, as `fit.disks` to 0.02 px, by lines of sight."""
+    code, at = library(), _Addresses()
+    assert code is not None  # as `body_of` asked
+    found = torch.empty(len(views), len(position_lab_mm), 3, dtype=torch.float64)
+    X, radius, count = (
+        at(position_lab_mm, torch.float64),
+        ctypes.c_double(radius_mm),
+        ctypes.c_int64(len(position_lab_mm)),
+    )
+    for view, to in zip(views, found, strict=True):
+        code.disks(ctypes.byref(_of_view(view)[0]), ctypes.c_void_p(X), radius, ctypes.c_void_p(to.data_ptr()), count)
+    return found[..., :2], found[..., 2]
 
 
 def settle(
@@ -273,17 +288,18 @@ def _edge_table() -> Tensor:
 class Body(NamedTuple):
     """The functions of a fit; as those of `fit`."""
 
+    disks: Callable[[Sequence[CameraView], Tensor, float], tuple[Tensor, Tensor]]
     refine: Callable[[Pixels, PoseStart, SphereModel, int, float], FittedPoses]
     kept: Callable[[Pixels, PoseStart, SphereModel, float], Tensor]
     settle: Callable[[FrameDisks, PoseStart, SphereModel, int, float, bool], tuple[FittedPoses, Tensor]]
 
 
-IN_TORCH = Body(fit.refine, fit.kept, fit.settle)
-COMPILED = Body(refine, kept, settle)
+IN_TORCH = Body(fit.disks, fit.refine, fit.kept, fit.settle)
+COMPILED = Body(disks, refine, kept, settle)
 
 
-def body_of(begin: PoseStart) -> Body:
-    """Return the body for fits that begin there."""
-    X = begin.position_lab_mm
+def body_of(position_lab_mm: Tensor) -> Body:
+    """Return the body for spheres there."""
+    X = position_lab_mm
     able = library() is not None and X.device.type == "cpu" and not X.requires_grad
     return COMPILED if able else IN_TORCH

@@ -3,6 +3,7 @@ the pixels of what covers the sphere (bubbles, specks, a rod, an unknown glint):
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.camera_view import FrameDisks
+from sphereorient.cameras import sphere_disk_px
+from sphereorient.pose.camera_view import CameraView, FrameDisks
 from sphereorient.pose.model import Shading, SphereModel, by_pose
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
@@ -244,6 +246,13 @@ def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:
     # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
     few = count / max(count - fitted, 1)
     return few * (tiles @ tiles.mT)
+
+
+def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
+    """Return middles (C, B, 2) and radii (C, B), px, of the disks of spheres at (B, 3), mm, in C views."""
+    each = [sphere_disk_px(view.camera, position_lab_mm, radius_mm) for view in views]
+    middles, radii = zip(*each, strict=True)
+    return torch.stack(middles), torch.stack(radii)
 
 
 def settle(

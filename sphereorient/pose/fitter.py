@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.cameras import R_lab_view, sphere_disk_px
+from sphereorient.cameras import R_lab_view
 from sphereorient.pose.camera_view import (
     SIZES,
     CameraView,
@@ -100,8 +100,7 @@ class Fitter:
 
     def disks_px(self, position_lab_mm: Tensor) -> DisksPx:
         """Return where the disks lie that a sphere at (B, 3), mm, shows."""
-        disks = [sphere_disk_px(view.camera, position_lab_mm, self.radius_mm) for view in self.views]
-        middles, radii = (torch.stack(parts) for parts in zip(*disks, strict=True))
+        middles, radii = body_of(position_lab_mm).disks(self.views, position_lab_mm, self.radius_mm)
         return DisksPx(middles, radii.nan_to_num().amax(0))
 
     def shows_unknown(self, camera: int, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
@@ -176,13 +175,14 @@ class Fitter:
             return pixels
         every = torch.ones(len(position_lab_mm), len(self.views), dtype=torch.bool)
         begin = moved_to(self.device, PoseStart(position_lab_mm, R_lab_body, every))
-        kept = body_of(begin).kept(moved_to(self.device, pixels), begin, self.model(), self.most_hidden)
+        seen = moved_to(self.device, pixels)
+        kept = body_of(begin.position_lab_mm).kept(seen, begin, self.model(), self.most_hidden)
         return replace(pixels, inside=kept.to(CPU))
 
     def fit(self, pixels: Pixels, begin: PoseStart, level: PyramidLevel, iterations: int) -> FittedPoses:
         """Refine B poses at one level; see `refine`."""
-        begin = moved_to(self.device, begin)
-        fit = body_of(begin).refine(moved_to(self.device, pixels), begin, self.model(level), iterations, 0.0)
+        begin, pixels = moved_to(self.device, begin), moved_to(self.device, pixels)
+        fit = body_of(begin.position_lab_mm).refine(pixels, begin, self.model(level), iterations, 0.0)
         return moved_to(CPU, fit)
 
     def again(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> FittedPoses:
@@ -229,7 +229,7 @@ class Fitter:
             hidden = known.hidden
         disks = FrameDisks.of(self.views, frames, disks_px.middle_px, stencil, hidden)
         model, there = self.model(), moved_to(self.device, begin)
-        fit, far = body_of(there).settle(disks, there, model, self.instants, self.most_hidden, first)
+        fit, far = body_of(there.position_lab_mm).settle(disks, there, model, self.instants, self.most_hidden, first)
         fit = moved_to(CPU, fit)
         if rows := far.nonzero()[:, 0].tolist():
             on = begin.after(fit).of(torch.tensor(rows))

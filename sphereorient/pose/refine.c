@@ -19,6 +19,7 @@
 #define HARMONICS 9
 #define EDGE_COLUMNS (4 + 2 * NODES)
 #define EVERY 4       /* n-th place suffices for numbers of a whole disk: they are in order of distance */
+#define MOST_ROUNDS 16 /* of a place in a picture */
 #define TWO_PI 6.283185307179586
 
 typedef struct {
@@ -1287,6 +1288,51 @@ static int settle_on(const Near *n, Cut *cut, int64_t pose, int64_t more) {
         fit(t, &cut->work.at, cut->work.sums, 0);
     }
     return far;
+}
+
+/* Find the place in a picture, px, whose line of sight passes through a point, by Newton's method from pixel to pixel;
+   beyond the picture its border goes on. NaN where the point lies behind the camera. */
+static void place_of(const Scene *scene, const double *X, double *to) {
+    const int64_t width = scene->width, height = scene->height, size = width * height, each = scene->origins > 1;
+    int64_t x = width / 2, y = height / 2;
+    for (int round = 0; round < MOST_ROUNDS; round++) {
+        const int64_t from = y * width + x, next[2] = {x + 1 < width ? 1 : -1, y + 1 < height ? width : -width};
+        double to_point[3], over[2][3], along = 0, own = 0, mixed = 0, other = 0, pull[2] = {0};
+        for (int i = 0; i < 3; i++) to_point[i] = X[i] - (double)scene->origin[i * scene->origins + each * from];
+        const double distance = length(to_point);
+        for (int i = 0; i < 3; i++) {
+            const float *direction = scene->direction + i * size + from;
+            const float *origin = scene->origin + i * scene->origins + each * from;
+            along += to_point[i] * (double)*direction;
+            for (int k = 0; k < 2; k++) {
+                const double move = (double)origin[each * next[k]] - (double)*origin;
+                over[k][i] = (next[k] > 0 ? 1 : -1) * ((double)direction[next[k]] - (double)*direction + move / distance);
+                pull[k] += over[k][i] * (to_point[i] / distance - (double)*direction);
+            }
+            own += over[0][i] * over[0][i], mixed += over[0][i] * over[1][i], other += over[1][i] * over[1][i];
+        }
+        const double share = 1 / (own * other - mixed * mixed);
+        to[0] = (double)x + share * (other * pull[0] - mixed * pull[1]);
+        to[1] = (double)y + share * (own * pull[1] - mixed * pull[0]);
+        const int64_t right = (int64_t)rint(fmin(fmax(to[0], 0), (double)(width - 1)));
+        const int64_t down = (int64_t)rint(fmin(fmax(to[1], 0), (double)(height - 1)));
+        if (right == x && down == y) {
+            if (!(along > 0)) to[0] = to[1] = NAN;
+            return;
+        }
+        x = right, y = down;
+    }
+}
+
+/* Write where the disks of poses lie in a picture, (poses, 3), px: middle, and radius along the camera's x. */
+void disks(const Scene *scene, const double *position, double radius_mm, double *to, int64_t poses) {
+    for (int64_t pose = 0; pose < poses; pose++, position += 3, to += 3) {
+        double beside[3], rim[2];
+        for (int i = 0; i < 3; i++) beside[i] = position[i] + radius_mm * (double)scene->axes[i];
+        place_of(scene, position, to);
+        place_of(scene, beside, rim);
+        to[2] = hypot(rim[0] - to[0], rim[1] - to[1]);
+    }
 }
 
 /* The size of the largest record that this code reads: a caller with another one must not call it. */

@@ -154,7 +154,7 @@ def refined(
     pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4, most_hidden: float = 0.0
 ) -> FittedPoses:
     """Fit by compiled code, where there is any."""
-    return body_of(begin).refine(pixels, begin, model, iterations, most_hidden)
+    return body_of(begin.position_lab_mm).refine(pixels, begin, model, iterations, most_hidden)
 
 
 def fitted(rig: Rig, kind: str, pixels: Pixels, X: Tensor, R: Tensor, sigma: float, **changes: object) -> FittedPoses:

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from camera_examples import MODELS as CAMERAS
+from camera_examples import behind_port, pinhole
 from refine_examples import (
     BEHIND,
     BLUR_PX,
@@ -22,12 +24,14 @@ from refine_examples import (
 )
 
 from sphereorient import so3
+from sphereorient.cameras import centre_lab_mm, sphere_disk_px
 from sphereorient.cameras.response import Response
 from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import first_fitter
+from sphereorient.pose.pixels import LinesOfSight
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
 
 RIG, COUNT = rig_of(), 6
@@ -91,6 +95,24 @@ def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
     expected = fitter.settled(frames, begin)
     assert_same(found, expected)
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, R)).max()) < 0.5
+
+
+@pytest.mark.parametrize("name", [*CAMERAS, "port"])
+def test_disks_lie_where_cameras_of_all_models_project_them(name):
+    camera = behind_port(pinhole()) if name == "port" else CAMERAS[name]()
+    width, height = camera.image_size
+    still = scene_of(np.zeros((height, width), np.float32))
+    view = CameraView(name=name, camera=camera, background=still, diameter_px=40.0, sight=LinesOfSight(camera))
+    spread = torch.randn(300, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    middles, radii = compiled.disks([view], 30.0 * spread, 5.0)
+    expected, radii_px = sphere_disk_px(camera, 30.0 * spread, 5.0)
+    within = ((expected > 20.0) & (expected < expected.new_tensor([width - 20.0, height - 20.0]))).all(-1)
+    assert int(within.sum()) > 200
+    assert float((middles[0] - expected)[within].abs().max()) < 0.02
+    assert float((radii[0] - radii_px)[within].abs().max()) < 0.02
+    if name not in ("telecentric", "port"):
+        behind = 2 * centre_lab_mm(camera) - 30.0 * spread
+        assert bool(compiled.disks([view], behind, 5.0)[0].isnan().all())
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
