@@ -208,10 +208,13 @@ class BallTracker:
         fit = self._fitted(there, X, R, use, disks_px)
         if visible is None and bool((poor := self._poor(fit, use)).any()):
             # A sharp picture holds the fit where it began: once more, from coarse to fine.
-            near = self._approached(there.frames, (X, R), use, there.precision, poor, None)
-            again = self._fitted(there, *near, use)
-            better = (again.score * use).sum(1) > (fit.score * use).sum(1)
-            fit = again.where(poor & better, fit)
+            which = poor.nonzero()[:, 0]
+            some, frames = there.start(X, R, use).of(which), [there.frames[k] for k in which.tolist()]
+            at = some.position_lab_mm, some.R_lab_body
+            near, turned = self._approached(frames, at, some.use, there.precision[which], poor[which], None)
+            again = self.fitter.settled(frames, replace(some, position_lab_mm=self._from(near), R_lab_body=turned))
+            better = (again.score * some.use).sum(1) > (fit.score * use)[which].sum(1)
+            fit = fit.with_rows(which[better].tolist(), again.of(better))
         good = self._supported(fit, use, visible)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.

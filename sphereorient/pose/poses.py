@@ -82,7 +82,7 @@ class FittedPoses:
 
     def with_rows(self, rows: Sequence[int], others: "FittedPoses") -> "FittedPoses":
         """Return the poses (B,) with others in some rows, by index."""
-        at, there = torch.tensor(rows), others.parts()
+        at, there = torch.tensor(rows, dtype=torch.int64), others.parts()
         return FittedPoses(**{name: part.index_copy(0, at, there[name]) for name, part in self.parts().items()})
 
 

@@ -1,6 +1,7 @@
 """One way through a run, for every command, the Python API and the workers: learn, follow, join."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -126,10 +127,17 @@ class Work:
         """Join the measured batches to the track of each ball, write them, and empty the store."""
         measured = (self.store.read(batch) for batch in self.batches)
         self.progress("join", 0, 1)
-        joined = self.method.join(self.job, self.follower, measured, self.progress)
+        with ThreadPoolExecutor(1) as pool:  # digests of movies leave the interpreter free
+            experiment, names = self.job.recording.experiment, list(self.job.recording.cameras)
+            inputs = input_files(experiment, names)
+            origin = pool.submit(provenance, inputs, experiment.folder, self.request.command)
+            joined = self.method.join(self.job, self.follower, measured, self.progress)
         learnt = {name: known for name, (_, known) in joined.items() if known is not None}
         tracks = Tracks(
-            {name: finished(track, self.job.of(name), self.request, known) for name, (track, known) in joined.items()}
+            {
+                name: finished(track, self.job.of(name), self.request, known, origin.result())
+                for name, (track, known) in joined.items()
+            }
         )
         with writing_of(self.request):
             if learnt and self.request.save_learnt is not None:
@@ -191,14 +199,14 @@ def track_movies(
     return run(request, MemoryStore(), progress=progress)
 
 
-def finished(track: Trajectory, job: Job, request: Request, known: Learnt | None) -> Trajectory:
-    """Add the errors that the fits do not hold, and the provenance."""
+def finished(
+    track: Trajectory, job: Job, request: Request, known: Learnt | None, origin: Mapping[str, Any]
+) -> Trajectory:
+    """Add the errors that the fits do not hold, and the provenance, of which `origin` is that of the whole run."""
     recording, settings = job.recording, job.settings
     remarks = [*recording.remarks, *track.provenance.get("remarks", ()), *results.missed_text(track)]
     track, doubts = results.with_errors(track, recording, None if known is None else known.lasting, compared=True)
-    inputs = input_files(recording.experiment, list(recording.cameras))
-    origin = dict(track.provenance) | provenance(inputs, recording.experiment.folder, request.command)
-    origin["remarks"] = remarks + doubts
+    origin = {**track.provenance, **origin, "remarks": remarks + doubts}
     if settings.propose.checkpoint is not None:
         origin["proposer_sha256"] = sha256(checkpoint_path(settings.propose.checkpoint))
     return replace(track, method=request.method, settings=settings_yaml(settings), provenance=origin)

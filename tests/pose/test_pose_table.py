@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from sphereorient import so3
-from sphereorient.pose.poses import POSE_PARTS, Poses, exchanged, no_pose, pose_table, pose_tables
+from sphereorient.pose.poses import POSE_PARTS, FittedPoses, Poses, exchanged, no_pose, pose_table, pose_tables
 from sphereorient.trajectory import Reason
 
 CAMERAS = 2
@@ -124,3 +124,14 @@ def test_exchanged_tables_are_those_of_exchanged_frames():
         assert all(part[found.mask].equal(whole.parts()[key][whole.mask]) for key, part in found.parts().items())
         assert found.use.equal(whole.use)
         assert found.reason == whole.reason
+
+
+def test_rows_of_fits_are_exchanged_also_none():
+    fits = [FittedPoses(**poses(3, seed).parts()) for seed in (1, 2)]
+    for rows in ([], [2, 0]):
+        found = fits[0].with_rows(rows, fits[1].of(torch.arange(len(rows))))
+        for name in POSE_PARTS:
+            expected = getattr(fits[0], name).clone()
+            for k, row in enumerate(rows):
+                expected[row] = getattr(fits[1], name)[k]
+            assert torch.equal(getattr(found, name), expected)
