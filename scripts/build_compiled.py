@@ -15,9 +15,8 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
-SOURCES = [
-    Path("sphereorient", name) for name in ("so3.c", "sphere/texture_table.c", "pose/refine.c", "motion/kalman.c")
-]
+NAMES = "so3.c", "sphere/texture_table.c", "pose/refine.c", "motion/kalman.c", "mapping/paint_cells.c"
+SOURCES = [Path("sphereorient", name) for name in NAMES]
 # Fused multiplication and addition would give other bits on other processors.
 FLAGS = ["-std=c11", "-O3", "-fPIC", "-shared", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
 X86 = {"avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4"]}

@@ -1,0 +1,115 @@
+"""The paint of a ball in cells of directions, as pictures show it: a map that grows with every picture."""
+
+import ctypes
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.files.compiled import compiled, record
+from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, octahedral_directions, tangents
+
+SOURCE = Path(__file__).with_suffix("")
+Growing = record(SOURCE, "Growing")
+LEAST_COSINE = 0.25  # of the slant at which a picture shows paint
+LEAST_WEIGHT = 0.05  # squared cosines: a cell with less is unseen
+ASIDE = 1.3  # cells from one to those beside it, by which its slope is measured
+SAMPLES = 9  # along each axis of a disk, from which a view's polynomial is found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BallView:
+    """Where a camera's picture shows a ball at one place: the polynomial from lines of sight to pixels."""
+
+    R_view_lab: Tensor  # (3, 3) float64; view: right, down, towards the camera
+    distance_radii: float  # of the camera
+    place_px: Tensor  # (2, 10) float64, by the slopes of a line of sight times the distance
+
+    @classmethod
+    def of(cls, camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> "BallView":
+        """Return the view of a ball at a position (3,), mm."""
+        X, origin = position_lab_mm.double(), camera.rays(camera.project(position_lab_mm.double())).origin_lab_mm
+        in_camera = (X - origin) @ camera.R_cam_lab.mT
+        D = float(in_camera.norm()) / radius_mm
+        R = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)[:, None] * (camera.R_cam_lab.mT @ R_cam_view(in_camera)).mT
+        at = torch.linspace(-1.0, 1.0, SAMPLES, dtype=torch.float64)
+        a, b = (part.reshape(-1) for part in torch.meshgrid(at, at, indexing="ij"))
+        points = X + radius_mm * (torch.stack([a, b, torch.zeros_like(a)], dim=-1) @ R)
+        found = torch.linalg.lstsq(_terms(a, b), camera.project(points)).solution.mT
+        return cls(R_view_lab=R, distance_radii=D, place_px=found.contiguous())
+
+
+def _terms(a: Tensor, b: Tensor) -> Tensor:
+    """Return the terms of polynomials of third order, (..., 10)."""
+    return torch.stack([a**0, a, b, a * a, a * b, b * b, a * a * a, a * a * b, a * b * b, b * b * b], dim=-1)
+
+
+@cache
+def _cells(side: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return directions (cells, 3), the four cells beside each, and slopes by their differences (cells, 4, 3)."""
+    centre = octahedral_directions(side)
+    step = ASIDE * math.sqrt(4 * math.pi) / side
+    along = tangents(centre)
+    near = [centre + sign * step * tangent for tangent in along for sign in (1.0, -1.0)]
+    beside = torch.stack([octahedral_cells(*one.unbind(-1), side) for one in near], dim=1)
+    away = centre[beside] - centre[:, None]
+    across = torch.stack([(away * tangent[:, None]).sum(-1) for tangent in along], dim=-1)  # (cells, 4, 2)
+    by = torch.linalg.pinv(across, rtol=0.1).mT @ torch.stack(along, dim=1)
+    return centre.float().contiguous(), beside.int().contiguous(), by.float().contiguous()
+
+
+class PaintCells:
+    """The mean grey that pictures show in cells of directions, and its table for fits. `side` counts cells per axis;
+    `blur_rad` is the blur of the pictures, which the table has as well.
+    """
+
+    def __init__(self, side: int, blur_rad: float) -> None:
+        self._side = side
+        self.weight, self.total = torch.zeros(side * side), torch.zeros(side * side)
+        unseen = TextureTable(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(side * side, 1), blur_rad)
+        self.table = TextureTable(torch.zeros(side * side, 4), blur_rad, unseen)
+
+    def add(self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor) -> None:
+        """Add a picture's part (H, W) float32 whose first pixel is `corner`: left, top; `counts` (H, W) bool."""
+        assert self.table.unseen is not None
+        turn = (view.R_view_lab @ R_lab_body).contiguous()
+        if (code := compiled(SOURCE, Growing)) is None:
+            self._add(view, grey, counts, corner, turn)
+            return
+        parts = *_cells(self._side), grey, counts, turn, view.place_px
+        sums = self.weight, self.total, self.table.rows, self.table.unseen.rows
+        sizes = len(self.weight), grey.shape[1], grey.shape[0], *corner
+        numbers = view.distance_radii, LEAST_COSINE, LEAST_WEIGHT
+        code.grow(ctypes.byref(Growing(*sizes, *_addresses(parts), *numbers, *_addresses(sums))))
+
+    def _add(
+        self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], turn: Tensor
+    ) -> None:
+        """Do what the compiled code does."""
+        assert self.table.unseen is not None
+        (directions, beside, slope_by), D, (height, width) = _cells(self._side), view.distance_radii, grey.shape
+        x, y, z = (directions.double() @ turn.mT).unbind(-1)
+        cosine = (D * z - 1) / (D * D + 1 - 2 * D * z).sqrt()
+        u, v = (_terms(x * D / (D - z), y * D / (D - z)) @ view.place_px.mT - torch.tensor(corner)).unbind(-1)
+        shown = (cosine > LEAST_COSINE) & (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+        column, row = (torch.where(shown, part, 0.0).long() for part in (u, v))
+        shown &= counts[row, column] & counts[row, column + 1] & counts[row + 1, column] & counts[row + 1, column + 1]
+        right, down = (u - column).float(), (v - row).float()
+        upper, lower = (grey[at, column] + right * (grey[at, column + 1] - grey[at, column]) for at in (row, row + 1))
+        weight = torch.where(shown, cosine.square().float(), 0.0)
+        self.weight += weight
+        self.total += torch.where(shown, weight * (upper + down * (lower - upper)), 0.0)
+        known = self.weight >= LEAST_WEIGHT
+        changed, mean = shown & known, self.total / self.weight
+        differs = torch.where(known[beside], mean[beside] - mean[:, None], 0.0)
+        rows = torch.cat([mean[:, None], (differs[..., None] * slope_by).sum(1)], dim=1)
+        self.table.rows[changed] = rows[changed]
+        self.table.unseen.rows[changed, 0] = 0.0
+
+
+def _addresses(parts: tuple[Tensor, ...]) -> list[int]:
+    return [part.data_ptr() for part in parts]
