@@ -42,7 +42,10 @@ class EvenLight:
     """Makes pictures of one camera even: grey less the mean of its neighbourhood, over the deviation there."""
 
     def __init__(self, view: CameraView, position_lab_mm: Tensor, radius_mm: float) -> None:
-        (u, v), radius_px = view.camera.project(position_lab_mm).tolist(), float(view.radius_px(position_lab_mm, radius_mm))
+        (u, v), radius_px = (
+            view.camera.project(position_lab_mm).tolist(),
+            float(view.radius_px(position_lab_mm, radius_mm)),
+        )
         width, height = view.camera.image_size
         reach = int(REACH * radius_px) + 2
         self.left, self.top = max(0, round(u) - reach), max(0, round(v) - reach)
@@ -155,7 +158,8 @@ class FirstPass:
         """Return whole pictures, and the start of fits at orientations (B, 3, 3)."""
         shapes = [view.camera.image_size[::-1] for view in self._fitter.views]
         frames = [
-            [light.framed(one, shape) for light, one, shape in zip(self._even, row, shapes, strict=True)] for row in even
+            [light.framed(one, shape) for light, one, shape in zip(self._even, row, shapes, strict=True)]
+            for row in even
         ]
         many = self._X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
         return frames, PoseStart(*many, held=True)

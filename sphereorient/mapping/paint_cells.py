@@ -35,7 +35,10 @@ class BallView:
         X, origin = position_lab_mm.double(), camera.rays(camera.project(position_lab_mm.double())).origin_lab_mm
         in_camera = (X - origin) @ camera.R_cam_lab.mT
         D = float(in_camera.norm()) / radius_mm
-        R = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)[:, None] * (camera.R_cam_lab.mT @ R_cam_view(in_camera)).mT
+        R = (
+            torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)[:, None]
+            * (camera.R_cam_lab.mT @ R_cam_view(in_camera)).mT
+        )
         at = torch.linspace(-1.0, 1.0, SAMPLES, dtype=torch.float64)
         a, b = (part.reshape(-1) for part in torch.meshgrid(at, at, indexing="ij"))
         points = X + radius_mm * (torch.stack([a, b, torch.zeros_like(a)], dim=-1) @ R)
@@ -50,7 +53,7 @@ def _terms(a: Tensor, b: Tensor) -> Tensor:
 
 @cache
 def _cells(side: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return directions (cells, 3), the four cells beside each, and slopes by their differences (cells, 4, 3)."""
+    """Return directions (3, cells), the four cells beside each, and slopes by their differences (cells, 4, 3)."""
     centre = octahedral_directions(side)
     step = ASIDE * math.sqrt(4 * math.pi) / side
     along = tangents(centre)
@@ -59,7 +62,7 @@ def _cells(side: int) -> tuple[Tensor, Tensor, Tensor]:
     away = centre[beside] - centre[:, None]
     across = torch.stack([(away * tangent[:, None]).sum(-1) for tangent in along], dim=-1)  # (cells, 4, 2)
     by = torch.linalg.pinv(across, rtol=0.1).mT @ torch.stack(along, dim=1)
-    return centre.float().contiguous(), beside.int().contiguous(), by.float().contiguous()
+    return centre.mT.float().contiguous(), beside.int().contiguous(), by.float().contiguous()
 
 
 class PaintCells:
@@ -69,44 +72,42 @@ class PaintCells:
 
     def __init__(self, side: int, blur_rad: float) -> None:
         self._side = side
-        self.weight, self.total = torch.zeros(side * side), torch.zeros(side * side)
+        self.weight, self.mean = torch.zeros(side * side), torch.zeros(side * side)
+        self._shown = torch.zeros(side * side, dtype=torch.int32)
         unseen = TextureTable(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(side * side, 1), blur_rad)
         self.table = TextureTable(torch.zeros(side * side, 4), blur_rad, unseen)
 
     def add(self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor) -> None:
         """Add a picture's part (H, W) float32 whose first pixel is `corner`: left, top; `counts` (H, W) bool."""
         assert self.table.unseen is not None
-        turn = (view.R_view_lab @ R_lab_body).contiguous()
+        turn, place = (view.R_view_lab @ R_lab_body).float().contiguous(), view.place_px.clone()
+        place[:, 0] -= torch.tensor(corner)
         if (code := compiled(SOURCE, Growing)) is None:
-            self._add(view, grey, counts, corner, turn)
+            self._add(view, grey, counts, place, turn)
             return
-        parts = *_cells(self._side), grey, counts, turn, view.place_px
-        sums = self.weight, self.total, self.table.rows, self.table.unseen.rows
-        sizes = len(self.weight), grey.shape[1], grey.shape[0], *corner
-        numbers = view.distance_radii, LEAST_COSINE, LEAST_WEIGHT
+        parts = *_cells(self._side), grey, counts, turn, place.float()
+        sums = self.weight, self.mean, self.table.rows, self.table.unseen.rows, self._shown
+        sizes, numbers = (len(self.weight), *grey.shape[::-1]), (view.distance_radii, LEAST_COSINE, LEAST_WEIGHT)
         code.grow(ctypes.byref(Growing(*sizes, *_addresses(parts), *numbers, *_addresses(sums))))
 
-    def _add(
-        self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], turn: Tensor
-    ) -> None:
+    def _add(self, view: BallView, grey: Tensor, counts: Tensor, place_px: Tensor, turn: Tensor) -> None:
         """Do what the compiled code does."""
         assert self.table.unseen is not None
         (directions, beside, slope_by), D, (height, width) = _cells(self._side), view.distance_radii, grey.shape
-        x, y, z = (directions.double() @ turn.mT).unbind(-1)
+        x, y, z = turn @ directions
         cosine = (D * z - 1) / (D * D + 1 - 2 * D * z).sqrt()
-        u, v = (_terms(x * D / (D - z), y * D / (D - z)) @ view.place_px.mT - torch.tensor(corner)).unbind(-1)
+        u, v = place_px.float() @ _terms(x * D / (D - z), y * D / (D - z)).mT
         shown = (cosine > LEAST_COSINE) & (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
         column, row = (torch.where(shown, part, 0.0).long() for part in (u, v))
         shown &= counts[row, column] & counts[row, column + 1] & counts[row + 1, column] & counts[row + 1, column + 1]
-        right, down = (u - column).float(), (v - row).float()
+        right, down = u - column, v - row
         upper, lower = (grey[at, column] + right * (grey[at, column + 1] - grey[at, column]) for at in (row, row + 1))
-        weight = torch.where(shown, cosine.square().float(), 0.0)
+        weight, here = torch.where(shown, cosine.square(), 0.0), upper + down * (lower - upper)
         self.weight += weight
-        self.total += torch.where(shown, weight * (upper + down * (lower - upper)), 0.0)
+        self.mean += torch.where(shown, weight / self.weight * (here - self.mean), 0.0)
         known = self.weight >= LEAST_WEIGHT
-        changed, mean = shown & known, self.total / self.weight
-        differs = torch.where(known[beside], mean[beside] - mean[:, None], 0.0)
-        rows = torch.cat([mean[:, None], (differs[..., None] * slope_by).sum(1)], dim=1)
+        differs = torch.where(known[beside], self.mean[beside] - self.mean[:, None], 0.0)
+        rows, changed = torch.cat([self.mean[:, None], (differs[..., None] * slope_by).sum(1)], dim=1), shown & known
         self.table.rows[changed] = rows[changed]
         self.table.unseen.rows[changed, 0] = 0.0
 
