@@ -110,6 +110,11 @@ class Experiment:
         return self.sphere.fixed
 
     @property
+    def mapless(self) -> bool:
+        """Whether its only sphere stays in its place and has no texture map: one is learnt from the movies."""
+        return self.alone and self.fixed and (self.texture_path is None or not self.texture_path.exists())
+
+    @property
     def length_unit(self) -> str:
         """Unit of all lengths of a track: mm, or radii of an only sphere of unknown diameter."""
         return "radii" if any(sphere.diameter_mm is None for sphere in self.spheres) else "mm"

@@ -45,9 +45,8 @@ def open_live(
     other, or no map of a ball that moves.
     """
     experiment = load_experiment(source)
-    path = experiment.texture_path
-    if experiment.fixed and learnt is None and (path is None or not path.exists()):
-        with _learning(experiment, settings, cameras, path or experiment.folder / MAP) as opened:
+    if experiment.mapless and learnt is None:
+        with _learning(experiment, settings, cameras, experiment.texture_path or experiment.folder / MAP) as opened:
             yield opened
         return
     refine = settings.refine.model_copy(update={"chunks": 1})  # frames come one by one

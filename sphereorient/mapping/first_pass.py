@@ -1,8 +1,9 @@
-"""Orientations of a ball in its place, frame by frame, by a map that grows with each of them: nothing is known before."""
+"""Orientations of a ball in its place, frame by frame, by a map that grows with each: nothing is known before."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import cv2
@@ -12,15 +13,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.errors import Reason
-from sphereorient.locate import Background, Frame
+from sphereorient.cameras import centre_lab_mm
+from sphereorient.errors import PaintError, Reason, refusal
+from sphereorient.experiment.recording import UNKNOWN, Recording, TextureMap, spread_frames
+from sphereorient.files.threads import Progress, counted
+from sphereorient.locate import Background, Frame, screened_frames
 from sphereorient.mapping.disks import Crops
 from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics
 from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lights.disk import DiskLight
-from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of
+from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
+from sphereorient.sphere.texture import map_directions
 
 Picture = NDArray[Any]
 GREY = 128.0  # of even pictures: their mean; as the scene about the ball, so that its limb does not show
@@ -35,6 +40,15 @@ LEAST_SCORE = 0.3  # of a picture that the map explains
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 GOES_ON = 0.5  # share of a change of the turn that goes on, see `Chunk.expected`
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
+PLACE_FRAMES, PLACE_TURN = 120, math.radians(20.0)  # first frames, by which the ball's place is found where it turns
+MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
+MAPPED = 400  # of them, evenly spread, that the map is made of
+LIGHT_RADII = 0.12  # half side of the neighbourhood over which the mean picture is averaged: it is the light
+BLACK, WHITE = 0.03, 0.97  # shares of the seen cells that are darker, and of the map's range between them
+PLACE_STEP = 0.01  # of the radius, and of the distance from one camera: by which the ball is moved to find its place
+PLACE_ROUNDS, FARTHEST = 4, 2.0  # of these moves, and steps that one goes at most
+LEAST_FOUND = 0.5  # share of the frames
+LOST = 1.5  # what a frame without a pose counts there; one that is explained counts what is left of its power
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
 
 
@@ -58,16 +72,28 @@ class EvenLight:
         self._within = within.astype(np.float32)
         self._window = (2 * int(WINDOW * radius_px) + 1,) * 2
         self._share = 1 / np.maximum(self._mean(self._within), 1e-3)
-        self._number = float(self._within.sum())
+        self._number, self._radius_px = float(self._within.sum()), radius_px
 
     def _mean(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
         for _ in range(2):  # nearly a Gaussian
-            picture = cv2.boxFilter(picture, -1, self._window, borderType=cv2.BORDER_CONSTANT)
+            picture = np.asarray(cv2.boxFilter(picture, -1, self._window, borderType=cv2.BORDER_CONSTANT), np.float32)
         return picture
+
+    def part(self, picture: Picture) -> NDArray[np.float32]:
+        """Return what is cut out of a picture (H, W), grey levels."""
+        return np.asarray(picture[self._there], np.float32)
+
+    def smooth(self, part: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the local mean of a part over what counts, 1 at least."""
+        side = (2 * int(LIGHT_RADII * self._radius_px) + 1,) * 2
+        parts = part * self._within, self._within
+        total, share = (cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT) for one in parts)
+        level: NDArray[np.float32] = np.maximum(total / np.maximum(share, 1e-3), 1.0)
+        return level
 
     def __call__(self, picture: Picture) -> NDArray[np.float32]:
         """Return what is cut out of a picture (H, W), even."""
-        grey = picture[self._there].astype(np.float32) * self._within
+        grey = self.part(picture) * self._within
         away = (grey - self._mean(grey) * self._share) * self._within
         square = away * away
         power = self._mean(square) * self._share + EVENER * float(square.sum()) / self._number
@@ -129,6 +155,31 @@ class FirstPass:
             fit = self._settled([even], shots, R[None], use)
         return poses_of(fit, slice(0, 1), use, reason)
 
+    def parts(self, shots: Sequence[Frame], use: Tensor) -> list[NDArray[np.float32] | None]:
+        """Return what is cut out of each picture in use, grey levels."""
+        return [
+            light.part(shot.picture) if seen else None
+            for light, shot, seen in zip(self._even, shots, use.tolist(), strict=True)
+        ]
+
+    def map_of(self, pictures: Sequence[tuple[Tensor, Sequence[NDArray[np.float32] | None]]]) -> TextureMap:
+        """Return the map (H, 2 H), 0 black .. 1 white, of the `parts` of pictures at orientations (3, 3), without the
+        light: what these have in common.
+        """
+        cells = PaintCells(self.cells.side, self.cells.table.blur_rad)
+        for c, (view, light) in enumerate(zip(self._views, self._even, strict=True)):
+            seen = [(R, part) for R, row in pictures if (part := row[c]) is not None]
+            if not seen:
+                continue
+            level = light.smooth(np.mean([part for _, part in seen], axis=0, dtype=np.float32))
+            for R, part in seen:
+                cells.add(view, torch.from_numpy(part / level), light.counts, (light.left, light.top), R)
+        direction = map_directions(16 * math.ceil(cells.side / 16))
+        grey, unseen = cells.sample(direction)
+        low, high = (float(grey[~unseen].quantile(share)) for share in (BLACK, WHITE))
+        grey = (BLACK + (WHITE - BLACK) * (grey - low) / max(high - low, 1e-6)).clamp(0.0, 1.0)
+        return TextureMap(grey=grey.masked_fill(unseen, UNKNOWN), unseen=unseen if bool(unseen.any()) else None)
+
     def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor) -> None:
         for view, light, one, seen in zip(self._views, self._even, even, use.tolist(), strict=True):
             if seen:
@@ -171,7 +222,8 @@ class FirstPass:
 
     def _explained(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Return which fits (B,) have arrived, and explain all pictures in use."""
-        return ((fit.score > LEAST_SCORE) | ~use).all(1) & (fit.step[:, :3].norm(dim=1) < NEAR_RAD)
+        arrived: Tensor = fit.step[:, :3].norm(dim=1) < NEAR_RAD
+        return arrived & ((fit.score > LEAST_SCORE) | ~use).all(1)
 
 
 def _even_scene(view: CameraView) -> Background:
@@ -180,4 +232,73 @@ def _even_scene(view: CameraView) -> Background:
 
 
 def _mean_score(fit: FittedPoses, use: Tensor) -> Tensor:
-    return (fit.score * use).sum(1)
+    score: Tensor = (fit.score * use).sum(1)
+    return score
+
+
+def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]]) -> Crops:
+    """Return the place, near the given one, at which a map that grows by some frames explains them best: of a ball that
+    is too large by one part in a hundred all turns are too small by that, and the paint does not meet itself again.
+    """
+    camera, one = place.views[0].camera, len(place.views) == 1
+    sight = place.position_lab_mm[0] - centre_lab_mm(camera)
+    step_mm = PLACE_STEP * place.radius_mm
+    moves = torch.stack([step_mm * camera.R_cam_lab[0], step_mm * camera.R_cam_lab[1], PLACE_STEP * sight])
+    moves[2] *= 1.0 if one else step_mm / moves[2].norm()
+
+    def left(at: Tensor) -> float:
+        follower = FirstPass(replace(place, position_lab_mm=at[None]))
+        found = [follower.next(t, row) for t, row in zip(time_s, shots, strict=True)]
+        return float(np.mean([1 - float(one.score[0, one.use].mean()) if supported(one) else LOST for one in found]))
+
+    X, here = place.position_lab_mm[0], left(place.position_lab_mm[0])
+    for _ in range(PLACE_ROUNDS):
+        steps = []
+        for move in moves:
+            before, after = left(X - move), left(X + move)
+            bend = before - 2 * here + after
+            shift = 0.5 * (before - after) / bend if bend > 0 else math.copysign(FARTHEST, before - after)
+            steps.append(min(max(shift, -FARTHEST), FARTHEST))
+        there = X + torch.tensor(steps, dtype=X.dtype) @ moves
+        if (now := left(there)) < here:
+            X, here = there, now
+        else:
+            moves = moves / 2
+    return replace(place, position_lab_mm=X[None])
+
+
+def first_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
+    """Return the map of a ball at a place, see `fixed_place`, from the first frames of its movies; the body frame is
+    the lab at the first frame that shows it.
+    Raises PaintError: the ball does not turn, or the map explains hardly a frame.
+    """
+    count = min(MOST_FRAMES, len(recording.timeline))
+    time_s = recording.timeline.time_s[:count].tolist()
+
+    def shots() -> Iterator[tuple[Frame, ...]]:
+        pairs = zip(recording.streams, place.views, strict=True)
+        return zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
+
+    progress("place", 0, 1)
+    begin = list(islice(shots(), PLACE_FRAMES))
+    place = placed(place, time_s[: len(begin)], begin)
+    progress("place", 1, 1)
+    follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
+    pictures: list[tuple[Tensor, Sequence[NDArray[np.float32] | None]]] = []
+    turned, found, first = 0.0, 0, None
+    for k, row in enumerate(counted("first pass", shots(), count, progress)):
+        poses = follower.next(time_s[k], row)
+        if not supported(poses):
+            continue
+        R = poses.R_lab_body[0]
+        first = R if first is None else first
+        found, turned = found + 1, max(turned, float(so3.geodesic_distance(first, R)))
+        if k in kept:
+            pictures.append((R, follower.parts(row, poses.use)))
+    if turned < PLACE_TURN:
+        got, do = f"{math.degrees(turned):.2g} degrees in all frames together", "use a movie in which the ball turns"
+        raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
+    if found < LEAST_FOUND * count:
+        got, do = f"{found} of {count} frames that a growing map explains", "learn the map with `sphereorient map`"
+        raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
+    return follower.map_of(pictures)

@@ -58,7 +58,7 @@ def _cells(side: int) -> tuple[Tensor, Tensor, Tensor]:
     step = ASIDE * math.sqrt(4 * math.pi) / side
     along = tangents(centre)
     near = [centre + sign * step * tangent for tangent in along for sign in (1.0, -1.0)]
-    beside = torch.stack([octahedral_cells(*one.unbind(-1), side) for one in near], dim=1)
+    beside = torch.stack([octahedral_cells(one[:, 0], one[:, 1], one[:, 2], side) for one in near], dim=1)
     away = centre[beside] - centre[:, None]
     across = torch.stack([(away * tangent[:, None]).sum(-1) for tangent in along], dim=-1)  # (cells, 4, 2)
     by = torch.linalg.pinv(across, rtol=0.1).mT @ torch.stack(along, dim=1)
@@ -71,7 +71,7 @@ class PaintCells:
     """
 
     def __init__(self, side: int, blur_rad: float) -> None:
-        self._side = side
+        self.side = side
         self.weight, self.mean = torch.zeros(side * side), torch.zeros(side * side)
         self._shown = torch.zeros(side * side, dtype=torch.int32)
         unseen = TextureTable(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(side * side, 1), blur_rad)
@@ -85,15 +85,22 @@ class PaintCells:
         if (code := compiled(SOURCE, Growing)) is None:
             self._add(view, grey, counts, place, turn)
             return
-        parts = *_cells(self._side), grey, counts, turn, place.float()
+        parts = *_cells(self.side), grey, counts, turn, place.float()
         sums = self.weight, self.mean, self.table.rows, self.table.unseen.rows, self._shown
         sizes, numbers = (len(self.weight), *grey.shape[::-1]), (view.distance_radii, LEAST_COSINE, LEAST_WEIGHT)
         code.grow(ctypes.byref(Growing(*sizes, *_addresses(parts), *numbers, *_addresses(sums))))
 
+    def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the grey at directions (H, W, 3), and where it is unseen, (H, W) bool."""
+        assert self.table.unseen is not None
+        at, shape = direction_body.reshape(-1, 3).float().mT[None], direction_body.shape[:-1]
+        grey, unseen = (table.sample(at)[0].reshape(shape) for table in (self.table, self.table.unseen))
+        return grey, unseen > 0.5
+
     def _add(self, view: BallView, grey: Tensor, counts: Tensor, place_px: Tensor, turn: Tensor) -> None:
         """Do what the compiled code does."""
         assert self.table.unseen is not None
-        (directions, beside, slope_by), D, (height, width) = _cells(self._side), view.distance_radii, grey.shape
+        (directions, beside, slope_by), D, (height, width) = _cells(self.side), view.distance_radii, grey.shape
         x, y, z = turn @ directions
         cosine = (D * z - 1) / (D * D + 1 - 2 * D * z).sqrt()
         u, v = place_px.float() @ _terms(x * D / (D - z), y * D / (D - z)).mT

@@ -1,7 +1,7 @@
 """The method of `sphereorient map`: learn the texture maps from movies in which the spheres rotate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +15,12 @@ from sphereorient.files.provenance import provenance
 from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
 from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
+from sphereorient.mapping.disks import fixed_place
+from sphereorient.mapping.first_pass import first_map
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import load_texture, unseen_share
 from sphereorient.sphere.compare import MapComparison
 from sphereorient.trajectory import Trajectory
 
@@ -89,6 +91,22 @@ def learn_map(
             for name, one in shared_maps(maps, progress).items()
         }
     return results.get(UNNAMED, results)
+
+
+def with_first_map(recording: Recording, settings: Settings, progress: Progress) -> Recording:
+    """Return the recording of one fixed ball with a map of its first frames, see `first_map`; raise as that does."""
+    progress("place", 0, 1)
+    found = first_map(recording, fixed_place(recording, settings.paint, settings.locate), progress)
+    name, shown = recording.experiment.sphere.name, 1.0 if found.unseen is None else 1 - unseen_share(found.unseen)
+    remark = (
+        f"no map: one of the first frames is used, which shows {100 * shown:.0f} % of the ball; its axes are the lab's"
+    )
+    return replace(
+        recording,
+        experiment=recording.experiment.with_sphere(texture_path=None),
+        maps={name: found},
+        remarks=(*recording.remarks, f"{remark} at the first frame"),
+    )
 
 
 def _own(kept: Path | None, name: str) -> Path | None:
