@@ -16,7 +16,7 @@ from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import UNKNOWN, Recording, TextureMap, spread_frames
-from sphereorient.files.threads import Progress, counted
+from sphereorient.files.threads import Progress, counted, side_by_side
 from sphereorient.locate import Background, Frame, screened_frames
 from sphereorient.mapping.disks import Crops
 from sphereorient.mapping.paint_cells import BallView, PaintCells
@@ -34,19 +34,19 @@ WINDOW = 0.35  # half side, radii, of the neighbourhood over which light is take
 EVENER = 0.25  # share of the whole disk's power that is added to that of the neighbourhood
 WITHIN = 0.98  # of the radius: pixels that count
 REACH = 1.2  # of the radius: half side of what is cut out
-CELLS_A_PIXEL = 0.6  # cells of the map along a pixel in the disk's middle
+CELLS_A_PIXEL = 0.75  # cells of the map along a pixel in the disk's middle
 NOISE = 10.0  # grey levels, of even pictures
 LEAST_SCORE = 0.3  # of a picture that the map explains
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 GOES_ON = 0.5  # share of a change of the turn that goes on, see `Chunk.expected`
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
-PLACE_FRAMES, PLACE_TURN = 120, math.radians(20.0)  # first frames, by which the ball's place is found where it turns
+PLACE_FRAMES, PLACE_TURN = 60, math.radians(20.0)  # first frames, by which the ball's place is found where it turns
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
 MAPPED = 400  # of them, evenly spread, that the map is made of
 LIGHT_RADII = 0.12  # half side of the neighbourhood over which the mean picture is averaged: it is the light
 BLACK, WHITE = 0.03, 0.97  # shares of the seen cells that are darker, and of the map's range between them
 PLACE_STEP = 0.01  # of the radius, and of the distance from one camera: by which the ball is moved to find its place
-PLACE_ROUNDS, FARTHEST = 4, 2.0  # of these moves, and steps that one goes at most
+PLACE_ROUNDS, PLACE_NEAR, FARTHEST = 5, 0.2, 2.0  # of these moves, steps that are short, and the longest
 LEAST_FOUND = 0.5  # share of the frames
 LOST = 1.5  # what a frame without a pose counts there; one that is explained counts what is left of its power
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
@@ -253,13 +253,12 @@ def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame
 
     X, here = place.position_lab_mm[0], left(place.position_lab_mm[0])
     for _ in range(PLACE_ROUNDS):
-        steps = []
-        for move in moves:
-            before, after = left(X - move), left(X + move)
-            bend = before - 2 * here + after
-            shift = 0.5 * (before - after) / bend if bend > 0 else math.copysign(FARTHEST, before - after)
-            steps.append(min(max(shift, -FARTHEST), FARTHEST))
-        there = X + torch.tensor(steps, dtype=X.dtype) @ moves
+        around = [X + sign * move for move in moves for sign in (-1, 1)]
+        pairs = torch.tensor(list(side_by_side(left, around)), dtype=X.dtype).reshape(3, 2)
+        steps = torch.tensor([_lowest(before, here, after) for before, after in pairs.tolist()], dtype=X.dtype)
+        there = X + steps @ moves
+        if float(steps.abs().max()) < PLACE_NEAR:
+            break
         if (now := left(there)) < here:
             X, here = there, now
         else:
@@ -302,3 +301,10 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         got, do = f"{found} of {count} frames that a growing map explains", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
     return follower.map_of(pictures)
+
+
+def _lowest(before: float, here: float, after: float) -> float:
+    """Return where a parabola through values at -1, 0 and 1 is lowest, not far from these."""
+    bend = before - 2 * here + after
+    shift = 0.5 * (before - after) / bend if bend > 0 else math.copysign(FARTHEST, before - after)
+    return min(max(shift, -FARTHEST), FARTHEST)
