@@ -40,13 +40,15 @@ LEAST_SCORE = 0.3  # of a picture that the map explains
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 GOES_ON = 0.5  # share of a change of the turn that goes on, see `Chunk.expected`
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
-PLACE_FRAMES, PLACE_TURN = 60, math.radians(20.0)  # first frames, by which the ball's place is found where it turns
+PLACES = (60, 3), (300, 1)  # first frames by which the ball's place is found, and how often: paint that is seen again
+# tells it, of few frames the radius is 0.2 % too small
+TURNED = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
 MAPPED = 400  # of them, evenly spread, that the map is made of
 LIGHT_RADII = 0.12  # half side of the neighbourhood over which the mean picture is averaged: it is the light
 BLACK, WHITE = 0.03, 0.97  # shares of the seen cells that are darker, and of the map's range between them
 PLACE_STEP = 0.01  # of the radius, and of the distance from one camera: by which the ball is moved to find its place
-PLACE_ROUNDS, PLACE_NEAR, FARTHEST = 5, 0.2, 2.0  # of these moves, steps that are short, and the longest
+FARTHEST = 2.0  # of these moves, that a step goes at most
 LEAST_FOUND = 0.5  # share of the frames
 LOST = 1.5  # what a frame without a pose counts there; one that is explained counts what is left of its power
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
@@ -236,7 +238,7 @@ def _mean_score(fit: FittedPoses, use: Tensor) -> Tensor:
     return score
 
 
-def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]]) -> Crops:
+def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]], rounds: int) -> Crops:
     """Return the place, near the given one, at which a map that grows by some frames explains them best: of a ball that
     is too large by one part in a hundred all turns are too small by that, and the paint does not meet itself again.
     """
@@ -252,17 +254,15 @@ def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame
         return float(np.mean([1 - float(one.score[0, one.use].mean()) if supported(one) else LOST for one in found]))
 
     X, here = place.position_lab_mm[0], left(place.position_lab_mm[0])
-    for _ in range(PLACE_ROUNDS):
+    for _ in range(rounds):
         around = [X + sign * move for move in moves for sign in (-1, 1)]
         pairs = torch.tensor(list(side_by_side(left, around)), dtype=X.dtype).reshape(3, 2)
         steps = torch.tensor([_lowest(before, here, after) for before, after in pairs.tolist()], dtype=X.dtype)
         there = X + steps @ moves
-        if float(steps.abs().max()) < PLACE_NEAR:
-            break
         if (now := left(there)) < here:
             X, here = there, now
         else:
-            moves = moves / 2
+            break
     return replace(place, position_lab_mm=X[None])
 
 
@@ -279,8 +279,9 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         return zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
 
     progress("place", 0, 1)
-    begin = list(islice(shots(), PLACE_FRAMES))
-    place = placed(place, time_s[: len(begin)], begin)
+    for most, rounds in PLACES:
+        begin = list(islice(shots(), most))
+        place = placed(place, time_s[: len(begin)], begin, rounds)
     progress("place", 1, 1)
     follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
     pictures: list[tuple[Tensor, Sequence[NDArray[np.float32] | None]]] = []
@@ -294,7 +295,7 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         found, turned = found + 1, max(turned, float(so3.geodesic_distance(first, R)))
         if k in kept:
             pictures.append((R, follower.parts(row, poses.use)))
-    if turned < PLACE_TURN:
+    if turned < TURNED:
         got, do = f"{math.degrees(turned):.2g} degrees in all frames together", "use a movie in which the ball turns"
         raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
     if found < LEAST_FOUND * count:

@@ -95,7 +95,6 @@ def learn_map(
 
 def with_first_map(recording: Recording, settings: Settings, progress: Progress) -> Recording:
     """Return the recording of one fixed ball with a map of its first frames, see `first_map`; raise as that does."""
-    progress("place", 0, 1)
     found = first_map(recording, fixed_place(recording, settings.paint, settings.locate), progress)
     name, shown = recording.experiment.sphere.name, 1.0 if found.unseen is None else 1 - unseen_share(found.unseen)
     remark = (
