@@ -141,20 +141,20 @@ class FirstPass:
         even = [light(shot.picture) for light, shot in zip(self._even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
-            fit = None
+            self._grow(even, use, R)  # the map is this frame
+            fit: FittedPoses | None = self._settled([even], R[None], use)
         else:
-            fit = self._fitted(time_s - self._before[0], self._before[1], even, shots, use)
-            if fit is None:
-                self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)
-                return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason], use)
-            R = fit.R_lab_body[0]
-            rate = so3.log(R @ self._before[1].mT) / (time_s - self._before[0])
+            fit = self._fitted(max(time_s - self._before[0], 0.0), self._before[1], even, use)
+        if fit is None:
+            self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)
+            return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason], use)
+        if self._before is not None:
+            R, step_s = fit.R_lab_body[0], time_s - self._before[0]
+            rate = so3.log(R @ self._before[1].mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
             self._change = rate - self._rate if bool(self._rate.any()) else self._change
             self._rate = rate
+            self._grow(even, use, R)
         self._before = time_s, R
-        self._grow(even, use, R)
-        if fit is None:  # the map is this frame: its own fit, for its errors
-            fit = self._settled([even], shots, R[None], use)
         return poses_of(fit, slice(0, 1), use, reason)
 
     def parts(self, shots: Sequence[Frame], use: Tensor) -> list[NDArray[np.float32] | None]:
@@ -187,40 +187,33 @@ class FirstPass:
             if seen:
                 self.cells.add(view, torch.from_numpy(one), light.counts, (light.left, light.top), R_lab_body)
 
-    def _fitted(
-        self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], shots: Sequence[Frame], use: Tensor
-    ) -> FittedPoses | None:
+    def _fitted(self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], use: Tensor) -> FittedPoses | None:
         """Fit near the expected orientation, else near any within reach; None: the map explains the frame nowhere."""
         expected = so3.exp(step_s * (self._rate + GOES_ON * self._change)) @ R
-        fit = self._settled([even], shots, expected[None], use)
+        fit = self._settled([even], expected[None], use)
         if bool(self._explained(fit, use)[0]):
             return fit
-        frames, begin = self._start([even], shots, self._grid @ R, use)
+        frames, begin = self._start([even], self._grid @ R, use)
         level, count = self._fitter.optics.fine, len(self._grid)
-        one = self._fitter.pixels(frames[:1], self._X[None], level).thinned(TRIED_EVERY)
-        pixels = one.where(torch.arange(len(shots)).repeat(count))
-        tried = self._fitter.fit(pixels, begin, level, TRIED_STEPS)
+        one = self._fitter.pixels(frames, self._X[None], level).thinned(TRIED_EVERY)
+        tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(count)), begin, level, TRIED_STEPS)
         best = _mean_score(tried, use).topk(TRIED_BEST).indices
-        fit = self._settled([even] * TRIED_BEST, shots, tried.R_lab_body[best], use)
+        fit = self._settled([even] * TRIED_BEST, tried.R_lab_body[best], use)
         rows = _mean_score(fit, use).argmax()[None]
         return fit.of(rows) if bool(self._explained(fit, use)[rows]) else None
 
     def _start(
-        self, even: Sequence[Sequence[NDArray[np.float32]]], shots: Sequence[Frame], R: Tensor, use: Tensor
+        self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor
     ) -> tuple[list[list[NDArray[np.float32]]], PoseStart]:
         """Return whole pictures, and the start of fits at orientations (B, 3, 3)."""
         shapes = [view.camera.image_size[::-1] for view in self._fitter.views]
-        frames = [
-            [light.framed(one, shape) for light, one, shape in zip(self._even, row, shapes, strict=True)]
-            for row in even
-        ]
+        lights = list(zip(self._even, shapes, strict=True))
+        frames = [[light.framed(one, shape) for (light, shape), one in zip(lights, row, strict=True)] for row in even]
         many = self._X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
         return frames, PoseStart(*many, held=True)
 
-    def _settled(
-        self, even: Sequence[Sequence[NDArray[np.float32]]], shots: Sequence[Frame], R: Tensor, use: Tensor
-    ) -> FittedPoses:
-        return self._fitter.settled(*self._start(even, shots, R, use))
+    def _settled(self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor) -> FittedPoses:
+        return self._fitter.settled(*self._start(even, R, use))
 
     def _explained(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Return which fits (B,) have arrived, and explain all pictures in use."""

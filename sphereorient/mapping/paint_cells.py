@@ -85,7 +85,7 @@ class PaintCells:
         if (code := compiled(SOURCE, Growing)) is None:
             self._add(view, grey, counts, place, turn)
             return
-        parts = *_cells(self.side), grey, counts, turn, place.float()
+        parts = *_cells(self.side), grey.contiguous(), counts.contiguous(), turn, place.float()
         sums = self.weight, self.mean, self.table.rows, self.table.unseen.rows, self._shown
         sizes, numbers = (len(self.weight), *grey.shape[::-1]), (view.distance_radii, LEAST_COSINE, LEAST_WEIGHT)
         code.grow(ctypes.byref(Growing(*sizes, *_addresses(parts), *numbers, *_addresses(sums))))

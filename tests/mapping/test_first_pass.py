@@ -1,0 +1,129 @@
+"""A map that grows with every picture, and the first pass that follows a ball by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from camera_examples import brown, pinhole
+from growing_examples import RATE_HZ, turning_ball  # noqa: F401
+from renders import error_deg
+
+from sphereorient import so3
+from sphereorient.cameras import Camera
+from sphereorient.locate import Frame
+from sphereorient.mapping import paint_cells
+from sphereorient.mapping.first_pass import FirstPass, placed
+from sphereorient.mapping.paint_cells import BallView, PaintCells
+from sphereorient.pose.poses import Poses, supported
+from sphereorient.sphere.texture_table import octahedral_directions
+from sphereorient.trajectory import Reason
+
+X, RADIUS_MM = torch.tensor([12.0, -9.0, 20.0], dtype=torch.float64), 30.0
+
+
+def paint(normal_body: torch.Tensor) -> torch.Tensor:
+    """Smooth paint, with its slope known by hand."""
+    x, y, z = normal_body.unbind(-1)
+    return 3.0 + x * y + torch.sin(2 * z)
+
+
+def picture_of(camera: Camera, R_lab_body: torch.Tensor) -> torch.Tensor:
+    """What a camera sees of that paint, (H, W) float32; 0 beside the ball."""
+    width, height = camera.image_size
+    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    rays = camera.rays(torch.stack([u, v], dim=-1))
+    to_centre = X - rays.origin_lab_mm
+    along = (to_centre * rays.direction_lab).sum(-1)
+    inside = RADIUS_MM**2 - to_centre.square().sum(-1) + along.square()
+    hit = rays.origin_lab_mm + (along - inside.clamp_min(0).sqrt())[..., None] * rays.direction_lab
+    seen = paint(((hit - X) / RADIUS_MM) @ R_lab_body)
+    return torch.where(inside > 0, seen, 0.0).float()
+
+
+@pytest.mark.parametrize("camera", [pinhole(), brown()], ids=["pinhole", "brown"])
+@pytest.mark.parametrize("built", [True, False], ids=["compiled", "torch"])
+def test_cells_hold_the_paint_and_its_slope_where_pictures_show_it(camera, built, monkeypatch):
+    if not built:
+        monkeypatch.setattr(paint_cells, "compiled", lambda *_: None)
+    cells, view = PaintCells(64, 0.05), BallView.of(camera, X, RADIUS_MM)
+    for turn in ((0.3, -0.2, 0.5), (0.5, 0.4, -0.3)):
+        R = so3.exp(torch.tensor(turn, dtype=torch.float64))
+        picture = picture_of(camera, R)
+        cells.add(view, picture, picture > 0, (0, 0), R)
+    directions = octahedral_directions(64)
+    seen = cells.weight > 0.3
+    assert 0.3 < float(seen.float().mean()) < 0.7
+    assert float((cells.mean - paint(directions))[seen].abs().max()) < 0.02
+    x, y, z = directions.unbind(-1)
+    slope = torch.stack([y, x, 2 * torch.cos(2 * z)], dim=-1)
+    slope = slope - (slope * directions).sum(-1, keepdim=True) * directions
+    off = (cells.table.rows[:, 1:] - slope)[seen].norm(dim=-1)
+    assert float(off.median()) < 0.03
+    value, _ = cells.table.sample(directions[seen].float().mT[None])
+    assert float((value[0] - paint(directions[seen])).abs().max()) < 0.02
+    grey, unseen = cells.sample(directions.reshape(64, 64, 3))
+    assert torch.equal(unseen.reshape(-1), cells.weight < paint_cells.LEAST_WEIGHT)
+    assert bool((grey[unseen] == 0).all())
+
+
+def test_masked_pixels_show_nothing():
+    camera, R = pinhole(), torch.eye(3, dtype=torch.float64)
+    cells, view, picture = PaintCells(48, 0.05), BallView.of(pinhole(), X, RADIUS_MM), picture_of(camera, R)
+    cells.add(view, picture, torch.zeros_like(picture, dtype=torch.bool), (0, 0), R)
+    assert not bool(cells.weight.any())
+    cells.add(view, picture[100:, 50:], picture[100:, 50:] > 0, (50, 100), R)
+    whole = PaintCells(48, 0.05)
+    whole.add(view, picture, picture > 0, (0, 0), R)
+    both = (cells.weight > 0) & (whole.weight > 0)
+    assert 0.5 * int((whole.weight > 0).sum()) < int(both.sum())
+    torch.testing.assert_close(cells.mean[both], whole.mean[both], atol=1e-3, rtol=0.0)
+
+
+def followed(ball, numbers, place=None) -> list[Poses]:
+    follower = FirstPass(place or ball.place)
+    return [follower.next(k / RATE_HZ, [ball.shots[k]]) for k in numbers]
+
+
+def test_the_first_pass_follows_a_ball_of_which_nothing_is_known(ball):
+    place = replace(ball.place, position_lab_mm=ball.X[:1])
+    found = followed(ball, range(70), place)
+    R = torch.cat([poses.R_lab_body for poses in found])
+    assert torch.equal(R[0], torch.eye(3, dtype=torch.float64)) or float(so3.log(R[0]).norm()) < 1e-3
+    steps = error_deg(R[1:] @ R[:-1].mT, ball.R[1:] @ ball.R[:-1].mT)
+    assert float(steps.median()) < 0.1
+    assert float(error_deg(R, ball.R @ ball.R[0].mT).max()) < 1.0
+    sigma = torch.stack([poses.covariance[0, :3, :3].diagonal().sum().sqrt() for poses in found[1:]])
+    assert 0.005 < float(torch.rad2deg(sigma.median())) < 0.3
+
+
+def test_a_jump_is_found_and_another_thing_is_none(ball):
+    place = replace(ball.place, position_lab_mm=ball.X[:1])
+    follower = FirstPass(place)
+    for k in range(5):
+        follower.next(k / RATE_HZ, [ball.shots[k]])
+    shape, background = ball.shots[0].picture.shape, place.views[0].background
+    dark = Frame(shown=np.zeros(shape, np.uint8), background=background)
+    noise = Frame(shown=np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8), background=background)
+    assert follower.next(5 / RATE_HZ, [dark]).reason == (Reason.DARK,)
+    assert follower.next(6 / RATE_HZ, [noise]).reason == (Reason.LOW_SCORE,)
+    again = follower.next(8 / RATE_HZ, [ball.shots[8]])  # 30 degrees on
+    assert supported(again)
+    assert float(error_deg(again.R_lab_body, (ball.R[8] @ ball.R[0].mT)[None]).max()) < 1.0
+    assert supported(follower.next(8 / RATE_HZ, [ball.shots[8]]))  # a time that stands
+
+
+@pytest.mark.slow
+def test_the_place_is_found_by_paint_that_is_seen_again(ball):
+    times, camera = [k / RATE_HZ for k in range(70)], ball.place.views[0].camera
+    px = ball.place.radius_mm / float(ball.place.views[0].radius_px(ball.X[0], ball.place.radius_mm))  # mm
+    start = ball.X[:1] + 0.4 * px * (camera.R_cam_lab[0] - camera.R_cam_lab[1])
+    found = placed(replace(ball.place, position_lab_mm=start), times, [[shot] for shot in ball.shots], 3)
+    aside = (camera.project(found.position_lab_mm) - camera.project(ball.X[:1])).norm()
+    assert float(aside) < 0.25  # px, of 0.57
+    sizes = [
+        float(ball.place.views[0].radius_px(X, ball.place.radius_mm)) for X in (found.position_lab_mm[0], ball.X[0])
+    ]
+    assert abs(sizes[0] / sizes[1] - 1) < 0.015
