@@ -14,6 +14,8 @@ from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Res
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 
 if TYPE_CHECKING:
+    from sphereorient.experiment import Experiment
+    from sphereorient.methods.settings import Settings
     from sphereorient.run import Outcome, Request
     from sphereorient.trajectory import Trajectory
 
@@ -56,7 +58,7 @@ def track(given: _TrackOptions) -> None:
     chosen = with_proposer(given.chosen(given.method, *also), given.proposer)
     requests = [
         Request(
-            experiment=experiment,
+            experiment=_with_map(experiment, given, chosen),
             out=path,
             method=given.method,
             settings=chosen,
@@ -77,6 +79,34 @@ def track(given: _TrackOptions) -> None:
         for name, track in tracks.items():
             _print_summary(track, name)
         typer.echo(f"Wrote {given.out}")
+
+
+def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path | Experiment":
+    """Return an experiment with a map; of a ball that stays in its place and has none, one is learnt and written."""
+    from sphereorient.experiment import load_experiment
+
+    experiment = load_experiment(path)
+    if given.method != "precise" or given.learnt is not None or not experiment.mapless:
+        return path
+    from sphereorient.files.whole_file import writing
+    from sphereorient.methods.map import first_map_of
+    from sphereorient.report.texture_map import write_seen, write_texture
+    from sphereorient.sphere import unseen_share
+
+    check_writable(experiment.map_path)
+    with progress_bar(given.quiet) as advance:
+        found = first_map_of(experiment, settings, given.names, advance)
+    seen = 1.0 - (found.grey * 0 if found.unseen is None else found.unseen.float())
+    with writing(force=False):
+        write_texture(found.grey, experiment.map_path)
+        write_seen(seen, experiment.map_path)
+    if not given.quiet:
+        share = 100 * (1.0 if found.unseen is None else 1 - unseen_share(found.unseen))
+        about = f"{share:.0f} % of the ball, by the first frames; its axes are the lab's at the first of them"
+        typer.echo(f"note: no map: wrote {experiment.map_path}, {about}; `sphereorient map` learns a finer one.")
+        if experiment.texture_path is None:
+            typer.echo(f"next: write texture: {experiment.map_path.name} in sphere: of {path}")
+    return experiment.with_sphere(texture_path=experiment.map_path)
 
 
 @contextmanager

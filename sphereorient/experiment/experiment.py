@@ -24,6 +24,9 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 FrameNumber = Annotated[int, Field(ge=0)]
 
 
+MAP = "texture.png"  # of an experiment that names none
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sphere:
     """One sphere of an experiment."""
@@ -108,6 +111,11 @@ class Experiment:
     def fixed(self) -> bool:
         """Whether the centre of the only sphere is fixed."""
         return self.sphere.fixed
+
+    @property
+    def map_path(self) -> Path:
+        """Where the texture map of the only sphere is, or is written: as named, or beside the experiment."""
+        return self.texture_path or self.folder / MAP
 
     @property
     def mapless(self) -> bool:

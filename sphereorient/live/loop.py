@@ -24,8 +24,6 @@ from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
 
-MAP = "texture.png"  # beside the experiment, where that names none
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LiveSetUp:
@@ -46,7 +44,7 @@ def open_live(
     """
     experiment = load_experiment(source)
     if experiment.mapless and learnt is None:
-        with _learning(experiment, settings, cameras, experiment.texture_path or experiment.folder / MAP) as opened:
+        with _learning(experiment, settings, cameras, experiment.map_path) as opened:
             yield opened
         return
     refine = settings.refine.model_copy(update={"chunks": 1})  # frames come one by one

@@ -1,7 +1,7 @@
 """The method of `sphereorient map`: learn the texture maps from movies in which the spheres rotate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, input_files
-from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.experiment.recording import Recording, TextureMap, open_recording
 from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.provenance import provenance
 from sphereorient.files.threads import Progress, silent
@@ -20,7 +20,7 @@ from sphereorient.mapping.first_pass import first_map
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml
-from sphereorient.sphere import load_texture, unseen_share
+from sphereorient.sphere import load_texture
 from sphereorient.sphere.compare import MapComparison
 from sphereorient.trajectory import Trajectory
 
@@ -93,19 +93,13 @@ def learn_map(
     return results.get(UNNAMED, results)
 
 
-def with_first_map(recording: Recording, settings: Settings, progress: Progress) -> Recording:
-    """Return the recording of one fixed ball with a map of its first frames, see `first_map`; raise as that does."""
-    found = first_map(recording, fixed_place(recording, settings.paint, settings.locate), progress)
-    name, shown = recording.experiment.sphere.name, 1.0 if found.unseen is None else 1 - unseen_share(found.unseen)
-    remark = (
-        f"no map: one of the first frames is used, which shows {100 * shown:.0f} % of the ball; its axes are the lab's"
-    )
-    return replace(
-        recording,
-        experiment=recording.experiment.with_sphere(texture_path=None),
-        maps={name: found},
-        remarks=(*recording.remarks, f"{remark} at the first frame"),
-    )
+def first_map_of(
+    experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, progress: Progress
+) -> TextureMap:
+    """Return the map of a ball that stays in its place, of which there is none, see `first_map`; raise as that does."""
+    with open_recording(experiment, cameras, textured=False) as recording, one_thread():
+        progress("place", 0, 1)
+        return first_map(recording, fixed_place(recording, settings.paint, settings.locate), progress)
 
 
 def _own(kept: Path | None, name: str) -> Path | None:

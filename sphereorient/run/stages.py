@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from sphereorient.errors import ExperimentError, SettingsError, error_words, refusal
-from sphereorient.experiment import Experiment, input_files, load_experiment
+from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import open_recording
 from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.provenance import provenance, sha256
@@ -155,13 +155,7 @@ def opened(request: Request, store: Store, progress: Progress = silent) -> Itera
     method = check_method(request)
     given = load_learnt(request.learnt) if isinstance(request.learnt, Path) else request.learnt
     device = torch_device(request.device)
-    experiment = load_experiment(request.experiment)
-    mapless = method is PRECISE and experiment.mapless
-    with open_recording(experiment, request.cameras, textured=not mapless) as recording, one_thread():
-        if mapless:
-            from sphereorient.methods.map import with_first_map  # late: with a map nothing is learnt
-
-            recording = with_first_map(recording, request.settings, progress)
+    with open_recording(request.experiment, request.cameras) as recording, one_thread():
         job = Job(recording=recording, settings=request.settings, device=device, given=given)
         yield Work(request=request, method=method, job=job, store=store, progress=progress)
 

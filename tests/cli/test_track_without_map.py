@@ -1,0 +1,62 @@
+"""`sphereorient track` of a ball that stays in its place, and of which there is no map."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+from typer.testing import CliRunner
+
+from sphereorient import so3
+from sphereorient.cli import app
+from sphereorient.errors import SphereOrientError
+from sphereorient.sphere import load_texture
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
+
+
+def experiment_of(folder, omega_rms: float):
+    """A movie of a ball in its place, without a map; and its true attitudes."""
+    settings = SynthSettings(
+        frames=70, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
+        exposure_samples=1, omega_rms=omega_rms, seed=5,
+    )  # fmt: skip
+    path = write_synthetic_experiment(folder, settings)
+    content = yaml.safe_load(path.read_text())
+    content["sphere"] = {"diameter": content["sphere"]["diameter"], "texture": "own.png", "fixed": True}
+    path.write_text(yaml.safe_dump(content))
+    with h5py.File(folder / "truth.h5") as file:
+        return path, torch.from_numpy(file["orientation"][()])
+
+
+def run(path, *more: str):
+    out = path.parent / "track.h5"
+    return CliRunner().invoke(app, ["track", str(path), "--out", str(out), "--cameras", "cam1", *more]), out
+
+
+@pytest.mark.slow
+def test_a_map_of_the_first_frames_is_written_and_used(tmp_path):
+    path, R_true = experiment_of(tmp_path / "turns", 60.0)
+    done, out = run(path)
+    assert done.exit_code == 0, done.output
+    assert "no map: wrote" in done.output
+    assert load_texture(path.parent / "own.png").std() > 0.1
+    with h5py.File(out) as file:
+        R, valid = torch.from_numpy(file["orientation"][()]), file["valid"][()]
+    assert np.mean(valid) > 0.95
+    R, R_true = R[valid], R_true[valid]
+    body = so3.nearest_rotation((R.mT @ R_true).mean(0))
+    assert float(torch.rad2deg(so3.geodesic_distance(R @ body, R_true)).median()) < 0.6
+    again, _ = run(path, "--force")
+    assert "no map" not in again.output
+
+
+def test_a_ball_that_rests_has_no_map(tmp_path):
+    path, _ = experiment_of(tmp_path / "rests", 0.02)
+    done, out = run(path)
+    assert done.exit_code == 1
+    assert isinstance(done.exception, SphereOrientError)
+    assert "turns" in str(done.exception)
+    assert not out.exists()
+    assert not (path.parent / "own.png").exists()
