@@ -17,6 +17,7 @@ from sphereorient.cameras import centre_lab_mm
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import UNKNOWN, Recording, TextureMap, spread_frames
 from sphereorient.files.threads import Progress, counted, side_by_side
+from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
 from sphereorient.mapping.disks import Crops
 from sphereorient.mapping.paint_cells import BallView, PaintCells
@@ -38,7 +39,6 @@ CELLS_A_PIXEL = 0.75  # cells of the map along a pixel in the disk's middle
 NOISE = 10.0  # grey levels, of even pictures
 LEAST_SCORE = 0.3  # of a picture that the map explains
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
-GOES_ON = 0.5  # share of a change of the turn that goes on, see `Chunk.expected`
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
 PLACES = (60, 3), (300, 1)  # first frames by which the ball's place is found, and how often: paint that is seen again
 # tells it, of few frames the radius is 0.2 % too small
@@ -58,10 +58,8 @@ class EvenLight:
     """Makes pictures of one camera even: grey less the mean of its neighbourhood, over the deviation there."""
 
     def __init__(self, view: CameraView, position_lab_mm: Tensor, radius_mm: float) -> None:
-        (u, v), radius_px = (
-            view.camera.project(position_lab_mm).tolist(),
-            float(view.radius_px(position_lab_mm, radius_mm)),
-        )
+        u, v = view.camera.project(position_lab_mm).tolist()
+        radius_px = float(view.radius_px(position_lab_mm, radius_mm))
         width, height = view.camera.image_size
         reach = int(REACH * radius_px) + 2
         self.left, self.top = max(0, round(u) - reach), max(0, round(v) - reach)
@@ -81,9 +79,9 @@ class EvenLight:
             picture = np.asarray(cv2.boxFilter(picture, -1, self._window, borderType=cv2.BORDER_CONSTANT), np.float32)
         return picture
 
-    def part(self, picture: Picture) -> NDArray[np.float32]:
-        """Return what is cut out of a picture (H, W), grey levels."""
-        return np.asarray(picture[self._there], np.float32)
+    def part(self, picture: Picture) -> Picture:
+        """Return what is cut out of a picture (H, W)."""
+        return picture[self._there].copy()
 
     def smooth(self, part: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the local mean of a part over what counts, 1 at least."""
@@ -95,7 +93,7 @@ class EvenLight:
 
     def __call__(self, picture: Picture) -> NDArray[np.float32]:
         """Return what is cut out of a picture (H, W), even."""
-        grey = self.part(picture) * self._within
+        grey = picture[self._there].astype(np.float32) * self._within
         away = (grey - self._mean(grey) * self._share) * self._within
         square = away * away
         power = self._mean(square) * self._share + EVENER * float(square.sum()) / self._number
@@ -157,14 +155,14 @@ class FirstPass:
         self._before = time_s, R
         return poses_of(fit, slice(0, 1), use, reason)
 
-    def parts(self, shots: Sequence[Frame], use: Tensor) -> list[NDArray[np.float32] | None]:
-        """Return what is cut out of each picture in use, grey levels."""
+    def parts(self, shots: Sequence[Frame], use: Tensor) -> list[Picture | None]:
+        """Return what is cut out of each picture in use."""
         return [
             light.part(shot.picture) if seen else None
             for light, shot, seen in zip(self._even, shots, use.tolist(), strict=True)
         ]
 
-    def map_of(self, pictures: Sequence[tuple[Tensor, Sequence[NDArray[np.float32] | None]]]) -> TextureMap:
+    def map_of(self, pictures: Sequence[tuple[Tensor, Sequence[Picture | None]]]) -> TextureMap:
         """Return the map (H, 2 H), 0 black .. 1 white, of the `parts` of pictures at orientations (3, 3), without the
         light: what these have in common.
         """
@@ -175,7 +173,8 @@ class FirstPass:
                 continue
             level = light.smooth(np.mean([part for _, part in seen], axis=0, dtype=np.float32))
             for R, part in seen:
-                cells.add(view, torch.from_numpy(part / level), light.counts, (light.left, light.top), R)
+                flat = torch.from_numpy(np.asarray(part / level, np.float32))
+                cells.add(view, flat, light.counts, (light.left, light.top), R)
         direction = map_directions(16 * math.ceil(cells.side / 16))
         grey, unseen = cells.sample(direction)
         low, high = (float(grey[~unseen].quantile(share)) for share in (BLACK, WHITE))
@@ -189,7 +188,7 @@ class FirstPass:
 
     def _fitted(self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], use: Tensor) -> FittedPoses | None:
         """Fit near the expected orientation, else near any within reach; None: the map explains the frame nowhere."""
-        expected = so3.exp(step_s * (self._rate + GOES_ON * self._change)) @ R
+        expected = so3.exp(step_s * (self._rate + LEAST_CHANGE * self._change)) @ R
         fit = self._settled([even], expected[None], use)
         if bool(self._explained(fit, use)[0]):
             return fit
@@ -277,8 +276,9 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         place = placed(place, time_s[: len(begin)], begin, rounds)
     progress("place", 1, 1)
     follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
-    pictures: list[tuple[Tensor, Sequence[NDArray[np.float32] | None]]] = []
-    turned, found, first = 0.0, 0, None
+    pictures: list[tuple[Tensor, Sequence[Picture | None]]] = []
+    first: Tensor | None = None
+    turned, found = 0.0, 0
     for k, row in enumerate(counted("first pass", shots(), count, progress)):
         poses = follower.next(time_s[k], row)
         if not supported(poses):
