@@ -40,15 +40,15 @@ NOISE = 10.0  # grey levels, of even pictures
 LEAST_SCORE = 0.3  # of a picture that the map explains
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
-PLACES = (60, 3), (300, 1)  # first frames by which the ball's place is found, and how often: paint that is seen again
-# tells it, of few frames the radius is 0.2 % too small
+# First frames by which the ball's place is found, and moves that are tried, shares of its radius, and of its distance
+# from one camera: paint that is seen again tells it. Of smaller moves the passes do not tell what is better.
+PLACES = (60, 0.03), (60, 0.02), (300, 0.02)
 TURNED = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
 MAPPED = 400  # of them, evenly spread, that the map is made of
 LIGHT_RADII = 0.12  # half side of the neighbourhood over which the mean picture is averaged: it is the light
 BLACK, WHITE = 0.03, 0.97  # shares of the seen cells that are darker, and of the map's range between them
-PLACE_STEP = 0.01  # of the radius, and of the distance from one camera: by which the ball is moved to find its place
-FARTHEST = 2.0  # of these moves, that a step goes at most
+FARTHEST = 1.5  # of these moves: a step goes so far at most
 LEAST_FOUND = 0.5  # share of the frames
 LOST = 1.5  # what a frame without a pose counts there; one that is explained counts what is left of its power
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
@@ -230,32 +230,25 @@ def _mean_score(fit: FittedPoses, use: Tensor) -> Tensor:
     return score
 
 
-def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]], rounds: int) -> Crops:
+def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]], share: float) -> Crops:
     """Return the place, near the given one, at which a map that grows by some frames explains them best: of a ball that
     is too large by one part in a hundred all turns are too small by that, and the paint does not meet itself again.
+    `share`: of the radius, by which it is moved to either side.
     """
     camera, one = place.views[0].camera, len(place.views) == 1
-    sight = place.position_lab_mm[0] - centre_lab_mm(camera)
-    step_mm = PLACE_STEP * place.radius_mm
-    moves = torch.stack([step_mm * camera.R_cam_lab[0], step_mm * camera.R_cam_lab[1], PLACE_STEP * sight])
-    moves[2] *= 1.0 if one else step_mm / moves[2].norm()
+    sight, step_mm = place.position_lab_mm[0] - centre_lab_mm(camera), share * place.radius_mm
+    along = share * sight if one else step_mm * sight / sight.norm()
+    moves = torch.stack([step_mm * camera.R_cam_lab[0], step_mm * camera.R_cam_lab[1], along])
 
     def left(at: Tensor) -> float:
         follower = FirstPass(replace(place, position_lab_mm=at[None]))
         found = [follower.next(t, row) for t, row in zip(time_s, shots, strict=True)]
         return float(np.mean([1 - float(one.score[0, one.use].mean()) if supported(one) else LOST for one in found]))
 
-    X, here = place.position_lab_mm[0], left(place.position_lab_mm[0])
-    for _ in range(rounds):
-        around = [X + sign * move for move in moves for sign in (-1, 1)]
-        pairs = torch.tensor(list(side_by_side(left, around)), dtype=X.dtype).reshape(3, 2)
-        steps = torch.tensor([_lowest(before, here, after) for before, after in pairs.tolist()], dtype=X.dtype)
-        there = X + steps @ moves
-        if (now := left(there)) < here:
-            X, here = there, now
-        else:
-            break
-    return replace(place, position_lab_mm=X[None])
+    X = place.position_lab_mm[0]
+    here, *beside = side_by_side(left, [X, *(X + sign * move for move in moves for sign in (-1, 1))])
+    steps = [_lowest(before, here, after) for before, after in zip(beside[::2], beside[1::2], strict=True)]
+    return replace(place, position_lab_mm=(X + torch.tensor(steps, dtype=X.dtype) @ moves)[None])
 
 
 def first_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
@@ -271,9 +264,9 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         return zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
 
     progress("place", 0, 1)
-    for most, rounds in PLACES:
+    for most, share in PLACES:
         begin = list(islice(shots(), most))
-        place = placed(place, time_s[: len(begin)], begin, rounds)
+        place = placed(place, time_s[: len(begin)], begin, share)
     progress("place", 1, 1)
     follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
     pictures: list[tuple[Tensor, Sequence[Picture | None]]] = []
