@@ -43,6 +43,7 @@ STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the
 # First frames by which the ball's place is found, and moves that are tried, shares of its radius, and of its distance
 # from one camera: paint that is seen again tells it. Of smaller moves the passes do not tell what is better.
 PLACES = (60, 0.03), (60, 0.02), (300, 0.02)
+HELD_BYTES = 1 << 28  # of their pictures
 TURNED = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
 MAPPED = 400  # of them, evenly spread, that the map is made of
@@ -264,8 +265,9 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         return zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
 
     progress("place", 0, 1)
+    held = HELD_BYTES // sum(math.prod(view.camera.image_size) for view in place.views)
     for most, share in PLACES:
-        begin = list(islice(shots(), most))
+        begin = list(islice(shots(), min(most, max(held, PLACES[0][0]))))
         place = placed(place, time_s[: len(begin)], begin, share)
     progress("place", 1, 1)
     follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
