@@ -93,20 +93,21 @@ def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path |
     from sphereorient.report.texture_map import write_seen, write_texture
     from sphereorient.sphere import unseen_share
 
-    check_writable(experiment.map_path)
+    target = experiment.new_map_path()
+    check_writable(target)
     with progress_bar(given.quiet) as advance:
         found = first_map_of(experiment, settings, given.names, advance)
-    seen = 1.0 - (found.grey * 0 if found.unseen is None else found.unseen.float())
+    unseen = found.grey.isnan() if found.unseen is None else found.unseen  # none is
     with writing(force=False):
-        write_texture(found.grey, experiment.map_path)
-        write_seen(seen, experiment.map_path)
+        write_texture(found.grey, target)
+        write_seen((~unseen).int(), target)
     if not given.quiet:
-        share = 100 * (1.0 if found.unseen is None else 1 - unseen_share(found.unseen))
+        share = 100 * (1 - unseen_share(unseen))
         about = f"{share:.0f} % of the ball, by the first frames; its axes are the lab's at the first of them"
-        typer.echo(f"note: no map: wrote {experiment.map_path}, {about}; `sphereorient map` learns a finer one.")
+        typer.echo(f"note: no map: wrote {target}, {about}; `sphereorient map` learns a finer one.")
         if experiment.texture_path is None:
-            typer.echo(f"next: write texture: {experiment.map_path.name} in sphere: of {path}")
-    return experiment.with_sphere(texture_path=experiment.map_path)
+            typer.echo(f"next: write texture: {target.name} in sphere: of {path}")
+    return experiment.with_sphere(texture_path=target)
 
 
 @contextmanager

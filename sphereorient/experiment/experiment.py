@@ -22,8 +22,6 @@ MAX_CAMERAS = 8  # of an experiment: all subsets of them may be tried
 MOVIES_OWN = "movies"  # value of `times`
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 FrameNumber = Annotated[int, Field(ge=0)]
-
-
 MAP = "texture.png"  # of an experiment that names none
 
 
@@ -113,14 +111,18 @@ class Experiment:
         return self.sphere.fixed
 
     @property
-    def map_path(self) -> Path:
-        """Where the texture map of the only sphere is, or is written: as named, or beside the experiment."""
-        return self.texture_path or self.folder / MAP
-
-    @property
     def mapless(self) -> bool:
         """Whether its only sphere stays in its place and has no texture map: one is learnt from the movies."""
         return self.alone and self.fixed and (self.texture_path is None or not self.texture_path.exists())
+
+    def new_map_path(self) -> Path:
+        """Return where the map that is learnt is written: as named, or beside the experiment.
+        Raises ExperimentError: there is a file, which the experiment does not name.
+        """
+        path = self.texture_path or self.folder / MAP
+        if path.exists():
+            raise refused(str(path), "no map there yet", "a file", "write it under sphere: texture:, or rename it")
+        return path
 
     @property
     def length_unit(self) -> str:

@@ -44,7 +44,7 @@ def open_live(
     """
     experiment = load_experiment(source)
     if experiment.mapless and learnt is None:
-        with _learning(experiment, settings, cameras, experiment.map_path) as opened:
+        with _learning(experiment, settings, cameras, experiment.new_map_path()) as opened:
             yield opened
         return
     refine = settings.refine.model_copy(update={"chunks": 1})  # frames come one by one
@@ -69,9 +69,6 @@ def _learning(
     from sphereorient.mapping.disks import fixed_place
     from sphereorient.report.texture_map import write_seen, write_texture
 
-    if path.exists():
-        do = "write it under sphere: texture:, or rename it"
-        raise ExperimentError(refusal(str(path), expected="no map there yet", got="a file", do=do))
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
 
         def save() -> str:

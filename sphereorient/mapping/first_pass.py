@@ -20,6 +20,7 @@ from sphereorient.files.threads import Progress, counted, side_by_side
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
 from sphereorient.mapping.disks import Crops
+from sphereorient.mapping.iterations import BLACK, WHITE, lowest
 from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics
 from sphereorient.pose.fit import NEAR_RAD
@@ -48,7 +49,6 @@ TURNED = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
 MAPPED = 400  # of them, evenly spread, that the map is made of
 LIGHT_RADII = 0.12  # half side of the neighbourhood over which the mean picture is averaged: it is the light
-BLACK, WHITE = 0.03, 0.97  # shares of the seen cells that are darker, and of the map's range between them
 FARTHEST = 1.5  # of these moves: a step goes so far at most
 LEAST_FOUND = 0.5  # share of the frames
 LOST = 1.5  # what a frame without a pose counts there; one that is explained counts what is left of its power
@@ -141,19 +141,18 @@ class FirstPass:
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
             self._grow(even, use, R)  # the map is this frame
-            fit: FittedPoses | None = self._settled([even], R[None], use)
-        else:
-            fit = self._fitted(max(time_s - self._before[0], 0.0), self._before[1], even, use)
+            self._before = time_s, R
+            return poses_of(self._settled([even], R[None], use), slice(0, 1), use, reason)
+        step_s, before = time_s - self._before[0], self._before[1]
+        fit = self._fitted(max(step_s, 0.0), before, even, use)
         if fit is None:
             self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)
             return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason], use)
-        if self._before is not None:
-            R, step_s = fit.R_lab_body[0], time_s - self._before[0]
-            rate = so3.log(R @ self._before[1].mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
-            self._change = rate - self._rate if bool(self._rate.any()) else self._change
-            self._rate = rate
-            self._grow(even, use, R)
-        self._before = time_s, R
+        R = fit.R_lab_body[0]
+        rate = so3.log(R @ before.mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
+        self._change = rate - self._rate if bool(self._rate.any()) else self._change
+        self._rate, self._before = rate, (time_s, R)
+        self._grow(even, use, R)
         return poses_of(fit, slice(0, 1), use, reason)
 
     def parts(self, shots: Sequence[Frame], use: Tensor) -> list[Picture | None]:
@@ -231,7 +230,7 @@ def _mean_score(fit: FittedPoses, use: Tensor) -> Tensor:
     return score
 
 
-def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]], share: float) -> Crops:
+def better_place(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]], share: float) -> Crops:
     """Return the place, near the given one, at which a map that grows by some frames explains them best: of a ball that
     is too large by one part in a hundred all turns are too small by that, and the paint does not meet itself again.
     `share`: of the radius, by which it is moved to either side.
@@ -248,11 +247,11 @@ def placed(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame
 
     X = place.position_lab_mm[0]
     here, *beside = side_by_side(left, [X, *(X + sign * move for move in moves for sign in (-1, 1))])
-    steps = [_lowest(before, here, after) for before, after in zip(beside[::2], beside[1::2], strict=True)]
+    steps = [lowest(before, here, after, FARTHEST) for before, after in zip(beside[::2], beside[1::2], strict=True)]
     return replace(place, position_lab_mm=(X + torch.tensor(steps, dtype=X.dtype) @ moves)[None])
 
 
-def first_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
+def first_pass_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
     """Return the map of a ball at a place, see `fixed_place`, from the first frames of its movies; the body frame is
     the lab at the first frame that shows it.
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
@@ -268,7 +267,7 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
     held = HELD_BYTES // sum(math.prod(view.camera.image_size) for view in place.views)
     for most, share in PLACES:
         begin = list(islice(shots(), min(most, max(held, PLACES[0][0]))))
-        place = placed(place, time_s[: len(begin)], begin, share)
+        place = better_place(place, time_s[: len(begin)], begin, share)
     progress("place", 1, 1)
     follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
     pictures: list[tuple[Tensor, Sequence[Picture | None]]] = []
@@ -290,10 +289,3 @@ def first_map(recording: Recording, place: Crops, progress: Progress) -> Texture
         got, do = f"{found} of {count} frames that a growing map explains", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
     return follower.map_of(pictures)
-
-
-def _lowest(before: float, here: float, after: float) -> float:
-    """Return where a parabola through values at -1, 0 and 1 is lowest, not far from these."""
-    bend = before - 2 * here + after
-    shift = 0.5 * (before - after) / bend if bend > 0 else math.copysign(FARTHEST, before - after)
-    return min(max(shift, -FARTHEST), FARTHEST)

@@ -35,10 +35,8 @@ class BallView:
         X, origin = position_lab_mm.double(), camera.rays(camera.project(position_lab_mm.double())).origin_lab_mm
         in_camera = (X - origin) @ camera.R_cam_lab.mT
         D = float(in_camera.norm()) / radius_mm
-        R = (
-            torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)[:, None]
-            * (camera.R_cam_lab.mT @ R_cam_view(in_camera)).mT
-        )
+        R = R_cam_view(in_camera).mT @ camera.R_cam_lab
+        R[2] *= -1
         at = torch.linspace(-1.0, 1.0, SAMPLES, dtype=torch.float64)
         a, b = (part.reshape(-1) for part in torch.meshgrid(at, at, indexing="ij"))
         points = X + radius_mm * (torch.stack([a, b, torch.zeros_like(a)], dim=-1) @ R)
@@ -74,32 +72,29 @@ class PaintCells:
         self.side = side
         self.weight, self.mean = torch.zeros(side * side), torch.zeros(side * side)
         self._shown = torch.zeros(side * side, dtype=torch.int32)
-        unseen = TextureTable(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(side * side, 1), blur_rad)
-        self.table = TextureTable(torch.zeros(side * side, 4), blur_rad, unseen)
+        self._unseen = TextureTable(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(side * side, 1), blur_rad)
+        self.table = TextureTable(torch.zeros(side * side, 4), blur_rad, self._unseen)
 
     def add(self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor) -> None:
         """Add a picture's part (H, W) float32 whose first pixel is `corner`: left, top; `counts` (H, W) bool."""
-        assert self.table.unseen is not None
         turn, place = (view.R_view_lab @ R_lab_body).float().contiguous(), view.place_px.clone()
         place[:, 0] -= torch.tensor(corner)
         if (code := compiled(SOURCE, Growing)) is None:
             self._add(view, grey, counts, place, turn)
             return
         parts = *_cells(self.side), grey.contiguous(), counts.contiguous(), turn, place.float()
-        sums = self.weight, self.mean, self.table.rows, self.table.unseen.rows, self._shown
+        sums = self.weight, self.mean, self.table.rows, self._unseen.rows, self._shown
         sizes, numbers = (len(self.weight), *grey.shape[::-1]), (view.distance_radii, LEAST_COSINE, LEAST_WEIGHT)
         code.grow(ctypes.byref(Growing(*sizes, *_addresses(parts), *numbers, *_addresses(sums))))
 
     def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
         """Return the grey at directions (H, W, 3), and where it is unseen, (H, W) bool."""
-        assert self.table.unseen is not None
         at, shape = direction_body.reshape(-1, 3).float().mT[None], direction_body.shape[:-1]
-        grey, unseen = (table.sample(at)[0].reshape(shape) for table in (self.table, self.table.unseen))
+        grey, unseen = (table.sample(at)[0].reshape(shape) for table in (self.table, self._unseen))
         return grey, unseen > 0.5
 
     def _add(self, view: BallView, grey: Tensor, counts: Tensor, place_px: Tensor, turn: Tensor) -> None:
         """Do what the compiled code does."""
-        assert self.table.unseen is not None
         (directions, beside, slope_by), D, (height, width) = _cells(self.side), view.distance_radii, grey.shape
         x, y, z = turn @ directions
         cosine = (D * z - 1) / (D * D + 1 - 2 * D * z).sqrt()
@@ -116,7 +111,7 @@ class PaintCells:
         differs = torch.where(known[beside], self.mean[beside] - self.mean[:, None], 0.0)
         rows, changed = torch.cat([self.mean[:, None], (differs[..., None] * slope_by).sum(1)], dim=1), shown & known
         self.table.rows[changed] = rows[changed]
-        self.table.unseen.rows[changed, 0] = 0.0
+        self._unseen.rows[changed, 0] = 0.0
 
 
 def _addresses(parts: tuple[Tensor, ...]) -> list[int]:

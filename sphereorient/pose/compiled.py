@@ -29,7 +29,7 @@ from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUK
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
-EDGE_FAR = 4.0  # farther inside nothing is cut off, farther outside all is: there the paint takes fewer look-ups
+EDGE_FAR = 4.0  # farther inside, the limb cuts nothing off; farther outside all, and no paint is looked up
 READABLE = {np.dtype(name) for name in ("uint8", "uint16", "float32")}  # pixels, in this machine's order of bytes
 SOURCE = Path(__file__).with_name("refine")
 _Table, _Task, _Stencil, _Scene, _Shot, Near = (
@@ -166,13 +166,10 @@ def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float
     code, at = library(), _Addresses()
     assert code is not None  # as `body_of` asked
     found = torch.empty(len(views), len(position_lab_mm), 3, dtype=torch.float64)
-    X, radius, count = (
-        at(position_lab_mm, torch.float64),
-        ctypes.c_double(radius_mm),
-        ctypes.c_int64(len(position_lab_mm)),
-    )
+    X, count = ctypes.c_void_p(at(position_lab_mm, torch.float64)), ctypes.c_int64(len(position_lab_mm))
     for view, to in zip(views, found, strict=True):
-        code.disks(ctypes.byref(_of_view(view)[0]), ctypes.c_void_p(X), radius, ctypes.c_void_p(to.data_ptr()), count)
+        scene, _alive = _of_view(view)
+        code.disks(ctypes.byref(scene), X, ctypes.c_double(radius_mm), ctypes.c_void_p(to.data_ptr()), count)
     return found[..., :2], found[..., 2]
 
 

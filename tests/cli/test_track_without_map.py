@@ -60,3 +60,16 @@ def test_a_ball_that_rests_has_no_map(tmp_path):
     assert "turns" in str(done.exception)
     assert not out.exists()
     assert not (path.parent / "own.png").exists()
+
+
+def test_a_map_that_the_experiment_does_not_name_is_not_written_over(tmp_path):
+    path, _ = experiment_of(tmp_path / "turns", 60.0)
+    content = yaml.safe_load(path.read_text())
+    del content["sphere"]["texture"]
+    path.write_text(yaml.safe_dump(content))
+    before = (path.parent / "texture.png").read_bytes()  # that of the renderer
+    done, out = run(path, "--force")
+    assert isinstance(done.exception, SphereOrientError)
+    assert "write it under sphere: texture:" in str(done.exception)
+    assert (path.parent / "texture.png").read_bytes() == before
+    assert not out.exists()

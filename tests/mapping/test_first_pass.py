@@ -15,7 +15,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.locate import Frame
 from sphereorient.mapping import paint_cells
-from sphereorient.mapping.first_pass import FirstPass, placed
+from sphereorient.mapping.first_pass import FirstPass, better_place
 from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.pose.poses import Poses, supported
 from sphereorient.sphere.texture_table import octahedral_directions
@@ -120,7 +120,7 @@ def test_the_place_is_found_by_paint_that_is_seen_again(ball):
     times, camera = [k / RATE_HZ for k in range(70)], ball.place.views[0].camera
     px = ball.place.radius_mm / float(ball.place.views[0].radius_px(ball.X[0], ball.place.radius_mm))  # mm
     start = ball.X[:1] + 0.4 * px * (camera.R_cam_lab[0] - camera.R_cam_lab[1])
-    found = placed(replace(ball.place, position_lab_mm=start), times, [[shot] for shot in ball.shots], 0.03)
+    found = better_place(replace(ball.place, position_lab_mm=start), times, [[shot] for shot in ball.shots], 0.03)
     aside = (camera.project(found.position_lab_mm) - camera.project(ball.X[:1])).norm()
     assert float(aside) < 0.25  # px, of 0.57
     sizes = [
