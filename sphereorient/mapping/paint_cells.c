@@ -1,6 +1,8 @@
 /* The paint of a ball in cells of directions, as pictures show it: what `PaintCells` of paint_cells.py computes, which
    defines it. Built without fused or reordered arithmetic. */
 
+#include <string.h>
+
 #include "../sphere/cells.h"
 
 #define TERMS 10 /* of a polynomial of third order in two variables */
@@ -19,6 +21,8 @@ typedef struct {
     float *weight, *mean;         /* (cells), of what pictures showed */
     float *rows, *unseen;         /* (cells, 4), tangent planes of the mean, and of what is unseen */
     int32_t *shown;               /* (cells), work: which ones the picture shows */
+    float *here, *cosine;         /* (cells), of `see`: grey and slant of what the picture shows, 0 elsewhere */
+    int32_t *nearest;             /* (cells), of `see`: the pixel */
 } Growing;
 
 /* The size of the record that this code reads: a caller with another one must not call it. */
@@ -35,8 +39,15 @@ static int before_centre(const Growing *g, int64_t from, int n, int32_t *found) 
     return count;
 }
 
-/* Add what a picture shows of some cells; return how many it shows, and which. */
-static int add(const Growing *g, const int32_t *cell, int n, int32_t *shown) {
+/* What a picture shows of some cells. */
+typedef struct {
+    int32_t cell[BLOCK + 1], nearest[BLOCK];
+    float here[BLOCK], cosine[BLOCK];
+} Shown;
+
+/* Look up `n` cells in a picture; keep those that it shows, return their number. */
+static int look(const Growing *g, Shown *s, int n) {
+    const int32_t *cell = s->cell;
     float view[3][BLOCK], u[BLOCK], v[BLOCK], cosine[BLOCK];
     const float D = g->distance, *p = g->place, *q = p + TERMS;
     for (int c = 0; c < 3; c++) {
@@ -61,22 +72,46 @@ static int add(const Growing *g, const int32_t *cell, int n, int32_t *shown) {
         const float right = u[i] - (float)x, down = v[i] - (float)y, *grey = g->grey;
         const float upper = grey[at] + right * (grey[at + 1] - grey[at]);
         const float lower = grey[below] + right * (grey[below + 1] - grey[below]);
-        const float weight = cosine[i] * cosine[i], here = upper + down * (lower - upper);
-        const int64_t k = cell[i];
-        g->weight[k] += weight;
-        g->mean[k] += weight / g->weight[k] * (here - g->mean[k]);
-        shown[count++] = (int32_t)k;
+        s->cell[count] = cell[i], s->here[count] = upper + down * (lower - upper), s->cosine[count] = cosine[i];
+        s->nearest[count++] = (int32_t)((int64_t)(v[i] + 0.5f) * g->width + (int64_t)(u[i] + 0.5f));
     }
     return count;
 }
 
+/* Return how many cells from one on a picture shows, and what. */
+static int shown_from(const Growing *g, int64_t from, Shown *s) {
+    const int n = (int)(g->cells - from < BLOCK ? g->cells - from : BLOCK);
+    return look(g, s, before_centre(g, from, n, s->cell));
+}
+
+/* Write what a picture shows of all cells. */
+void see(const Growing *g) {
+    Shown s;
+    memset(g->here, 0, (size_t)g->cells * sizeof(float));
+    memset(g->cosine, 0, (size_t)g->cells * sizeof(float));
+    memset(g->nearest, 0, (size_t)g->cells * sizeof(int32_t));
+    for (int64_t from = 0; from < g->cells; from += BLOCK) {
+        const int count = shown_from(g, from, &s);
+        for (int i = 0; i < count; i++) {
+            const int64_t k = s.cell[i];
+            g->here[k] = s.here[i], g->cosine[k] = s.cosine[i], g->nearest[k] = s.nearest[i];
+        }
+    }
+}
+
 /* Add a picture, and write the tables anew where it shows the ball; return the number of cells that it shows. */
 int64_t grow(const Growing *g) {
-    int32_t found[BLOCK + 1];
+    Shown s;
     int64_t count = 0;
     for (int64_t from = 0; from < g->cells; from += BLOCK) {
-        const int n = (int)(g->cells - from < BLOCK ? g->cells - from : BLOCK);
-        count += add(g, found, before_centre(g, from, n, found), g->shown + count);
+        const int here = shown_from(g, from, &s);
+        for (int i = 0; i < here; i++) {
+            const int64_t k = s.cell[i];
+            const float weight = s.cosine[i] * s.cosine[i];
+            g->weight[k] += weight;
+            g->mean[k] += weight / g->weight[k] * (s.here[i] - g->mean[k]);
+            g->shown[count++] = (int32_t)k;
+        }
     }
     for (int64_t i = 0; i < count; i++) {
         const int64_t k = g->shown[i];

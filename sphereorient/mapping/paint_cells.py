@@ -2,6 +2,7 @@
 
 import ctypes
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -77,15 +78,43 @@ class PaintCells:
 
     def add(self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor) -> None:
         """Add a picture's part (H, W) float32 whose first pixel is `corner`: left, top; `counts` (H, W) bool."""
-        turn, place = (view.R_view_lab @ R_lab_body).float().contiguous(), view.place_px.clone()
-        place[:, 0] -= torch.tensor(corner)
+        turn, place = _seen_from(view, corner, R_lab_body)
         if (code := compiled(SOURCE, Growing)) is None:
-            self._add(view, grey, counts, place, turn)
+            grown, cosine, _ = self._see(view, grey, counts, place, turn)
+            shown, weight = cosine > 0, cosine.square()
+            self.weight += weight
+            self.mean += torch.where(shown, weight / self.weight * (grown - self.mean), 0.0)
+            self._write(shown & (self.weight >= LEAST_WEIGHT))
             return
-        parts = *_cells(self.side), grey.contiguous(), counts.contiguous(), turn, place.float()
+        parts = *_cells(self.side), grey.contiguous(), counts.contiguous(), turn, place
         sums = self.weight, self.mean, self.table.rows, self._unseen.rows, self._shown
-        sizes, numbers = (len(self.weight), *grey.shape[::-1]), (view.distance_radii, LEAST_COSINE, LEAST_WEIGHT)
-        code.grow(ctypes.byref(Growing(*sizes, *_addresses(parts), *numbers, *_addresses(sums))))
+        code.grow(ctypes.byref(_growing(view, parts, sums, ())))
+
+    def see(
+        self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what a picture's part shows of all cells: grey, the slant's cosine, 0 where it shows nothing, and the
+        number of the pixel; arguments as of `add`.
+        """
+        turn, place = _seen_from(view, corner, R_lab_body)
+        if (code := compiled(SOURCE, Growing)) is None:
+            return self._see(view, grey, counts, place, turn)
+        parts = *_cells(self.side), grey.contiguous(), counts.contiguous(), turn, place
+        here, cosine = torch.empty(2, self.side**2)
+        pixel = torch.empty(self.side**2, dtype=torch.int32)
+        code.see(ctypes.byref(_growing(view, parts, (None,) * 5, (here, cosine, pixel))))
+        return here, cosine, pixel
+
+    def set(self, mean: Tensor, weight: Tensor) -> None:
+        """Replace what pictures showed: mean grey and weight of each cell."""
+        self.mean, self.weight = mean.clone(), weight.clone()
+        self._unseen.rows[:, 0] = 1.0
+        self._write(weight >= LEAST_WEIGHT)
+
+    @property
+    def normals(self) -> Tensor:
+        """Directions of the cells, (cells, 3)."""
+        return _cells(self.side)[0].mT
 
     def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
         """Return the grey at directions (H, W, 3), and where it is unseen, (H, W) bool."""
@@ -93,26 +122,45 @@ class PaintCells:
         grey, unseen = (table.sample(at)[0].reshape(shape) for table in (self.table, self._unseen))
         return grey, unseen > 0.5
 
-    def _add(self, view: BallView, grey: Tensor, counts: Tensor, place_px: Tensor, turn: Tensor) -> None:
+    def _write(self, changed: Tensor) -> None:
+        """Write the tables anew in some cells (cells,) bool."""
+        _, beside, slope_by = _cells(self.side)
+        known = self.weight >= LEAST_WEIGHT
+        differs = torch.where(known[beside], self.mean[beside] - self.mean[:, None], 0.0)
+        rows = torch.cat([self.mean[:, None], (differs[..., None] * slope_by).sum(1)], dim=1)
+        self.table.rows[changed] = rows[changed]
+        self._unseen.rows[changed, 0] = 0.0
+
+    def _see(
+        self, view: BallView, grey: Tensor, counts: Tensor, place_px: Tensor, turn: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Do what the compiled code does."""
-        (directions, beside, slope_by), D, (height, width) = _cells(self.side), view.distance_radii, grey.shape
-        x, y, z = turn @ directions
+        D, (height, width) = view.distance_radii, grey.shape
+        x, y, z = turn @ _cells(self.side)[0]
         cosine = (D * z - 1) / (D * D + 1 - 2 * D * z).sqrt()
-        u, v = place_px.float() @ _terms(x * D / (D - z), y * D / (D - z)).mT
+        u, v = place_px @ _terms(x * D / (D - z), y * D / (D - z)).mT
         shown = (cosine > LEAST_COSINE) & (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
         column, row = (torch.where(shown, part, 0.0).long() for part in (u, v))
         shown &= counts[row, column] & counts[row, column + 1] & counts[row + 1, column] & counts[row + 1, column + 1]
         right, down = u - column, v - row
         upper, lower = (grey[at, column] + right * (grey[at, column + 1] - grey[at, column]) for at in (row, row + 1))
-        weight, here = torch.where(shown, cosine.square(), 0.0), upper + down * (lower - upper)
-        self.weight += weight
-        self.mean += torch.where(shown, weight / self.weight * (here - self.mean), 0.0)
-        known = self.weight >= LEAST_WEIGHT
-        differs = torch.where(known[beside], self.mean[beside] - self.mean[:, None], 0.0)
-        rows, changed = torch.cat([self.mean[:, None], (differs[..., None] * slope_by).sum(1)], dim=1), shown & known
-        self.table.rows[changed] = rows[changed]
-        self._unseen.rows[changed, 0] = 0.0
+        pixel = (v + 0.5).long() * width + (u + 0.5).long()
+        found = upper + down * (lower - upper), cosine, pixel.int()
+        here, cosine, pixel = (torch.where(shown, part, 0) for part in found)
+        return here, cosine, pixel
 
 
-def _addresses(parts: tuple[Tensor, ...]) -> list[int]:
-    return [part.data_ptr() for part in parts]
+def _seen_from(view: BallView, corner: tuple[int, int], R_lab_body: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rotation from the body to the view (3, 3), and the view's polynomial in a part of the picture."""
+    place = view.place_px.clone()
+    place[:, 0] -= torch.tensor(corner)
+    return (view.R_view_lab @ R_lab_body).float().contiguous(), place.float()
+
+
+def _growing(
+    view: BallView, parts: Sequence[Tensor], sums: Sequence[Tensor | None], seen: Sequence[Tensor]
+) -> ctypes.Structure:
+    directions, _, _, grey, *_ = parts
+    sizes, numbers = (directions.shape[1], *grey.shape[::-1]), (view.distance_radii, LEAST_COSINE, LEAST_WEIGHT)
+    addresses = [None if part is None else part.data_ptr() for part in (*parts, *sums, *seen)]
+    return Growing(*sizes, *addresses[: len(parts)], *numbers, *addresses[len(parts) :])

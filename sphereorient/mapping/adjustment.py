@@ -1,0 +1,252 @@
+"""Place, turns, light and paint of a ball from many pictures at once, from near ones: a bundle adjustment.
+
+The paint of each cell of the map is eliminated: it is the weighted mean of what the pictures show there. What one picture
+shows less this mean depends on place and turns alone. Sources: bundle adjustment, Triggs et al. 2000; elimination of
+what enters linearly, Golub and Pereyra 1973.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras import centre_lab_mm
+from sphereorient.errors import PaintError, refusal
+from sphereorient.experiment.recording import UNKNOWN, TextureMap
+from sphereorient.files.threads import Progress, counted, side_by_side, silent
+from sphereorient.mapping.disks import Crops
+from sphereorient.mapping.iterations import BLACK, WHITE
+from sphereorient.mapping.paint_cells import BallView, PaintCells
+from sphereorient.pose.camera_view import FIRST_BLUR_PX
+from sphereorient.sphere.texture import map_directions
+
+LEVELS = 4.0, 2.0, 1.0  # pixels in the disk's middle along a cell, of one adjustment after the other
+MOST_STEPS, NEAR = 12, 0.02  # of each; a step that moves what is seen by less, in cells, is the last
+MOST_CELLS = 256  # along each axis: the pictures of larger balls are blurred for it
+BLUR = 0.4  # cells, of pictures with smaller pixels
+WITHIN = 0.98  # of the radius: pixels that count
+LIGHT_RADII = 0.08  # half side of the neighbourhood over which light is averaged, twice
+LIGHT_ROUNDS, LIGHT_FRAMES = 2, 64  # in each of which it follows from the paint, and of which frames
+BLACKEST = 1e-3  # of the brightest light: the least
+ROBUST = 4.0  # deviations from the paint from which a picture counts less: what hides the ball, glare
+PRIOR = 0.05  # of the radius: error of the place at the start
+HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
+FARTHEST = 0.1  # of the radius, of a step: a place is near
+AT_ONCE = 4096  # cells
+LEAST = 1e-6  # of a weight
+
+Picture = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Adjustment:
+    """What the pictures of a ball in its place have in common."""
+
+    crops: Crops  # as given, at the place found
+    R_lab_body: Tensor  # (N, 3, 3) float64; the first is as given
+    cells: PaintCells  # of paint, in shares of the light
+    light: Sequence[Picture]  # of each camera, in the pixels of its crops
+    left: float  # root mean square of what the pictures differ from the paint
+
+    def texture(self) -> TextureMap:
+        """Return the map, 0 black .. 1 white."""
+        grey, unseen = self.cells.sample(map_directions(self.cells.side))
+        if bool(unseen.all()):
+            raise PaintError(refusal("movies", expected="a ball", got="no picture of it", do="check the movies"))
+        low, high = (float(grey[~unseen].quantile(share)) for share in (BLACK, WHITE))
+        grey = (BLACK + (WHITE - BLACK) * (grey - low) / max(high - low, LEAST)).clamp(0.0, 1.0)
+        return TextureMap(grey=grey.masked_fill(unseen, UNKNOWN), unseen=unseen if bool(unseen.any()) else None)
+
+
+def adjusted(crops: Crops, R_lab_body: Tensor, progress: Progress = silent) -> Adjustment:
+    """Return what all crops of a ball that stays in its place have in common, from near turns (N, 3, 3) and a near
+    place: coarse to fine.
+    """
+    light = [_mean_light(crops, c) for c in range(len(crops.views))]
+    found = Adjustment(crops=crops, R_lab_body=R_lab_body, cells=cells_of(crops), light=light, left=math.inf)
+    for pixels in counted("adjustment", LEVELS, len(LEVELS), progress):
+        found = replace(found, cells=cells_of(crops, pixels))
+        near = NEAR * math.sqrt(4 * math.pi) / found.cells.side  # radii
+        for _ in range(MOST_STEPS):
+            seen = [_seen(found, c) for c in range(len(crops.views))]
+            found = replace(found, light=[_light(found, one, c) for c, one in enumerate(seen)])
+            step, turn, left = _step(found, seen)  # radii, rad
+            crops = replace(crops, position_lab_mm=crops.position_lab_mm + step * crops.radius_mm)
+            found = replace(found, crops=crops, R_lab_body=found.R_lab_body @ so3.exp(turn), left=left)
+            if float(step.norm()) < near and float(turn.norm(dim=1).median()) < near:
+                break
+    grey, weight = _together(found, [_seen(found, c) for c in range(len(crops.views))])
+    found.cells.set(*_mean(grey, weight))
+    return found
+
+
+def cells_of(place: Crops, pixels: float = 1.0) -> PaintCells:
+    """Return an empty map of a ball at its first position, with `pixels` in a disk's middle along a cell."""
+    radius_px = max(float(view.radius_px(place.position_lab_mm[0], place.radius_mm)) for view in place.views)
+    side = 16 * math.ceil(math.sqrt(4 * math.pi) * radius_px / pixels / 16)
+    return PaintCells(min(side, MOST_CELLS), FIRST_BLUR_PX / radius_px)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """What one camera's N pictures show of all cells."""
+
+    grey: Tensor  # (N, cells) float32
+    cosine: Tensor  # (N, cells), of the slant; 0: does not show it
+    pixel: Tensor  # (N, cells) int32, of the crop
+
+    def where(self, rows: Tensor) -> "_Seen":
+        return _Seen(grey=self.grey[rows], cosine=self.cosine[rows], pixel=self.pixel[rows])
+
+    def paint(self, light: Picture) -> Tensor:
+        """Return the grey in shares of the light."""
+        shares: Tensor = self.grey / torch.from_numpy(light).reshape(-1)[self.pixel]
+        return shares
+
+
+def _seen(at: Adjustment, camera: int) -> _Seen:
+    crops, view = at.crops, at.crops.views[camera]
+    ball = BallView.of(view.camera, crops.position_lab_mm[0], crops.radius_mm)
+    counts = torch.from_numpy(_within(crops, camera))
+    blur_px = BLUR * _radius_px(crops, camera) * math.sqrt(4 * math.pi) / at.cells.side
+
+    def one(k: int) -> tuple[Tensor, Tensor, Tensor]:
+        crop = crops.crops[camera][k]
+        if crop is None or not bool(crops.seen[k, camera]):
+            none = torch.zeros(at.cells.side**2)
+            return none, none, none.int()
+        grey = crop.grey.astype(np.float32)
+        grey = cv2.GaussianBlur(grey, (0, 0), blur_px) if blur_px > 1.5 * BLUR else grey
+        return at.cells.see(ball, torch.from_numpy(grey), counts, (crop.left, crop.top), at.R_lab_body[k])
+
+    grey, cosine, pixel = zip(*side_by_side(one, range(len(at.R_lab_body))), strict=True)
+    return _Seen(grey=torch.stack(grey), cosine=torch.stack(cosine), pixel=torch.stack(pixel))
+
+
+def _radius_px(crops: Crops, camera: int) -> float:
+    return float(crops.views[camera].radius_px(crops.position_lab_mm[0], crops.radius_mm))
+
+
+def _within(crops: Crops, camera: int) -> NDArray[np.bool_]:
+    """Return which pixels of a camera's crops show the ball, (H, W)."""
+    view = crops.views[camera]
+    crop = next(crop for crop in crops.crops[camera] if crop is not None)
+    there = tuple(slice(at, at + size) for at, size in zip((crop.top, crop.left), crop.grey.shape, strict=True))
+    y, x = np.mgrid[there]
+    u, v = view.camera.project(crops.position_lab_mm[0]).tolist()
+    within = np.hypot(x - u, y - v) < WITHIN * _radius_px(crops, camera)
+    shown = view.background.shown
+    return within if shown is None else within & shown[there]
+
+
+def _smooth(crops: Crops, camera: int, total: Picture, share: Picture) -> Picture:
+    """Return the local mean of what counts: sums over pixels, by the share that each has."""
+    side = (2 * int(LIGHT_RADII * _radius_px(crops, camera)) + 1,) * 2
+    for _ in range(2):
+        total, share = (cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT) for one in (total, share))
+    level = total / np.maximum(share, LEAST * float(share.max()))
+    lit: Picture = np.maximum(level, max(BLACKEST * float(level.max()), LEAST)).astype(np.float32)
+    return lit
+
+
+def _mean_light(crops: Crops, camera: int) -> Picture:
+    """Return the local mean of all crops: the light, as far as paint averages out."""
+    counts = _within(crops, camera).astype(np.float32)
+    mean = np.mean([crop.grey for crop in crops.crops[camera] if crop is not None], axis=0, dtype=np.float32)
+    return _smooth(crops, camera, mean * counts, counts)
+
+
+def _light(at: Adjustment, seen: _Seen, camera: int) -> Picture:
+    """Return the light under which the paint that all pictures have in common looks like them."""
+    light, count = at.light[camera], len(seen.grey)
+    some = seen.where(torch.linspace(0, count - 1, min(LIGHT_FRAMES, count)).long())
+    weight, where = some.cosine.square(), some.pixel.reshape(-1)
+    for _ in range(LIGHT_ROUNDS):
+        paint = torch.where(some.cosine > 0, _mean(some.paint(light), weight)[0], 0.0)
+        sums = (torch.bincount(where, part.reshape(-1), light.size) for part in (some.grey * paint, paint.square()))
+        light = _smooth(at.crops, camera, *(part.float().reshape(light.shape).numpy() for part in sums))
+    return light
+
+
+def _mean(grey: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return means over all but the cells, (..., cells) to (cells), and their weights."""
+    total = weight.flatten(0, -2).sum(0)
+    return (weight * grey).flatten(0, -2).sum(0) / total.clamp_min(LEAST), total
+
+
+def _together(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor]:
+    """Return grey, in shares of light and of each picture's brightness, and weights of all cameras, (C, N, cells)."""
+    weight = torch.stack([one.cosine for one in seen]).square_()
+    grey = torch.stack([one.paint(light) for one, light in zip(seen, at.light, strict=True)])
+    mean, _ = _mean(grey, weight)
+    bright = (weight * grey) @ mean / (weight @ mean.square()).clamp_min(LEAST)
+    grey /= torch.where(bright > 0, bright, 1.0)[..., None]
+    mean, _ = _mean(grey, weight)
+    squares = (grey - mean).square_()
+    usual = float((weight * squares).sum() / weight.sum())
+    return grey, weight / (1 + squares / max(ROBUST**2 * usual, LEAST**2))
+
+
+def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]:
+    """Return one Gauss-Newton step of the place (3,), radii, and of the turns (N, 3), rad, in the body; and what is left.
+
+    A turn by t moves what is seen in direction n by t x n; a place that moves by d moves it by d less the part of d
+    along the line of sight w that leaves the sphere: d - w (n.d) / (n.w).
+    """
+    crops, R, count = at.crops, at.R_lab_body, len(at.R_lab_body)
+    grey, weight = _together(at, seen)
+    mean, total = _mean(grey, weight)
+    off = grey.sub_(mean)
+    left = float((weight * off.square()).sum() / weight.sum())
+    at.cells.set(mean, total)
+    slopes, normals = at.cells.table.rows[:, 1:], at.cells.normals
+    centres = torch.stack([crops.position_lab_mm[0] - centre_lab_mm(view.camera) for view in crops.views])
+    sight = ((centres / crops.radius_mm)[:, None, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
+    by_turn = torch.zeros(3, count, 3, count, dtype=torch.float64)
+    by_both, by_place = torch.zeros(count, 3, 3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+    force, force_place = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    for part in torch.arange(len(mean)).split(AT_ONCE):
+        s, n = slopes[part], normals[part]
+        q, w, e, whole = torch.linalg.cross(n, s), weight[..., part], off[..., part], total[part].clamp_min(LEAST)
+        along = (sight @ s.mT) / (1 + sight @ n.mT).clamp_max(-LEAST)  # a place's: s less n times it, in the body
+        once, square, twice = w.sum(0), (w * along.square()).sum(0), (w * along).sum(0)
+        rotations = R.float().flatten(1)
+        s_lab, n_lab = ((one.mT @ rotations).reshape(-1, 3, 3) for one in (once, twice))
+        p = ((s_lab @ s[..., None]) - (n_lab @ n[..., None]))[..., 0] / whole[:, None]  # the mean over the pictures
+        scaled = once * whole.rsqrt()
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            product = q[:, i] * q[:, j]
+            by_turn[i, :, j] += torch.diag(once @ product).double() - ((scaled * product) @ scaled.mT).double()
+        own = once @ _outer(q, s) - twice @ _outer(q, n)
+        by_both += own.reshape(count, 3, 3).double() @ R.mT - (once @ _outer(q, p)).reshape(count, 3, 3).double()
+        squares = once @ _outer(s, s) + square @ _outer(n, n) - twice @ (_outer(s, n) + _outer(n, s))
+        by_place += (R @ squares.reshape(count, 3, 3).double() @ R.mT).sum(0) - ((whole * p.mT) @ p).double()
+        force -= ((w * e).sum(0) @ q).double()
+        moved = (w * e).sum(0) @ s - (w * e * along).sum(0) @ n
+        force_place -= (R @ moved[..., None].double()).sum(0)[:, 0]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        by_turn[j, :, i] = by_turn[i, :, j].mT
+    H = torch.zeros(3 * count + 3, 3 * count + 3, dtype=torch.float64)
+    H[:-3, :-3] = by_turn.permute(1, 0, 3, 2).reshape(3 * count, -1)
+    H[:-3, -3:] = by_both.reshape(-1, 3)
+    H[-3:, :-3] = H[:-3, -3:].mT
+    H[-3:, -3:] = by_place + left / PRIOR**2 * torch.eye(3)
+    diagonal = H.diagonal()
+    usual = float(diagonal[:-3].mean())
+    diagonal[:3] += HELD * usual
+    diagonal[:-3] += FREE * usual + LEAST**2
+    x = torch.linalg.solve(H, torch.cat([force.reshape(-1), force_place]))
+    step = x[-3:] * (FARTHEST / max(float(x[-3:].norm()), FARTHEST))
+    return step, x[:-3].reshape(count, 3), math.sqrt(left)
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    """Return outer products of rows, (M, 9)."""
+    return (a[:, :, None] * b[:, None]).flatten(1)
