@@ -1,14 +1,13 @@
 """Place, turns, light and paint of a ball from many pictures at once, from near ones: a bundle adjustment.
 
-The paint of each cell of the map is eliminated: it is the weighted mean of what the pictures show there. What one picture
+The paint of each cell of the map is eliminated: it is the weighted mean of what the pictures show there. What a picture
 shows less this mean depends on place and turns alone. Sources: bundle adjustment, Triggs et al. 2000; elimination of
 what enters linearly, Golub and Pereyra 1973.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -80,7 +79,7 @@ def adjusted(crops: Crops, R_lab_body: Tensor, progress: Progress = silent) -> A
             step, turn, left = _step(found, seen)  # radii, rad
             crops = replace(crops, position_lab_mm=crops.position_lab_mm + step * crops.radius_mm)
             found = replace(found, crops=crops, R_lab_body=found.R_lab_body @ so3.exp(turn), left=left)
-            if float(step.norm()) < near and float(turn.norm(dim=1).median()) < near:
+            if _moved(step, found) < near and float(turn.norm(dim=1).median()) < near:
                 break
     grey, weight = _together(found, [_seen(found, c) for c in range(len(crops.views))])
     found.cells.set(*_mean(grey, weight))
@@ -122,12 +121,15 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
         if crop is None or not bool(crops.seen[k, camera]):
             none = torch.zeros(at.cells.side**2)
             return none, none, none.int()
-        grey = crop.grey.astype(np.float32)
-        grey = cv2.GaussianBlur(grey, (0, 0), blur_px) if blur_px > 1.5 * BLUR else grey
-        return at.cells.see(ball, torch.from_numpy(grey), counts, (crop.left, crop.top), at.R_lab_body[k])
+        grey = torch.from_numpy(_blurred(crop.grey.astype(np.float32), blur_px))
+        return at.cells.see(ball, grey, counts, (crop.left, crop.top), at.R_lab_body[k])
 
     grey, cosine, pixel = zip(*side_by_side(one, range(len(at.R_lab_body))), strict=True)
     return _Seen(grey=torch.stack(grey), cosine=torch.stack(cosine), pixel=torch.stack(pixel))
+
+
+def _blurred(grey: Picture, blur_px: float) -> Picture:
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32) if blur_px > 1.5 * BLUR else grey
 
 
 def _radius_px(crops: Crops, camera: int) -> float:
@@ -141,19 +143,22 @@ def _within(crops: Crops, camera: int) -> NDArray[np.bool_]:
     there = tuple(slice(at, at + size) for at, size in zip((crop.top, crop.left), crop.grey.shape, strict=True))
     y, x = np.mgrid[there]
     u, v = view.camera.project(crops.position_lab_mm[0]).tolist()
-    within = np.hypot(x - u, y - v) < WITHIN * _radius_px(crops, camera)
-    shown = view.background.shown
-    return within if shown is None else within & shown[there]
+    within: NDArray[np.bool_] = np.hypot(x - u, y - v) < WITHIN * _radius_px(crops, camera)
+    if view.background.shown is not None:
+        within &= view.background.shown[there]
+    return within
 
 
 def _smooth(crops: Crops, camera: int, total: Picture, share: Picture) -> Picture:
     """Return the local mean of what counts: sums over pixels, by the share that each has."""
     side = (2 * int(LIGHT_RADII * _radius_px(crops, camera)) + 1,) * 2
     for _ in range(2):
-        total, share = (cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT) for one in (total, share))
+        total, share = (
+            np.asarray(cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT), np.float32)
+            for one in (total, share)
+        )
     level = total / np.maximum(share, LEAST * float(share.max()))
-    lit: Picture = np.maximum(level, max(BLACKEST * float(level.max()), LEAST)).astype(np.float32)
-    return lit
+    return np.asarray(np.maximum(level, max(BLACKEST * float(level.max()), LEAST)), np.float32)
 
 
 def _mean_light(crops: Crops, camera: int) -> Picture:
@@ -194,25 +199,43 @@ def _together(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor]:
     return grey, weight / (1 + squares / max(ROBUST**2 * usual, LEAST**2))
 
 
+def _sights(at: Adjustment) -> Tensor:
+    """Return what the cameras are away from the ball's centre, (C, 3) float64, radii."""
+    centres = torch.stack([centre_lab_mm(view.camera) for view in at.crops.views])
+    return (at.crops.position_lab_mm[0] - centres) / at.crops.radius_mm
+
+
+def _by_place(at: Adjustment) -> Tensor:
+    """Return the metric (3, 3) of steps of the place by what they move: along the line of sight a ball but grows."""
+    sight = _sights(at)
+    square = sight.square().sum(1)[:, None, None]
+    ahead = sight[:, :, None] * sight[:, None] / square
+    return (torch.eye(3) - ahead + ahead / square).sum(0)
+
+
+def _moved(step: Tensor, at: Adjustment) -> float:
+    """Return how far a step of the place moves what is seen, radii."""
+    return math.sqrt(float(step @ _by_place(at) @ step))
+
+
 def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]:
-    """Return one Gauss-Newton step of the place (3,), radii, and of the turns (N, 3), rad, in the body; and what is left.
+    """Return one Gauss-Newton step of the place (3,), radii, and of turns (N, 3), rad, in the body; and what is left.
 
     A turn by t moves what is seen in direction n by t x n; a place that moves by d moves it by d less the part of d
     along the line of sight w that leaves the sphere: d - w (n.d) / (n.w).
     """
-    crops, R, count = at.crops, at.R_lab_body, len(at.R_lab_body)
+    R, count = at.R_lab_body, len(at.R_lab_body)
     grey, weight = _together(at, seen)
     mean, total = _mean(grey, weight)
     off = grey.sub_(mean)
     left = float((weight * off.square()).sum() / weight.sum())
     at.cells.set(mean, total)
     slopes, normals = at.cells.table.rows[:, 1:], at.cells.normals
-    centres = torch.stack([crops.position_lab_mm[0] - centre_lab_mm(view.camera) for view in crops.views])
-    sight = ((centres / crops.radius_mm)[:, None, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
+    sight = (_sights(at)[:, None, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
     by_turn = torch.zeros(3, count, 3, count, dtype=torch.float64)
     by_both, by_place = torch.zeros(count, 3, 3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
     force, force_place = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    for part in torch.arange(len(mean)).split(AT_ONCE):
+    for part in torch.split(torch.arange(len(mean)), AT_ONCE):
         s, n = slopes[part], normals[part]
         q, w, e, whole = torch.linalg.cross(n, s), weight[..., part], off[..., part], total[part].clamp_min(LEAST)
         along = (sight @ s.mT) / (1 + sight @ n.mT).clamp_max(-LEAST)  # a place's: s less n times it, in the body
@@ -237,13 +260,13 @@ def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]
     H[:-3, :-3] = by_turn.permute(1, 0, 3, 2).reshape(3 * count, -1)
     H[:-3, -3:] = by_both.reshape(-1, 3)
     H[-3:, :-3] = H[:-3, -3:].mT
-    H[-3:, -3:] = by_place + left / PRIOR**2 * torch.eye(3)
+    H[-3:, -3:] = by_place + left / PRIOR**2 * _by_place(at)
     diagonal = H.diagonal()
     usual = float(diagonal[:-3].mean())
     diagonal[:3] += HELD * usual
     diagonal[:-3] += FREE * usual + LEAST**2
     x = torch.linalg.solve(H, torch.cat([force.reshape(-1), force_place]))
-    step = x[-3:] * (FARTHEST / max(float(x[-3:].norm()), FARTHEST))
+    step = x[-3:] * (FARTHEST / max(_moved(x[-3:], at), FARTHEST))
     return step, x[:-3].reshape(count, 3), math.sqrt(left)
 
 

@@ -78,6 +78,11 @@ class Crops:
         """Return all cameras' whole pictures of some frames (M,)."""
         return [[self.picture(k, c) for c in range(len(self.views))] for k in frames.tolist()]
 
+    def holding(self, rows: Sequence[Sequence[Crop]], use: Tensor) -> "Crops":
+        """Return a record of a ball in one place with crops of all cameras, N rows, of which (N, C) are used."""
+        X = self.position_lab_mm[:1].expand(len(rows), 3)
+        return replace(self, crops=list(zip(*rows, strict=True)), position_lab_mm=X, seen=use)
+
     def frames_with_ball(self) -> Tensor:
         """Return the frames (M,) int64 in which a camera sees the sphere; raise PaintError if fewer than two."""
         frames = torch.nonzero(self.seen.any(1))[:, 0]

@@ -1,9 +1,8 @@
 """Orientations of a ball in its place, frame by frame, by a map that grows with each: nothing is known before."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import islice
 from typing import Any
 
 import cv2
@@ -13,21 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import centre_lab_mm
 from sphereorient.errors import PaintError, Reason, refusal
-from sphereorient.experiment.recording import UNKNOWN, Recording, TextureMap, spread_frames
-from sphereorient.files.threads import Progress, counted, side_by_side
+from sphereorient.experiment.recording import Recording, TextureMap, spread_frames
+from sphereorient.files.threads import Progress, counted
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
-from sphereorient.mapping.disks import Crops
-from sphereorient.mapping.iterations import BLACK, WHITE, lowest
-from sphereorient.mapping.paint_cells import BallView, PaintCells
+from sphereorient.mapping.adjustment import adjusted, cells_of
+from sphereorient.mapping.disks import Crops, cut_out
+from sphereorient.mapping.paint_cells import BallView
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics
 from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
-from sphereorient.sphere.texture import map_directions
 
 Picture = NDArray[Any]
 GREY = 128.0  # of even pictures: their mean; as the scene about the ball, so that its limb does not show
@@ -36,22 +33,15 @@ WINDOW = 0.35  # half side, radii, of the neighbourhood over which light is take
 EVENER = 0.25  # share of the whole disk's power that is added to that of the neighbourhood
 WITHIN = 0.98  # of the radius: pixels that count
 REACH = 1.2  # of the radius: half side of what is cut out
-CELLS_A_PIXEL = 0.75  # cells of the map along a pixel in the disk's middle
+CELL_PX = 0.75  # of the map, in the disk's middle
 NOISE = 10.0  # grey levels, of even pictures
 LEAST_SCORE = 0.3  # of a picture that the map explains
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
-# First frames by which the ball's place is found, and moves that are tried, shares of its radius, and of its distance
-# from one camera: paint that is seen again tells it. Of smaller moves the passes do not tell what is better.
-PLACES = (60, 0.03), (60, 0.02), (300, 0.02)
-HELD_BYTES = 1 << 28  # of their pictures
 TURNED = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
-MAPPED = 400  # of them, evenly spread, that the map is made of
-LIGHT_RADII = 0.12  # half side of the neighbourhood over which the mean picture is averaged: it is the light
-FARTHEST = 1.5  # of these moves: a step goes so far at most
+MAPPED = 150  # of them, evenly spread, that place and map are adjusted by
 LEAST_FOUND = 0.5  # share of the frames
-LOST = 1.5  # what a frame without a pose counts there; one that is explained counts what is left of its power
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
 
 
@@ -73,24 +63,12 @@ class EvenLight:
         self._within = within.astype(np.float32)
         self._window = (2 * int(WINDOW * radius_px) + 1,) * 2
         self._share = 1 / np.maximum(self._mean(self._within), 1e-3)
-        self._number, self._radius_px = float(self._within.sum()), radius_px
+        self._number = float(self._within.sum())
 
     def _mean(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
         for _ in range(2):  # nearly a Gaussian
             picture = np.asarray(cv2.boxFilter(picture, -1, self._window, borderType=cv2.BORDER_CONSTANT), np.float32)
         return picture
-
-    def part(self, picture: Picture) -> Picture:
-        """Return what is cut out of a picture (H, W)."""
-        return picture[self._there].copy()
-
-    def smooth(self, part: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the local mean of a part over what counts, 1 at least."""
-        side = (2 * int(LIGHT_RADII * self._radius_px) + 1,) * 2
-        parts = part * self._within, self._within
-        total, share = (cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT) for one in parts)
-        level: NDArray[np.float32] = np.maximum(total / np.maximum(share, 1e-3), 1.0)
-        return level
 
     def __call__(self, picture: Picture) -> NDArray[np.float32]:
         """Return what is cut out of a picture (H, W), even."""
@@ -116,8 +94,7 @@ class FirstPass:
         self._X, self._even = X, [EvenLight(view, X, radius_mm) for view in place.views]
         self._views = [BallView.of(view.camera, X, radius_mm) for view in place.views]
         diameter_px = 2 * max(float(view.radius_px(X, radius_mm)) for view in place.views)
-        side = 16 * math.ceil(math.sqrt(4 * math.pi) * diameter_px / 2 / CELLS_A_PIXEL / 16)
-        self.cells = PaintCells(side, 2 * FIRST_BLUR_PX / diameter_px)
+        self.cells = cells_of(place, CELL_PX)
         noise = torch.tensor([[NOISE**2, 0.0, 0.0, 0.0]] * len(place.views))
         self._fitter = Fitter(
             views=[replace(view, background=_even_scene(view), response=None) for view in place.views],
@@ -154,32 +131,6 @@ class FirstPass:
         self._rate, self._before = rate, (time_s, R)
         self._grow(even, use, R)
         return poses_of(fit, slice(0, 1), use, reason)
-
-    def parts(self, shots: Sequence[Frame], use: Tensor) -> list[Picture | None]:
-        """Return what is cut out of each picture in use."""
-        return [
-            light.part(shot.picture) if seen else None
-            for light, shot, seen in zip(self._even, shots, use.tolist(), strict=True)
-        ]
-
-    def map_of(self, pictures: Sequence[tuple[Tensor, Sequence[Picture | None]]]) -> TextureMap:
-        """Return the map (H, 2 H), 0 black .. 1 white, of the `parts` of pictures at orientations (3, 3), without the
-        light: what these have in common.
-        """
-        cells = PaintCells(self.cells.side, self.cells.table.blur_rad)
-        for c, (view, light) in enumerate(zip(self._views, self._even, strict=True)):
-            seen = [(R, part) for R, row in pictures if (part := row[c]) is not None]
-            if not seen:
-                continue
-            level = light.smooth(np.mean([part for _, part in seen], axis=0, dtype=np.float32))
-            for R, part in seen:
-                flat = torch.from_numpy(np.asarray(part / level, np.float32))
-                cells.add(view, flat, light.counts, (light.left, light.top), R)
-        direction = map_directions(16 * math.ceil(cells.side / 16))
-        grey, unseen = cells.sample(direction)
-        low, high = (float(grey[~unseen].quantile(share)) for share in (BLACK, WHITE))
-        grey = (BLACK + (WHITE - BLACK) * (grey - low) / max(high - low, 1e-6)).clamp(0.0, 1.0)
-        return TextureMap(grey=grey.masked_fill(unseen, UNKNOWN), unseen=unseen if bool(unseen.any()) else None)
 
     def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor) -> None:
         for view, light, one, seen in zip(self._views, self._even, even, use.tolist(), strict=True):
@@ -230,62 +181,33 @@ def _mean_score(fit: FittedPoses, use: Tensor) -> Tensor:
     return score
 
 
-def better_place(place: Crops, time_s: Sequence[float], shots: Sequence[Sequence[Frame]], share: float) -> Crops:
-    """Return the place, near the given one, at which a map that grows by some frames explains them best: of a ball that
-    is too large by one part in a hundred all turns are too small by that, and the paint does not meet itself again.
-    `share`: of the radius, by which it is moved to either side.
-    """
-    camera, one = place.views[0].camera, len(place.views) == 1
-    sight, step_mm = place.position_lab_mm[0] - centre_lab_mm(camera), share * place.radius_mm
-    along = share * sight if one else step_mm * sight / sight.norm()
-    moves = torch.stack([step_mm * camera.R_cam_lab[0], step_mm * camera.R_cam_lab[1], along])
-
-    def left(at: Tensor) -> float:
-        follower = FirstPass(replace(place, position_lab_mm=at[None]))
-        found = [follower.next(t, row) for t, row in zip(time_s, shots, strict=True)]
-        return float(np.mean([1 - float(one.score[0, one.use].mean()) if supported(one) else LOST for one in found]))
-
-    X = place.position_lab_mm[0]
-    here, *beside = side_by_side(left, [X, *(X + sign * move for move in moves for sign in (-1, 1))])
-    steps = [lowest(before, here, after, FARTHEST) for before, after in zip(beside[::2], beside[1::2], strict=True)]
-    return replace(place, position_lab_mm=(X + torch.tensor(steps, dtype=X.dtype) @ moves)[None])
-
-
 def first_pass_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
-    """Return the map of a ball at a place, see `fixed_place`, from the first frames of its movies; the body frame is
+    """Return the map of a ball near a place, see `fixed_place`, from the first frames of its movies; the body frame is
     the lab at the first frame that shows it.
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
     """
     count = min(MOST_FRAMES, len(recording.timeline))
-    time_s = recording.timeline.time_s[:count].tolist()
-
-    def shots() -> Iterator[tuple[Frame, ...]]:
-        pairs = zip(recording.streams, place.views, strict=True)
-        return zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
-
-    progress("place", 0, 1)
-    held = HELD_BYTES // sum(math.prod(view.camera.image_size) for view in place.views)
-    for most, share in PLACES:
-        begin = list(islice(shots(), min(most, max(held, PLACES[0][0]))))
-        place = better_place(place, time_s[: len(begin)], begin, share)
-    progress("place", 1, 1)
-    follower, kept = FirstPass(place), set(spread_frames(range(count), MAPPED))
-    pictures: list[tuple[Tensor, Sequence[Picture | None]]] = []
+    kept = set(spread_frames(range(count), MAPPED))
+    pairs = zip(recording.streams, place.views, strict=True)
+    shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
+    follower, crops, turns, used = FirstPass(place), [], [], []
     first: Tensor | None = None
     turned, found = 0.0, 0
-    for k, row in enumerate(counted("first pass", shots(), count, progress)):
-        poses = follower.next(time_s[k], row)
+    for k, row in enumerate(counted("first pass", shots, count, progress)):
+        poses = follower.next(float(recording.timeline.time_s[k]), row)
         if not supported(poses):
             continue
         R = poses.R_lab_body[0]
         first = R if first is None else first
         found, turned = found + 1, max(turned, float(so3.geodesic_distance(first, R)))
-        if k in kept:
-            pictures.append((R, follower.parts(row, poses.use)))
+        if k in kept or found == 1:
+            crops.append(cut_out(place, [shot.picture for shot in row]))
+            turns.append(R)
+            used.append(poses.use)
     if turned < TURNED:
         got, do = f"{math.degrees(turned):.2g} degrees in all frames together", "use a movie in which the ball turns"
         raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
     if found < LEAST_FOUND * count:
         got, do = f"{found} of {count} frames that a growing map explains", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
-    return follower.map_of(pictures)
+    return adjusted(place.holding(crops, torch.stack(used)), torch.stack(turns), progress).texture()
