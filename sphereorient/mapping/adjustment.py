@@ -28,7 +28,8 @@ from sphereorient.sphere.texture import map_directions
 
 LEVELS = 4.0, 2.0, 1.0  # pixels in the disk's middle along a cell, of one adjustment after the other
 MOST_STEPS, NEAR = 12, 0.02  # of each; a step that moves what is seen by less, in cells, is the last
-MOST_CELLS = 256  # along each axis: the pictures of larger balls are blurred for it
+PAINT_PX = 0.5  # the same of the map at the end
+MOST_CELLS = 320  # along each axis: the pictures of larger balls are blurred for it
 BLUR = 0.4  # cells, of pictures with smaller pixels
 WITHIN = 0.98  # of the radius: pixels that count
 LIGHT_RADII = 0.08  # half side of the neighbourhood over which light is averaged, twice
@@ -81,6 +82,7 @@ def adjusted(crops: Crops, R_lab_body: Tensor, progress: Progress = silent) -> A
             found = replace(found, crops=crops, R_lab_body=found.R_lab_body @ so3.exp(turn), left=left)
             if _moved(step, found) < near and float(turn.norm(dim=1).median()) < near:
                 break
+    found = replace(found, cells=cells_of(crops, PAINT_PX))
     grey, weight = _together(found, [_seen(found, c) for c in range(len(crops.views))])
     found.cells.set(*_mean(grey, weight))
     return found
