@@ -90,19 +90,17 @@ def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path |
         return path
     from sphereorient.files.whole_file import writing
     from sphereorient.methods.map import first_map_of
-    from sphereorient.report.texture_map import write_seen, write_texture
+    from sphereorient.report.texture_map import write_map
     from sphereorient.sphere import unseen_share
 
     target = experiment.new_map_path()
     check_writable(target)
     with progress_bar(given.quiet) as advance:
         found = first_map_of(experiment, settings, given.names, advance)
-    unseen = found.grey.isnan() if found.unseen is None else found.unseen  # none is
     with writing(force=False):
-        write_texture(found.grey, target)
-        write_seen((~unseen).int(), target)
+        write_map(found, target)
     if not given.quiet:
-        share = 100 * (1 - unseen_share(unseen))
+        share = 100 if found.unseen is None else 100 * (1 - unseen_share(found.unseen))
         about = f"{share:.0f} % of the ball, by the first frames; its axes are the lab's at the first of them"
         typer.echo(f"note: no map: wrote {target}, {about}; `sphereorient map` learns a finer one.")
         if experiment.texture_path is None:
@@ -190,7 +188,7 @@ def live(given: _LiveOptions) -> None:
     """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
 
     The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a
-    ball that stays in its place is learnt meanwhile; orientations are relative until it is known.
+    ball that stays in its place is learnt meanwhile, from the first frame on.
     """
     from sphereorient.live.live import TrackBlocks
     from sphereorient.live.loop import open_live, run_live

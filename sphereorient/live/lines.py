@@ -125,8 +125,8 @@ class JsonLines:
 
 
 def _states_errors(now: Measured) -> bool:
-    """Return whether there is a pose with errors of its own: not a relative one."""
-    return now.map_number > 0 and bool(np.isfinite(now.covariance).all())
+    """Return whether there is a pose with errors."""
+    return bool(np.isfinite(now.covariance).all())
 
 
 @dataclass(frozen=True, eq=False)

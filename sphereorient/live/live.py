@@ -36,7 +36,7 @@ class OnlineTracker:
     `tracker` has one chunk at a time (setting `refine.chunks`). Memory does not grow.
     """
 
-    number = 1  # of the map in use; 0: none yet
+    number = 1  # of the map in use
 
     def __init__(self, tracker: BallTracker, appearance: Appearance) -> None:
         self.appearance = appearance
@@ -97,8 +97,8 @@ class Measured:
     covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm)
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
     poses: Poses  # all that the fit says
-    map_number: int  # of the map that it was measured with; 0: none, the orientation is relative
-    flags: int  # bits of `Flag` that its fit has; 0 without a map
+    map_number: int  # of the map that it was measured with
+    flags: int  # bits of `Flag` that its fit has
     found: bool  # whether it was searched for: the first one, found again, or not where it was expected
     dropped: int  # frames since the one before that came too late
     latency_s: float  # from the picture's arrival to here
@@ -117,7 +117,7 @@ class Measured:
 class LiveTracker(Protocol):
     """Follows a ball frame by frame."""
 
-    number: int  # of the map in use; 0: none, orientations are relative to the first
+    number: int  # of the map in use
     appearance: Appearance
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
@@ -160,7 +160,7 @@ def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: Li
         reason=poses.reason,
         poses=poses,
         map_number=tracker.number,
-        flags=_flags(poses, tracker.appearance) if there and tracker.number else 0,
+        flags=_flags(poses, tracker.appearance) if there else 0,
         found=found and there,
         dropped=dropped,
         latency_s=time.perf_counter() - arrival.arrived_s,

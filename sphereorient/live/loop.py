@@ -65,26 +65,19 @@ def _learning(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, path: Path
 ) -> Iterator[LiveSetUp]:
     # Import late: with a map nothing is learnt.
-    from sphereorient.live.learning import LearningTracker, MapLearner
+    from sphereorient.live.learning import LearningTracker, process_aside
     from sphereorient.mapping.disks import fixed_place
-    from sphereorient.report.texture_map import write_seen, write_texture
+    from sphereorient.report.texture_map import write_map
 
-    with open_recording(experiment, cameras, textured=False) as recording, one_thread():
+    with process_aside() as aside, open_recording(experiment, cameras, textured=False) as recording, one_thread():
+        tracker = LearningTracker(fixed_place(recording, settings.paint, settings.locate), aside)
 
         def save() -> str:
-            texture, seen = learner.paint()
             with writing(force=True):  # that of before, by this run
-                write_texture(texture, path)
-                write_seen(seen, path)
+                write_map(tracker.texture(), path)
             return f"Wrote {path}"
 
-        learner = MapLearner()  # its process begins while the ball is looked for
-        try:
-            place = fixed_place(recording, settings.paint, settings.locate)
-            learner.begin(place, settings.paint)
-            yield LiveSetUp(recording=recording, tracker=LearningTracker(place, settings, learner), save_map=save)
-        finally:
-            learner.close()
+        yield LiveSetUp(recording=recording, tracker=tracker, save_map=save)
 
 
 def run_live(
@@ -94,7 +87,7 @@ def run_live(
     takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines.
     """
     recording, tracker = opened.recording, opened.tracker
-    views, number = tracker.appearance.fitter.views, tracker.number
+    views = tracker.appearance.fitter.views
     table, json_lines = FicTracLines(views[0].camera.R_cam_lab.numpy()), JsonLines(recording.experiment.fixed)
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
@@ -111,9 +104,6 @@ def run_live(
                 for output, form in outputs:
                     output.send(getattr(told, form))
                 monitor.saw(now, None if page is None else told.columns)
-                if number == 0 < now.map_number:
-                    number = now.map_number
-                    tell(f"frame {now.number}: orientations are by the map from here on")
     finally:
         feed.close()
     return monitor

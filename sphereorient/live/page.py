@@ -171,7 +171,6 @@ class LivePage:
             "frame": now.number,
             "time_s": now.time_s,
             "valid": now.valid,
-            "map_number": now.map_number,
             "reason": [str(why) for why in now.reason],
             "error_deg": without_nan(float(np.degrees(now.error_rad))),
             "latency": {"counts": counts.tolist(), "last_ms": float(edges[-1]), "median_ms": middle, "p99_ms": slow},

@@ -51,13 +51,15 @@ class Adjustment:
 
     crops: Crops  # as given, at the place found
     R_lab_body: Tensor  # (N, 3, 3) float64; the first is as given
-    cells: PaintCells  # of paint, in shares of the light
+    cells: PaintCells  # in which it was found, of paint in shares of the light
     light: Sequence[Picture]  # of each camera, in the pixels of its crops
     left: float  # root mean square of what the pictures differ from the paint
 
     def texture(self) -> TextureMap:
         """Return the map, 0 black .. 1 white."""
-        grey, unseen = self.cells.sample(map_directions(self.cells.side))
+        fine = replace(self, cells=cells_of(self.crops, PAINT_PX))
+        fine.cells.set(*_mean(*_together(fine, [_seen(fine, c) for c in range(len(self.crops.views))])))
+        grey, unseen = fine.cells.sample(map_directions(fine.cells.side))
         if bool(unseen.all()):
             raise PaintError(refusal("movies", expected="a ball", got="no picture of it", do="check the movies"))
         low, high = (float(grey[~unseen].quantile(share)) for share in (BLACK, WHITE))
@@ -82,9 +84,6 @@ def adjusted(crops: Crops, R_lab_body: Tensor, progress: Progress = silent) -> A
             found = replace(found, crops=crops, R_lab_body=found.R_lab_body @ so3.exp(turn), left=left)
             if _moved(step, found) < near and float(turn.norm(dim=1).median()) < near:
                 break
-    found = replace(found, cells=cells_of(crops, PAINT_PX))
-    grey, weight = _together(found, [_seen(found, c) for c in range(len(crops.views))])
-    found.cells.set(*_mean(grey, weight))
     return found
 
 
@@ -201,15 +200,17 @@ def _together(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor]:
     return grey, weight / (1 + squares / max(ROBUST**2 * usual, LEAST**2))
 
 
-def _sights(at: Adjustment) -> Tensor:
-    """Return what the cameras are away from the ball's centre, (C, 3) float64, radii."""
-    centres = torch.stack([centre_lab_mm(view.camera) for view in at.crops.views])
-    return (at.crops.position_lab_mm[0] - centres) / at.crops.radius_mm
+def sights(place: Crops) -> Tensor:
+    """Return the lines of sight from all cameras to a ball's first position, (C, 3) float64, radii, lab."""
+    centres = torch.stack([centre_lab_mm(view.camera) for view in place.views])
+    return (place.position_lab_mm[0] - centres) / place.radius_mm
 
 
-def _by_place(at: Adjustment) -> Tensor:
-    """Return the metric (3, 3) of steps of the place by what they move: along the line of sight a ball but grows."""
-    sight = _sights(at)
+def place_metric(place: Crops) -> Tensor:
+    """Return the metric (3, 3) of moves of a ball's place, by what they move in pictures, 1/radii^2 of each camera:
+    along a line of sight a ball but grows.
+    """
+    sight = sights(place)
     square = sight.square().sum(1)[:, None, None]
     ahead = sight[:, :, None] * sight[:, None] / square
     return (torch.eye(3) - ahead + ahead / square).sum(0)
@@ -217,7 +218,7 @@ def _by_place(at: Adjustment) -> Tensor:
 
 def _moved(step: Tensor, at: Adjustment) -> float:
     """Return how far a step of the place moves what is seen, radii."""
-    return math.sqrt(float(step @ _by_place(at) @ step))
+    return math.sqrt(float(step @ place_metric(at.crops) @ step))
 
 
 def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]:
@@ -233,7 +234,7 @@ def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]
     left = float((weight * off.square()).sum() / weight.sum())
     at.cells.set(mean, total)
     slopes, normals = at.cells.table.rows[:, 1:], at.cells.normals
-    sight = (_sights(at)[:, None, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
+    sight = (sights(at.crops)[:, None, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
     by_turn = torch.zeros(3, count, 3, count, dtype=torch.float64)
     by_both, by_place = torch.zeros(count, 3, 3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
     force, force_place = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
@@ -262,7 +263,7 @@ def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]
     H[:-3, :-3] = by_turn.permute(1, 0, 3, 2).reshape(3 * count, -1)
     H[:-3, -3:] = by_both.reshape(-1, 3)
     H[-3:, :-3] = H[:-3, -3:].mT
-    H[-3:, -3:] = by_place + left / PRIOR**2 * _by_place(at)
+    H[-3:, -3:] = by_place + left / PRIOR**2 * place_metric(at.crops)
     diagonal = H.diagonal()
     usual = float(diagonal[:-3].mean())
     diagonal[:3] += HELD * usual

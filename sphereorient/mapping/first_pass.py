@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -13,12 +14,12 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, Reason, refusal
-from sphereorient.experiment.recording import Recording, TextureMap, spread_frames
-from sphereorient.files.threads import Progress, counted
+from sphereorient.experiment.recording import Recording, TextureMap
+from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
-from sphereorient.mapping.adjustment import adjusted, cells_of
-from sphereorient.mapping.disks import Crops, cut_out
+from sphereorient.mapping.adjustment import Adjustment, adjusted, cells_of, place_metric
+from sphereorient.mapping.disks import Crop, Crops, cut_out, evenly_spread
 from sphereorient.mapping.paint_cells import BallView
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics
 from sphereorient.pose.fit import NEAR_RAD
@@ -36,11 +37,16 @@ REACH = 1.2  # of the radius: half side of what is cut out
 CELL_PX = 0.75  # of the map, in the disk's middle
 NOISE = 10.0  # grey levels, of even pictures
 LEAST_SCORE = 0.3  # of a picture that the map explains
+USUAL_OF = 200  # frames that tell the usual score
+SURE_SHARE = 0.7  # of it, where the ball is searched for over all orientations: the best of many wrong ones is less
+OUTLINE_ERROR, ADJUSTED_ERROR = 0.01, 5e-4  # of the place, radii in pictures: by an outline, by all pictures
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
-TURNED = math.radians(20.0)  # the ball turns by more
+WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried where it is none of these
+TURNED_RAD = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
-MAPPED = 150  # of them, evenly spread, that place and map are adjusted by
+MAPPED = 100  # of them that place and map are adjusted by, twice as many at most
+APART_RAD = 0.025  # turn from one of these to the next, at least
 LEAST_FOUND = 0.5  # share of the frames
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
 
@@ -89,8 +95,10 @@ class EvenLight:
 class FirstPass:
     """Follows a ball in its place by the map of the frames before: the body frame is the lab at the first one."""
 
-    def __init__(self, place: Crops) -> None:
+    def __init__(self, place: Crops, error: float = OUTLINE_ERROR) -> None:
+        """`place`: a record of crops with the place as first position; `error`: of it, radii in pictures."""
         X, radius_mm = place.position_lab_mm[0], place.radius_mm
+        self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
         self._X, self._even = X, [EvenLight(view, X, radius_mm) for view in place.views]
         self._views = [BallView.of(view.camera, X, radius_mm) for view in place.views]
         diameter_px = 2 * max(float(view.radius_px(X, radius_mm)) for view in place.views)
@@ -104,53 +112,93 @@ class FirstPass:
             widest_px=diameter_px / 2,
         )
         self._precision = HELD / radius_mm**2 * torch.eye(3, dtype=torch.float64)
-        self._grid = so3.local_grid(math.radians(STEP_DEG), math.radians(REACH_DEG))
+        self._near = so3.local_grid(math.radians(STEP_DEG), math.radians(REACH_DEG))
         self._before: tuple[float, Tensor] | None = None  # time, s, and R_lab_body (3, 3)
         self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)  # rad/s, and its last change
+        self._lost = 0  # frames that are not explained, in a row
+        self._usual, self._count = 0.0, 1  # score of frames that are, and their number
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> Poses:
-        """Return the pose of the frame of a time, none where the map does not explain it; the map grows by it."""
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the pose of the frame of a time, none where the map does not explain it, and whether it was searched
+        for; the map grows by it.
+        """
         use = torch.tensor([shot.usable for shot in shots])
         reason = [shot.reason for shot in shots]
         if not bool(use.any()):
-            return no_pose(len(shots), reason)
+            return no_pose(len(shots), reason), False
         even = [light(shot.picture) for light, shot in zip(self._even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
             self._grow(even, use, R)  # the map is this frame
             self._before = time_s, R
-            return poses_of(self._settled([even], R[None], use), slice(0, 1), use, reason)
+            return self._told(self._settled([even], R[None], use), use, reason), True
         step_s, before = time_s - self._before[0], self._before[1]
-        fit = self._fitted(max(step_s, 0.0), before, even, use)
+        fit, searched = self._fitted(max(step_s, 0.0), before, even, use)
         if fit is None:
-            self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)
-            return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason], use)
+            self._lost, self._rate, self._change = self._lost + 1, *torch.zeros(2, 3, dtype=torch.float64)
+            why = [Reason.LOW_SCORE if one is Reason.OK else one for one in reason]
+            return no_pose(len(shots), why, use), True
         R = fit.R_lab_body[0]
         rate = so3.log(R @ before.mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
+        rate = rate * (not searched)
         self._change = rate - self._rate if bool(self._rate.any()) else self._change
-        self._rate, self._before = rate, (time_s, R)
+        self._rate, self._before, self._lost = rate, (time_s, R), 0
+        score = float(_mean_score(fit, use)) / int(use.sum())
+        self._usual += (score - self._usual) / min(self._count, USUAL_OF)
+        self._count += 1
         self._grow(even, use, R)
-        return poses_of(fit, slice(0, 1), use, reason)
+        return self._told(fit, use, reason), searched
+
+    def _told(self, fit: FittedPoses, use: Tensor, reason: Sequence[Reason]) -> Poses:
+        poses = poses_of(fit, slice(0, 1), use, reason)
+        poses.covariance[:, 3:, 3:] = self._place_covariance
+        return poses
+
+    def shown(self, crops: Crops, R_lab_body: Tensor) -> "FirstPass":
+        """Return this pass after its map has grown by crops (N) at known orientations (N, 3, 3)."""
+        for k, use in enumerate(crops.seen):
+            pictures = crops.pictures(torch.tensor([k]))[0]
+            self._grow([light(one) for light, one in zip(self._even, pictures, strict=True)], use, R_lab_body[k])
+        return self
+
+    def follow(self, before: "FirstPass", correction: Tensor) -> None:
+        """Go on where another pass is, with its orientation times a correction (3, 3), in the lab."""
+        assert before._before is not None
+        self._before = before._before[0], correction @ before._before[1]
+        self._rate, self._change, self._lost = before._rate, before._change, before._lost
+        self._usual, self._count = before._usual, before._count
 
     def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor) -> None:
         for view, light, one, seen in zip(self._views, self._even, even, use.tolist(), strict=True):
             if seen:
                 self.cells.add(view, torch.from_numpy(one), light.counts, (light.left, light.top), R_lab_body)
 
-    def _fitted(self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], use: Tensor) -> FittedPoses | None:
-        """Fit near the expected orientation, else near any within reach; None: the map explains the frame nowhere."""
+    def _fitted(
+        self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], use: Tensor
+    ) -> tuple[FittedPoses | None, bool]:
+        """Fit near the expected orientation, else near any within reach, or any at all; return also whether the frame
+        was searched for. None: the map explains it nowhere.
+        """
         expected = so3.exp(step_s * (self._rate + LEAST_CHANGE * self._change)) @ R
         fit = self._settled([even], expected[None], use)
         if bool(self._explained(fit, use)[0]):
-            return fit
-        frames, begin = self._start([even], self._grid @ R, use)
-        level, count = self._fitter.optics.fine, len(self._grid)
+            return fit, False
+        fit = self._searched(even, use, self._near @ R)
+        if not bool(self._explained(fit, use)[0]) and self._lost & (self._lost - 1) == 0:  # frames 0, 1, 2, 4, 8 ..
+            fit = self._searched(even, use, so3.lattman_grid(math.radians(WHOLE_STEP_DEG)))
+            if float(_mean_score(fit, use)) < SURE_SHARE * self._usual * int(use.sum()):
+                return None, True
+        return (fit if bool(self._explained(fit, use)[0]) else None), True
+
+    def _searched(self, even: Sequence[NDArray[np.float32]], use: Tensor, R: Tensor) -> FittedPoses:
+        """Return the best fit near any of many orientations (M, 3, 3)."""
+        frames, begin = self._start([even], R, use)
+        level = self._fitter.optics.fine
         one = self._fitter.pixels(frames, self._X[None], level).thinned(TRIED_EVERY)
-        tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(count)), begin, level, TRIED_STEPS)
+        tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(len(R))), begin, level, TRIED_STEPS)
         best = _mean_score(tried, use).topk(TRIED_BEST).indices
         fit = self._settled([even] * TRIED_BEST, tried.R_lab_body[best], use)
-        rows = _mean_score(fit, use).argmax()[None]
-        return fit.of(rows) if bool(self._explained(fit, use)[rows]) else None
+        return fit.of(_mean_score(fit, use).argmax()[None])
 
     def _start(
         self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor
@@ -181,33 +229,92 @@ def _mean_score(fit: FittedPoses, use: Tensor) -> Tensor:
     return score
 
 
+@dataclass(eq=False)
+class _Kept:
+    crops: list[Crop]  # of each camera
+    use: Tensor  # (C,) bool
+    R_lab_body: Tensor  # (3, 3)
+
+
+class KeptFrames:
+    """The frames that place and map are adjusted by: apart by a turn that doubles whenever there are too many."""
+
+    def __init__(self, place: Crops) -> None:
+        self.count = 0  # of frames that were kept, those thinned out included
+        self._place, self._apart_rad = place, APART_RAD
+        self._rows: list[_Kept] = []
+
+    @property
+    def turned_rad(self) -> float:
+        """The largest turn from the first frame to another."""
+        turns = [so3.geodesic_distance(self._rows[0].R_lab_body, one.R_lab_body) for one in self._rows]
+        return max(map(float, turns), default=0.0)
+
+    def add(self, shots: Sequence[Frame], poses: Poses) -> None:
+        """Keep a frame with a pose where the ball has turned since the last one that was kept."""
+        R = poses.R_lab_body[0]
+        if self._rows and float(so3.geodesic_distance(self._rows[-1].R_lab_body, R)) < self._apart_rad:
+            return
+        self.count += 1
+        self._rows.append(_Kept(cut_out(self._place, [shot.picture for shot in shots]), poses.use, R))
+        if len(self._rows) == 2 * MAPPED:
+            self._rows, self._apart_rad = self._rows[::2], 2 * self._apart_rad
+
+    def so_far(self) -> "KeptFrames":
+        """Return a record of the same frames, to which no other ones come."""
+        same = copy(self)
+        same._rows = list(self._rows)
+        return same
+
+    def corrected(self, done: "KeptFrames", R_lab_body: Tensor) -> tuple[Tensor, "KeptFrames"]:
+        """Take orientations (N, 3, 3) from an adjustment of the frames of some time ago, and turn later ones alike.
+        Return that turn (3, 3), in the lab, and the later frames.
+        """
+        turn = R_lab_body[-1] @ done._rows[-1].R_lab_body.mT
+        since, before = self.so_far(), set(map(id, done._rows))
+        since._rows = [one for one in self._rows if id(one) not in before]
+        for one in since._rows:
+            one.R_lab_body = turn @ one.R_lab_body
+        for one, R in zip(done._rows, R_lab_body, strict=True):
+            one.R_lab_body = R
+        return turn, since
+
+    def adjusted(self, progress: Progress = silent) -> Adjustment:
+        """Return what the frames have in common.
+        Raises PaintError: the ball has not turned.
+        """
+        if self.turned_rad < TURNED_RAD:
+            got = f"{math.degrees(self.turned_rad):.2g} degrees in all frames together"
+            do = "use a movie in which the ball turns"
+            raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
+        return adjusted(*self.crops(), progress)
+
+    def crops(self, most: int = 2 * MAPPED) -> tuple[Crops, Tensor]:
+        """Return the frames, evenly spread if there are more, and their orientations (N, 3, 3)."""
+        some = evenly_spread(torch.arange(len(self._rows)), most).tolist() if self._rows else []
+        use = torch.zeros(len(some), len(self._place.views), dtype=torch.bool)
+        R = torch.zeros(len(some), 3, 3, dtype=torch.float64)
+        for n, k in enumerate(some):
+            use[n], R[n] = self._rows[k].use, self._rows[k].R_lab_body
+        return self._place.holding([self._rows[k].crops for k in some], use), R
+
+
 def first_pass_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
     """Return the map of a ball near a place, see `fixed_place`, from the first frames of its movies; the body frame is
     the lab at the first frame that shows it.
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
     """
     count = min(MOST_FRAMES, len(recording.timeline))
-    kept = set(spread_frames(range(count), MAPPED))
     pairs = zip(recording.streams, place.views, strict=True)
     shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
-    follower, crops, turns, used = FirstPass(place), [], [], []
-    first: Tensor | None = None
-    turned, found = 0.0, 0
+    follower, kept, found = FirstPass(place), KeptFrames(place), 0
     for k, row in enumerate(counted("first pass", shots, count, progress)):
-        poses = follower.next(float(recording.timeline.time_s[k]), row)
-        if not supported(poses):
-            continue
-        R = poses.R_lab_body[0]
-        first = R if first is None else first
-        found, turned = found + 1, max(turned, float(so3.geodesic_distance(first, R)))
-        if k in kept or found == 1:
-            crops.append(cut_out(place, [shot.picture for shot in row]))
-            turns.append(R)
-            used.append(poses.use)
-    if turned < TURNED:
-        got, do = f"{math.degrees(turned):.2g} degrees in all frames together", "use a movie in which the ball turns"
-        raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
+        poses, _ = follower.next(float(recording.timeline.time_s[k]), row)
+        if supported(poses):
+            kept.add(row, poses)
+            found += 1
+    adjustment = kept.adjusted(progress)
     if found < LEAST_FOUND * count:
         got, do = f"{found} of {count} frames that a growing map explains", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
-    return adjusted(place.holding(crops, torch.stack(used)), torch.stack(turns), progress).texture()
+    return adjustment.texture()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, diags, vstack
+from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from sphereorient import so3
@@ -29,7 +29,7 @@ from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart
 from sphereorient.pose.residuals import noise_curves
 from sphereorient.sphere.compare import fit_levels
 from sphereorient.sphere.texture import map_directions, texel_areas
-from sphereorient.sphere.texture_table import SIDE, TextureTable, texture_table
+from sphereorient.sphere.texture_table import SIDE, texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
@@ -157,13 +157,6 @@ def first_state(
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
     """Improve orientations, light and map once; k counts the iterations from 0."""
-    *_, found = iterating(state, settings, k)
-    assert found is not None
-    return found
-
-
-def iterating(state: State, settings: MapSettings, k: int) -> Iterator[tuple[State, Iteration] | None]:
-    """Yield what `iterate` returns, after pauses (None) in which something else may be computed."""
     before = state.R_lab_body
     smoothest = SMOOTHEST * 0.5**k
     if k < SEPARATE_ITERATIONS:
@@ -172,18 +165,15 @@ def iterating(state: State, settings: MapSettings, k: int) -> Iterator[tuple[Sta
         state = _with_light(state)
     elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and not state.fitter.light.linear):
         state = _lit_in_the_lab(state)
-    yield None
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smoothest)
-        yield None
     state, chi2 = with_map(state, smoothest)
     if k < LIGHT_ITERATIONS + LAB_ITERATIONS:
         state = _rescaled(state)
-    yield None
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
         state = replace(state, blur_px=_better_blur(state))
     moved_rad = attitude_change_rad(before, state.R_lab_body)
-    yield state, Iteration(moved_rad=moved_rad, misfit=chi2, blur_px=state.blur_px)
+    return state, Iteration(moved_rad=moved_rad, misfit=chi2, blur_px=state.blur_px)
 
 
 def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float, side: int = SIDE) -> Optics:
@@ -291,34 +281,11 @@ def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
     tie = max(smoothest * _typical(normal.diagonal()), state.tie)
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
     right -= tie * (grid.stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
-    return _changed(state, normal, right, tie), chi2
-
-
-def extended(state: State, new: State, tie: float, unseen: TextureTable | None) -> State:
-    """Return the state with a map that also shows what new instants show, whose poses, light and blur are known.
-    What it shows already is held by the weights of its texels: this takes a tenth of an iteration. `tie`: see `State`;
-    `unseen`: paint that the map does not know yet, as in a `TextureTable`.
-    """
-    assert state.weight is not None
-    height, held = len(state.texture), state.weight.reshape(-1).sqrt().float().numpy()
-    paint = SplineTable(state.texture, 0.0, unseen)
-    at = linearise(new.fitter, paint, new.pixels, new.position_lab_mm, new.R_lab_body, new.blur_px)
-    weight = at.weight
-    if at.view.known is not None:  # by it the light is found; the rest has any grey level
-        weight = torch.where(at.view.known, weight, (new.pixels.inside & ~new.pixels.clipped).to(weight.dtype))
-    at = replace(at, weight=weight * new.use.reshape(-1, 1))
-    shown = at.by_texel(height)
-    normal = NormalMatrix(vstack([shown, diags(held)], format="csr"))
-    return _changed(state, normal, shown.T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy(), tie)
-
-
-def _changed(state: State, normal: NormalMatrix, right: NDArray[np.float64], tie: float) -> State:
-    """Return the state with the change of its map that solves normal equations (T, T), (T,)."""
     height = len(state.texture)
     # Of conjugate gradients: what they leave, the next iteration finds.
     texture = state.texture + grid.solve_map(normal, right, height, tie, 10).float()
     weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
-    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight)
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight), chi2
 
 
 def sharp_map(state: State) -> Tensor:

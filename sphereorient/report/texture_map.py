@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.experiment import Experiment
+from sphereorient.experiment.recording import TextureMap
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
@@ -54,6 +55,13 @@ def write_texture(texture: Tensor, path: Path) -> None:
 def write_seen(seen: Tensor, texture: Path) -> None:
     """Write counts (H, 2 H) beside a texture map as 8-bit picture, limited to 255; may raise OutputError."""
     write_picture(seen_path(texture), seen.clamp(0, 255).byte().numpy())  # counts beyond are written as this
+
+
+def write_map(found: TextureMap, path: Path) -> None:
+    """Write a texture map, and beside it which texels are paint; may raise OutputError."""
+    unseen = torch.zeros_like(found.grey, dtype=torch.bool) if found.unseen is None else found.unseen
+    write_texture(found.grey, path)
+    write_seen((~unseen).int(), path)
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:

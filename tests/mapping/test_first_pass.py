@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 from camera_examples import brown, pinhole
-from growing_examples import RATE_HZ, turning_ball  # noqa: F401
 from renders import error_deg
+from turning_examples import RATE_HZ, turning_ball  # noqa: F401
 
 from sphereorient import so3
-from sphereorient.cameras import Camera
+from sphereorient.cameras import Camera, centre_lab_mm
 from sphereorient.locate import Frame
 from sphereorient.mapping import paint_cells
-from sphereorient.mapping.first_pass import FirstPass, better_place
+from sphereorient.mapping.first_pass import FirstPass, KeptFrames
 from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.pose.poses import Poses, supported
 from sphereorient.sphere.texture_table import octahedral_directions
@@ -84,7 +84,7 @@ def test_masked_pixels_show_nothing():
 
 def followed(ball, numbers, place=None) -> list[Poses]:
     follower = FirstPass(place or ball.place)
-    return [follower.next(k / RATE_HZ, [ball.shots[k]]) for k in numbers]
+    return [follower.next(k / RATE_HZ, [ball.shots[k]])[0] for k in numbers]
 
 
 def test_the_first_pass_follows_a_ball_of_which_nothing_is_known(ball):
@@ -107,23 +107,59 @@ def test_a_jump_is_found_and_another_thing_is_none(ball):
     shape, background = ball.shots[0].picture.shape, place.views[0].background
     dark = Frame(shown=np.zeros(shape, np.uint8), background=background)
     noise = Frame(shown=np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8), background=background)
-    assert follower.next(5 / RATE_HZ, [dark]).reason == (Reason.DARK,)
-    assert follower.next(6 / RATE_HZ, [noise]).reason == (Reason.LOW_SCORE,)
-    again = follower.next(8 / RATE_HZ, [ball.shots[8]])  # 30 degrees on
+    assert follower.next(5 / RATE_HZ, [dark])[0].reason == (Reason.DARK,)
+    assert follower.next(6 / RATE_HZ, [noise])[0].reason == (Reason.LOW_SCORE,)
+    again, searched = follower.next(8 / RATE_HZ, [ball.shots[8]])  # 30 degrees on
+    assert searched
     assert supported(again)
     assert float(error_deg(again.R_lab_body, (ball.R[8] @ ball.R[0].mT)[None]).max()) < 1.0
-    assert supported(follower.next(8 / RATE_HZ, [ball.shots[8]]))  # a time that stands
+    assert supported(follower.next(8 / RATE_HZ, [ball.shots[8]])[0])  # a time that stands
 
 
-@pytest.mark.slow
-def test_the_place_is_found_by_paint_that_is_seen_again(ball):
-    times, camera = [k / RATE_HZ for k in range(70)], ball.place.views[0].camera
-    px = ball.place.radius_mm / float(ball.place.views[0].radius_px(ball.X[0], ball.place.radius_mm))  # mm
+def test_a_ball_that_has_turned_far_unseen_is_found_again(ball):
+    follower = FirstPass(replace(ball.place, position_lab_mm=ball.X[:1]))
+    for k in range(50):
+        follower.next(k / RATE_HZ, [ball.shots[k]])
+    away = torch.rad2deg(so3.geodesic_distance(ball.R[:50], ball.R[49:50]))
+    far = int(away.argmax())
+    again, searched = follower.next(50 / RATE_HZ, [ball.shots[far]])
+    assert searched
+    assert float(away[far]) > 60.0
+    assert float(so3.geodesic_distance(again.R_lab_body[0], ball.R[far] @ ball.R[0].mT)) < 0.05
+
+
+def kept(ball, place) -> KeptFrames:
+    follower, frames = FirstPass(place), KeptFrames(place)
+    for k, shot in enumerate(ball.shots):
+        frames.add([shot], follower.next(k / RATE_HZ, [shot])[0])
+    return frames
+
+
+def test_place_and_turns_are_adjusted_together(ball):
+    camera, radius_mm = ball.place.views[0].camera, ball.place.radius_mm
+    px = radius_mm / float(ball.place.views[0].radius_px(ball.X[0], radius_mm))  # mm
     start = ball.X[:1] + 0.4 * px * (camera.R_cam_lab[0] - camera.R_cam_lab[1])
-    found = better_place(replace(ball.place, position_lab_mm=start), times, [[shot] for shot in ball.shots], 0.03)
-    aside = (camera.project(found.position_lab_mm) - camera.project(ball.X[:1])).norm()
-    assert float(aside) < 0.25  # px, of 0.57
-    sizes = [
-        float(ball.place.views[0].radius_px(X, ball.place.radius_mm)) for X in (found.position_lab_mm[0], ball.X[0])
-    ]
-    assert abs(sizes[0] / sizes[1] - 1) < 0.025  # of few frames of a small ball
+    start = start + 0.01 * (start - centre_lab_mm(camera))
+    found = kept(ball, replace(ball.place, position_lab_mm=start)).adjusted()
+    X = found.crops.position_lab_mm[0]
+    assert float((camera.project(X) - camera.project(ball.X[0])).norm()) < 0.05  # px, of 0.57
+    sizes = [float(ball.place.views[0].radius_px(one, radius_mm)) for one in (X, ball.X[0])]
+    assert abs(sizes[0] / sizes[1] - 1) < 0.003  # of 0.01
+    body = so3.nearest_rotation((found.R_lab_body.mT @ ball.R).mean(0))
+    assert float(error_deg(found.R_lab_body @ body, ball.R).median()) < 0.1
+
+
+def test_frames_that_were_kept_since_an_adjustment_turn_with_it(ball):
+    place = replace(ball.place, position_lab_mm=ball.X[:1])
+    frames = kept(ball, place)
+    before, late = frames.so_far(), frames.count
+    follower = FirstPass(place)
+    first, _ = follower.next(0.0, [ball.shots[0]])
+    far = replace(first, R_lab_body=so3.exp(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)))
+    frames.add([ball.shots[0]], far)
+    assert (before.count, frames.count) == (late, late + 1)
+    turn = so3.exp(torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
+    corrected, since = frames.corrected(before, turn @ before.crops()[1])
+    torch.testing.assert_close(corrected, turn)
+    assert len(since.crops()[1]) == 1
+    torch.testing.assert_close(frames.crops()[1][-1], turn @ far.R_lab_body[0])

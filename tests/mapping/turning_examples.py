@@ -1,4 +1,4 @@
-"""A ball that turns in its place, and a map of it that has grown with its frames."""
+"""A ball that turns in its place."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from test_fixed_centre import truth
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.locate import LocateSettings, screened_frames
-from sphereorient.mapping.disks import cut_out, fixed_place
-from sphereorient.mapping.growing import FIRST_FRAMES, GrowingMap
+from sphereorient.mapping.disks import fixed_place
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
@@ -34,16 +33,3 @@ def turning_ball(tmp_path_factory):
         for shot in shots:
             _ = shot.picture
     return SimpleNamespace(place=place, shots=shots, R=truth(path)[1], X=truth(path)[0])
-
-
-@pytest.fixture(name="grown", scope="module")
-def grown_map(ball):
-    """A map of 60 frames, after four iterations, from orientations in the body frame of the first frame."""
-    growing = GrowingMap(ball.place, SETTINGS)
-    Q = ball.R[0].mT
-    for k in range(60):
-        growing.add(cut_out(ball.place, [ball.shots[k].picture]), ball.R[k] @ Q)
-        if k in (FIRST_FRAMES, 40, 50, 59):
-            assert growing.ready()
-            growing.iterate(size=k >= 50)
-    return growing, growing.live_map()
