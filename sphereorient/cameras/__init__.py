@@ -3,6 +3,7 @@
 from sphereorient.cameras.brown import TsaiCamera
 from sphereorient.cameras.camera import (
     Camera,
+    CoarserCamera,
     ParameterCovariance,
     R_cam_view,
     R_lab_view,

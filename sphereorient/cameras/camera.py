@@ -102,6 +102,57 @@ class Camera(Protocol):
         """Return the pixels (..., 2) that `undistort` takes to `uv_px`."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CoarserCamera:
+    """A camera whose pixels are the means of `factor` times `factor` of another one's."""
+
+    camera: Camera
+    factor: int
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the picture, px; what is left at the right and below is no pixel."""
+        width, height = self.camera.image_size
+        return width // self.factor, height // self.factor
+
+    @property
+    def R_cam_lab(self) -> Tensor:
+        """As of the camera."""
+        return self.camera.R_cam_lab
+
+    @property
+    def T_cam_lab_mm(self) -> Tensor:
+        """As of the camera."""
+        return self.camera.T_cam_lab_mm
+
+    @property
+    def covariance(self) -> ParameterCovariance | None:
+        """As of the camera: its parameters are in its pixels."""
+        return self.camera.covariance
+
+    def _fine(self, uv_px: Tensor) -> Tensor:
+        return (uv_px + 0.5) * self.factor - 0.5
+
+    def _coarse(self, uv_px: Tensor) -> Tensor:
+        return (uv_px + 0.5) / self.factor - 0.5
+
+    def project(self, x_lab_mm: Tensor) -> Tensor:
+        """Project lab points (..., 3), mm, to pixels (..., 2)."""
+        return self._coarse(self.camera.project(x_lab_mm))
+
+    def rays(self, uv_px: Tensor) -> Rays:
+        """Return the rays of pixels (..., 2)."""
+        return self.camera.rays(self._fine(uv_px))
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixels (..., 2) of the camera without distortion."""
+        return self._coarse(self.camera.undistort(self._fine(uv_px)))
+
+    def distort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixels (..., 2) that `undistort` takes to `uv_px`."""
+        return self._coarse(self.camera.distort(self._fine(uv_px)))
+
+
 def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
     """Return the middle (..., 3), lab, mm, of the shortest segment between two rays, and its length (...), mm.
     Both are NaN, with gradient 0, for parallel rays; the rays broadcast. Source: common perpendicular (textbook).

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.cameras import CoarserCamera
 from sphereorient.errors import PaintError, Reason, refusal
-from sphereorient.experiment.recording import Recording, TextureMap
+from sphereorient.experiment.recording import Recording
 from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
@@ -28,6 +29,7 @@ from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 
 Picture = NDArray[Any]
+LEAST_RADIUS_PX = 45.0  # of pictures with coarser pixels
 GREY = 128.0  # of even pictures: their mean; as the scene about the ball, so that its limb does not show
 CONTRAST = 50.0  # of these, the deviation from it
 WINDOW = 0.35  # half side, radii, of the neighbourhood over which light is taken as even
@@ -45,10 +47,51 @@ STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the
 WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried where it is none of these
 TURNED_RAD = math.radians(20.0)  # the ball turns by more
 MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
+BEGIN = 300  # of these, by which place and map are adjusted first
 MAPPED = 100  # of them that place and map are adjusted by, twice as many at most
 APART_RAD = 0.025  # turn from one of these to the next, at least
 LEAST_FOUND = 0.5  # share of the frames
 TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CoarserPictures:
+    """Pictures of a large ball with coarser pixels: a first pass needs no finer ones."""
+
+    place: Crops  # seen so
+    factor: int
+
+    @classmethod
+    def of(cls, place: Crops) -> "CoarserPictures":
+        """Return those of a ball at a place."""
+        radius_px = min(float(view.radius_px(place.position_lab_mm[0], place.radius_mm)) for view in place.views)
+        factor = max(1, int(radius_px / LEAST_RADIUS_PX))
+        return cls(place=replace(place, views=[_coarser_view(view, factor) for view in place.views]), factor=factor)
+
+    def frames(self, shots: Sequence[Frame]) -> Sequence[Frame]:
+        """Return the frames of all cameras so."""
+        if self.factor == 1:
+            return shots
+        # Pictures that show nothing are not looked at.
+        return [Frame(shown=_coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in shots]
+
+
+def _coarser(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    height, width = (side // factor for side in picture.shape)
+    whole = picture[: height * factor, : width * factor]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _coarser_view(view: CameraView, factor: int) -> CameraView:
+    if factor == 1:
+        return view
+    scene, shown = view.background, view.background.shown
+    mean, noise = (_coarser(part, factor) for part in (scene.mean, scene.noise))
+    shown = None if shown is None else _coarser(shown.astype(np.float32), factor) == 1.0
+    background = Background(mean=mean, noise=noise / np.float32(factor), full_scale=scene.full_scale, shown=shown)
+    diameter_px = view.diameter_px / factor
+    coarse = replace(view.scene, background=background, diameter_px=diameter_px)
+    return CameraView.of(view.name, CoarserCamera(camera=view.camera, factor=factor), coarse)
 
 
 class EvenLight:
@@ -160,6 +203,10 @@ class FirstPass:
             pictures = crops.pictures(torch.tensor([k]))[0]
             self._grow([light(one) for light, one in zip(self._even, pictures, strict=True)], use, R_lab_body[k])
         return self
+
+    def begin(self, time_s: float, R_lab_body: Tensor) -> None:
+        """Begin with a frame of a time near an orientation (3, 3)."""
+        self._before = time_s, R_lab_body
 
     def follow(self, before: "FirstPass", correction: Tensor) -> None:
         """Go on where another pass is, with its orientation times a correction (3, 3), in the lab."""
@@ -299,22 +346,48 @@ class KeptFrames:
         return self._place.holding([self._rows[k].crops for k in some], use), R
 
 
-def first_pass_map(recording: Recording, place: Crops, progress: Progress) -> TextureMap:
-    """Return the map of a ball near a place, see `fixed_place`, from the first frames of its movies; the body frame is
-    the lab at the first frame that shows it.
+def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> Adjustment:
+    """Return what the first frames of a ball near a place, see `fixed_place`, have in common; the body frame is the lab
+    at the first frame that shows it. A few of them tell place and map; by these, more are followed and tell them again.
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
     """
-    count = min(MOST_FRAMES, len(recording.timeline))
-    pairs = zip(recording.streams, place.views, strict=True)
-    shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
-    follower, kept, found = FirstPass(place), KeptFrames(place), 0
-    for k, row in enumerate(counted("first pass", shots, count, progress)):
-        poses, _ = follower.next(float(recording.timeline.time_s[k]), row)
-        if supported(poses):
-            kept.add(row, poses)
-            found += 1
+    coarse, count = CoarserPictures.of(place), min(MOST_FRAMES, len(recording.timeline))
+    found, kept = _swept(recording, coarse, FirstPass(coarse.place), min(count, BEGIN), progress)
+    if kept.turned_rad < TURNED_RAD and count > BEGIN:  # it rests at first
+        found, kept = _swept(recording, coarse, FirstPass(coarse.place), count, progress)
     adjustment = kept.adjusted(progress)
-    if found < LEAST_FOUND * count:
-        got, do = f"{found} of {count} frames that a growing map explains", "learn the map with `sphereorient map`"
+    if count > len(found):
+        found, kept = _swept(recording, coarse, _after(adjustment, recording), count, progress)
+        adjustment = kept.adjusted(progress)
+    seen = sum(map(supported, found))
+    if seen < LEAST_FOUND * len(found):
+        got, do = f"{seen} of {len(found)} frames that a growing map explains", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
-    return adjustment.texture()
+    return adjustment
+
+
+def followed_by(adjustment: Adjustment, recording: Recording, place: Crops, progress: Progress) -> list[Poses]:
+    """Return the poses of all frames by the place and map of an adjustment of some, `place` as given to it."""
+    after, count = _after(adjustment, recording), len(recording.timeline)
+    return _swept(recording, CoarserPictures.of(place), after, count, progress)[0]
+
+
+def _after(adjustment: Adjustment, recording: Recording) -> FirstPass:
+    follower = FirstPass(adjustment.crops, ADJUSTED_ERROR).shown(adjustment.crops, adjustment.R_lab_body)
+    follower.begin(float(recording.timeline.time_s[0]), adjustment.R_lab_body[0])
+    return follower
+
+
+def _swept(
+    recording: Recording, coarse: CoarserPictures, follower: FirstPass, count: int, progress: Progress
+) -> tuple[list[Poses], KeptFrames]:
+    pairs = zip(recording.streams, coarse.place.views, strict=True)
+    shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
+    kept, found = KeptFrames(coarse.place), list[Poses]()
+    for k, row in enumerate(counted("first pass", shots, count, progress)):
+        frames = coarse.frames(row)
+        poses, _ = follower.next(float(recording.timeline.time_s[k]), frames)
+        found.append(poses)
+        if supported(poses):
+            kept.add(frames, poses)
+    return found, kept

@@ -16,7 +16,7 @@ from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
 from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
 from sphereorient.mapping.disks import fixed_place
-from sphereorient.mapping.first_pass import first_pass_map
+from sphereorient.mapping.first_pass import first_adjustment
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml
@@ -96,10 +96,11 @@ def learn_map(
 def first_map_of(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, progress: Progress
 ) -> TextureMap:
-    """Return the map of a ball in its place, of which there is none, see `first_pass_map`; raise as that does."""
+    """Return the map of a ball in its place, of which there is none, see `first_adjustment`; raise as that does."""
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         progress("place", 0, 1)
-        return first_pass_map(recording, fixed_place(recording, settings.paint, settings.locate), progress)
+        place = fixed_place(recording, settings.paint, settings.locate)
+        return first_adjustment(recording, place, progress).texture()
 
 
 def _own(kept: Path | None, name: str) -> Path | None:
