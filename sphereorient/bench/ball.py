@@ -7,11 +7,13 @@ beside the results.
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import torch
 import yaml
@@ -19,15 +21,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.bench.score import aligned_errors_deg
 from sphereorient.cameras import PinholeCamera, save_cameras
 from sphereorient.cameras.model import focal_of_field, middle_of_picture
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.picture import write_picture
 from sphereorient.files.threads import Progress, silent
-from sphereorient.files.whole_file import make_folder, write_text
+from sphereorient.files.whole_file import make_folder, write_text, writing
+from sphereorient.mapping.disks import fixed_place
+from sphereorient.mapping.first_pass import first_adjustment, followed_by
+from sphereorient.methods.method import one_thread
+from sphereorient.methods.settings import Settings
 from sphereorient.movies import write_ffv1
+from sphereorient.pose.poses import supported
+from sphereorient.report.texture_map import write_map
+from sphereorient.run import MemoryStore, Request
+from sphereorient.run.stages import run_tracks
 from sphereorient.sphere.texture import map_directions
+from sphereorient.statistics.behaviour import Behaviour, behaviour_of
 from sphereorient.synth.motion import Motion6D
 from sphereorient.synth.write import write_truth
+from sphereorient.trajectory.rotations import rotation_vectors
 
 Floats = NDArray[np.float32]
 
@@ -297,7 +312,10 @@ class _Film:
             swing = math.sin(2 * math.pi * 12 * k / RATE_HZ + math.pi * (leg % 2) + 2 * math.pi * rank / 3)
             angle = math.radians(-90 + side * (35 + 25 * rank) + 8 * swing)
             reach = r * (0.55 + 0.12 * rank + 0.06 * swing)
-            hip, foot = np.array([u, v - 0.78 * r]), np.array([u + reach * math.cos(angle), v + reach * math.sin(angle)])
+            hip, foot = (
+                np.array([u, v - 0.78 * r]),
+                np.array([u + reach * math.cos(angle), v + reach * math.sin(angle)]),
+            )
             knee = (hip + foot) / 2 + np.array([side * 0.18 * r, -0.12 * r])
             line = np.array([hip, knee, foot], np.int32).reshape(-1, 1, 2)
             cv2.polylines(picture, [line], False, GREY_LEG, max(1, round(0.035 * r)), cv2.LINE_AA)
@@ -342,3 +360,98 @@ def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, pro
     )
     write_truth(folder / "truth.h5", {"": truth}, {"cam1": camera})
     return folder / "experiment.yaml"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BallErrors:
+    """Errors of one way of N frames of a scene, degrees; a constant turn of body and lab is taken off."""
+
+    found: int  # frames with an orientation
+    step_deg: NDArray[np.float64]  # of the turn from each frame to the next, where both have one
+    orientation_deg: NDArray[np.float64]
+    over_sigma: float  # what varies from frame to frame over its stated sigma, rms of each axis
+    behaviour: Behaviour
+
+    @classmethod
+    def of(cls, time_s: Tensor, R: Tensor, covariance: Tensor, R_true: Tensor) -> "BallErrors":
+        """Compare orientations (N, 3, 3), NaN: none, and their covariances (N, 3, 3), lab, with true ones."""
+        ours, true = R.numpy(), R_true.numpy()
+        known = np.isfinite(ours).all((1, 2))
+        linked = known[1:] & known[:-1]
+        turns = [rotation_vectors(one[1:] @ one[:-1].transpose(0, 2, 1)) for one in (ours, true)]
+        steps = (turns[0] - turns[1])[linked]
+        variance = torch.diagonal(covariance, dim1=1, dim2=2).numpy()
+        stated = np.sqrt((variance[1:] + variance[:-1])[linked])
+        return cls(
+            found=int(known.sum()),
+            step_deg=np.rad2deg(np.linalg.norm(steps, axis=1)),
+            orientation_deg=aligned_errors_deg(ours[known], true[known], "both"),
+            over_sigma=float(np.sqrt(np.mean((steps / stated) ** 2))),
+            behaviour=behaviour_of(time_s.numpy(), ours, true, exact=True, align=True),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BallRow:
+    """What was measured of a scene."""
+
+    name: str
+    first: BallErrors  # of the first pass
+    refined: BallErrors | None  # of the precise method by its map; None: left out
+    cpu_ms: float  # of a frame of the first pass, decoded
+    radius_px: float
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all for JSON."""
+        ways = {"first": self.first} if self.refined is None else {"first": self.first, "refined": self.refined}
+        rows = {
+            way: {
+                "found": one.found,
+                "step_p50_deg": float(np.median(one.step_deg)),
+                "step_p95_deg": float(np.percentile(one.step_deg, 95)),
+                "orientation_p50_deg": float(np.median(one.orientation_deg)),
+                "orientation_p95_deg": float(np.percentile(one.orientation_deg, 95)),
+                "over_sigma": one.over_sigma,
+                "behaviour": one.behaviour.numbers(),
+            }
+            for way, one in ways.items()
+        }
+        return {"scene": self.name, "radius_px": self.radius_px, "cpu_ms": self.cpu_ms, **rows}
+
+
+def measured(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
+    """Track a scene from nothing; `refine`: by the precise method as well, with the map of the first pass."""
+    with h5py.File(path.with_name("truth.h5")) as file:
+        R_true = torch.from_numpy(file["orientation"][()])
+    with open_recording(path, None, textured=False) as recording, one_thread():
+        place = fixed_place(recording, settings.paint, settings.locate)
+        adjustment = first_adjustment(recording, place, progress)
+        begun = time.process_time()
+        for _ in recording.streams[0].pictures():
+            pass
+        decoded = time.process_time()
+        poses = followed_by(adjustment, recording, place, progress)
+        cpu_s = (time.process_time() - decoded) - (decoded - begun)
+        time_s = recording.timeline.time_s
+        radius_px = float(place.views[0].radius_px(place.position_lab_mm[0], place.radius_mm))
+    none = torch.full((3, 3), torch.nan, dtype=torch.float64)
+    R, covariance = (
+        torch.stack([of(one) if supported(one) else none for one in poses])
+        for of in (lambda one: one.R_lab_body[0], lambda one: one.covariance[0, :3, :3])
+    )
+    refined = None
+    if refine:
+        texture = path.with_name("learnt.png")
+        with writing(force=True):
+            write_map(adjustment.texture(), texture)
+        mapped = load_experiment(path).with_sphere(texture_path=texture)
+        (track,) = run_tracks(Request(experiment=mapped), MemoryStore(), progress=progress).values()
+        ours, covariance = (torch.from_numpy(part) for part in (track.orientation, track.orientation_cov))
+        refined = BallErrors.of(time_s, ours, covariance, R_true)
+    return BallRow(
+        name=path.parent.name,
+        first=BallErrors.of(time_s, R, covariance, R_true),
+        refined=refined,
+        cpu_ms=1e3 * cpu_s / len(poses),
+        radius_px=radius_px,
+    )

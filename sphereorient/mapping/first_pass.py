@@ -59,6 +59,7 @@ class CoarserPictures:
     """Pictures of a large ball with coarser pixels: a first pass needs no finer ones."""
 
     place: Crops  # seen so
+    whole: Sequence[CameraView]  # the views as filmed
     factor: int
 
     @classmethod
@@ -66,7 +67,8 @@ class CoarserPictures:
         """Return those of a ball at a place."""
         radius_px = min(float(view.radius_px(place.position_lab_mm[0], place.radius_mm)) for view in place.views)
         factor = max(1, int(radius_px / LEAST_RADIUS_PX))
-        return cls(place=replace(place, views=[_coarser_view(view, factor) for view in place.views]), factor=factor)
+        coarse = replace(place, views=[_coarser_view(view, factor) for view in place.views])
+        return cls(place=coarse, whole=place.views, factor=factor)
 
     def frames(self, shots: Sequence[Frame]) -> Sequence[Frame]:
         """Return the frames of all cameras so."""
@@ -381,7 +383,7 @@ def _after(adjustment: Adjustment, recording: Recording) -> FirstPass:
 def _swept(
     recording: Recording, coarse: CoarserPictures, follower: FirstPass, count: int, progress: Progress
 ) -> tuple[list[Poses], KeptFrames]:
-    pairs = zip(recording.streams, coarse.place.views, strict=True)
+    pairs = zip(recording.streams, coarse.whole, strict=True)
     shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
     kept, found = KeptFrames(coarse.place), list[Poses]()
     for k, row in enumerate(counted("first pass", shots, count, progress)):
