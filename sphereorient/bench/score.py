@@ -185,13 +185,58 @@ def _read_truth(path: str | Path, *names: str, sphere: str = UNNAMED, also: Sequ
     return truth
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference:
+    """Orientations to compare a track of N frames with; made by `reference_of`. NaN: none in this frame."""
+
+    R_lab_body: Floats  # (N, 3, 3)
+    start: NDArray[np.bool_]  # (N,), frames in which another tracker began anew
+    exact: bool  # the truth; else another tracker's
+
+
+def reference_of(path: Path, track: Trajectory) -> Reference:
+    """Read the reference of a track: truth.h5 or another track.h5, by time, or FicTrac's .dat, by the frame number.
+    Raise TrackError (of another kind, or no time in common) or BenchError (no FicTrac file).
+    """
+    R, start = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool)
+    if path.suffix.lower() == ".dat":
+        frame, orientation, begins = _fictrac_stretches(path)
+        row, there = _nearest(frame.astype(np.float64), track.time * track.frame_rate)
+        R[there], start[there] = orientation[row[there]], begins[row[there]]
+    elif not _is_track(path):
+        return Reference(R_lab_body=true_orientations(path, track.time, track.sphere), start=start, exact=True)
+    else:
+        tracks = Tracks.load(path)
+        other = next(iter((tracks if len(tracks) == 1 else tracks.picked(track.sphere)).values()))
+        row, there = _nearest(other.time, track.time)
+        R[there] = other.orientation[row[there]]
+    if not np.isfinite(R).any():
+        do = "pass a result on the same movie, and frame_rate in experiment.yaml for FicTrac's"
+        raise TrackError(refusal(f"reference {path}", expected="frames of the track", got="none of them", do=do))
+    return Reference(R_lab_body=R, start=start, exact=False)
+
+
+def _is_track(path: Path) -> bool:
+    try:
+        with h5py.File(path) as file:
+            return str(file.attrs.get("schema", "")).startswith("sphereorient-track")
+    except OSError:  # who reads it says so
+        return False
+
+
+def _nearest(known: Floats, wanted: Floats) -> tuple[Frames, NDArray[np.bool_]]:
+    """Return the rows of increasing known times nearest to the wanted ones, and where they are within half a step."""
+    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    row = np.where(np.abs(known[before] - wanted) < np.abs(known[after] - wanted), before, after)
+    step = float(np.median(np.diff(known))) if len(known) > 1 else np.inf
+    return row, np.abs(known[row] - wanted) <= step / 2
+
+
 def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
     """Return the rows of the truth at the nearest times; refuse times further than half a frame."""
-    after = np.clip(np.searchsorted(known_s, time_s), 0, len(known_s) - 1)
-    before = np.maximum(after - 1, 0)
-    row = np.where(np.abs(known_s[before] - time_s) < np.abs(known_s[after] - time_s), before, after)
-    step = float(np.median(np.diff(known_s))) if len(known_s) > 1 else np.inf
-    if len(time_s) and not np.abs(known_s[row] - time_s).max() <= step / 2:
+    row, there = _nearest(known_s, time_s)
+    if not there.all():
         got = f"{time_s[0]:.6g} .. {time_s[-1]:.6g} s"
         raise TrackError(refusal(f"truth {path}", expected="times of the track", got=got, do=DO))
     return row
@@ -202,6 +247,11 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats]:
 
     They are relative to its first frame, in axes of its own: align with "both". Raise BenchError for other files.
     """
+    return _fictrac_stretches(path)[:2]
+
+
+def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
+    """Read the same, and the frames (N,) in which its sequence counter begins anew."""
     do = "pass FicTrac's .dat file"
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
@@ -211,7 +261,9 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats]:
     if rows.shape[0] == 0 or rows.shape[1] < FICTRAC_COLUMNS:
         got = f"{rows.shape[0]} lines of {rows.shape[1]}"
         raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
-    return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]])
+    sequence = rows[:, FICTRAC["sequence"]].ravel()
+    begins = np.diff(sequence, prepend=sequence[:1]) < (1 if sequence.any() else 0)
+    return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]]), begins
 
 
 READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}

@@ -1,0 +1,239 @@
+"""What an experiment with an animal on a ball asks of a tracker: rotation gain, drift, heading and path, against truth
+or another tracker.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.errors import ShapeError, refusal
+from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.trajectory.rotations import rotation_vectors
+from sphereorient.trajectory.walk import arcs, walk_of
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+ABOUT = ("x", "y", "z", "along the rotation")  # the gains
+PER_BLOCK = 10  # frames at least; a block is to be longer than errors are correlated
+FEWEST_BLOCKS, GAIN_BLOCKS, DRIFT_BLOCKS = 8, 40, 30
+GAP = 1.5  # usual times between frames
+ONE_AXIS = 1e-3  # share of the turns' squares about the second axis, below which lab axes cannot be aligned
+CORRELATIONS = np.append(np.linspace(0.0, 0.95, 20), [0.98, 0.995, 0.999])  # of neighbouring blocks
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Behaviour:
+    """Gain, drift and walk of a track against a reference; made by `behaviour_of`, read by score and report. NaN: not
+    known, for the `reason`. Axes: lab x, y, z; gains have a fourth entry, all axes together.
+    """
+
+    frames: int  # with an orientation in both
+    pairs: int  # of neighbouring frames with one in both
+    gain: Interval  # (4,), 95 %
+    gain_bounds: Floats  # (2, 4), of a reference with errors: regression on it, and the inverse of its regression on us
+    gain_smooth: Interval | None  # (4,), of the smoothed orientations; None: there are none
+    drift_deg_min: Floats  # (3,), degrees a minute
+    drift_sigma_deg_min: Floats  # (3,), its standard error
+    apart_deg: float  # angle between the lab axes of the two, by the turns
+    heading_rad: float  # heading at the end less that of the reference; NaN, as the next two: the ball is not in place
+    length_ratio: float  # length of the path over that of the reference
+    end_share: float  # distance between the ends of the paths over the length of the reference's
+    reason: str
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all as numbers, lists and texts, for JSON."""
+
+        def listed(of: Interval) -> dict[str, Any]:
+            names = {"value": of.value, "low": of.low, "high": of.high, "sigma": of.error}
+            return {name: part.tolist() for name, part in names.items()}
+
+        plain = {name: part.tolist() if isinstance(part, np.ndarray) else part for name, part in vars(self).items()}
+        smooth = None if self.gain_smooth is None else listed(self.gain_smooth)
+        return {"about": list(ABOUT), **plain, "gain": listed(self.gain), "gain_smooth": smooth}
+
+
+def behaviour_of(
+    time_s: Floats,
+    R_lab_body: Floats,
+    R_reference: Floats,
+    *,
+    exact: bool,
+    align: bool = False,
+    fixed: bool = True,
+    start: Mask | None = None,
+    R_smooth: Floats | None = None,
+) -> Behaviour:
+    """Compare orientations (N, 3, 3) at times (N,), s, with those of a reference; NaN: not measured.
+
+    A constant rotation of the body axes is taken off always, one of the lab axes with `align`: the axes are then those
+    of a reference that is `exact`, else those of the track. Against an exact reference a gain is the regression through
+    zero of our turns on its; else the geometric mean of the two regressions. `fixed`: the ball stays in its place, and
+    has a walk. `start` (N,): frames in which the reference begins anew. `R_smooth`: the smoothed orientations.
+    Raises ShapeError: not the same number of frames. Source: docs/accuracy.md, Behaviour.
+    """
+    frames = len(time_s)
+    begins = np.zeros(frames, bool) if start is None else start
+    smooth = np.full((frames, 3, 3), np.nan) if R_smooth is None else R_smooth
+    if not frames == len(R_lab_body) == len(R_reference) == len(begins) == len(smooth):
+        got, do = f"{len(R_lab_body)} and {len(R_reference)}", "give both at the times of the track"
+        raise ShapeError(refusal("behaviour_of", expected=f"{frames} orientations each", got=got, do=do))
+    known: Mask = np.asarray(np.isfinite(R_lab_body + R_reference).all(axis=(1, 2)))
+    step_s = np.diff(time_s)
+    usual_s = float(np.median(step_s)) if frames > 1 else np.inf
+    linked = known[1:] & known[:-1] & ~begins[1:] & (step_s <= GAP * usual_s)
+    ours, theirs = (_turns(R)[linked] for R in (R_lab_body, R_reference))
+    A, second = _lab_axes(ours, theirs)
+    apart = float(np.linalg.norm(rotation_vectors(A[None])))
+    reason = _why_not(int(linked.sum()), second if align else 1.0)
+    left = A if align and second > ONE_AXIS else np.eye(3)
+    of_track, of_reference = (left.T, np.eye(3)) if exact else (np.eye(3), left)
+    R, R_true = of_track @ R_lab_body, of_reference @ R_reference
+    ours, theirs, smoothed = ours @ of_track.T, theirs @ of_reference.T, _turns(smooth)[linked] @ of_track.T
+    gain, bounds = _gain(ours, theirs, ours, exact, reason)
+    there = np.isfinite(smoothed).all(1)
+    again = reason or _why_not(int(there.sum()), 1.0)
+    gain_smooth = _gain(ours[there], theirs[there], smoothed[there], exact, again)[0] if there.any() else None
+    drift, sigma = _drift(time_s[known], R[known], R_true[known], np.cumsum(begins)[known], reason)
+    walk = _walk(time_s, R, R_true, known & ~begins) if fixed and second > 0 else (np.nan,) * 3
+    return Behaviour(
+        frames=int(known.sum()),
+        pairs=int(linked.sum()),
+        gain=gain,
+        gain_bounds=bounds,
+        gain_smooth=gain_smooth,
+        drift_deg_min=drift,
+        drift_sigma_deg_min=sigma,
+        apart_deg=float(np.rad2deg(apart)),
+        heading_rad=walk[0],
+        length_ratio=walk[1],
+        end_share=walk[2],
+        reason=reason,
+    )
+
+
+def _turns(R: Floats) -> Floats:
+    """Return the rotation vectors (N - 1, 3), rad, lab, from each frame (N, 3, 3) to the next."""
+    return rotation_vectors(R[1:] @ R[:-1].mT)
+
+
+def _why_not(pairs: int, second: float) -> str:
+    if pairs < FEWEST_BLOCKS * PER_BLOCK:
+        return f"{pairs} pairs of neighbouring frames in both, at least {FEWEST_BLOCKS * PER_BLOCK} needed"
+    return "" if second > ONE_AXIS else "the ball turns about one axis only: the lab axes cannot be aligned"
+
+
+def _lab_axes(ours: Floats, theirs: Floats) -> tuple[Floats, float]:
+    """Return the rotation A that takes the reference's turns (P, 3) to ours with the least squares, and how large the
+    second axis' share of their squares is. Turns neither drift nor have body axes.
+    Source: Kabsch 1976, Acta Cryst. A32, 922.
+    """
+    U, size, Vt = np.linalg.svd(ours.T @ theirs)
+    A = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return A, float(size[1] / size[0]) if size[0] > 0 else 0.0
+
+
+def _gain(ours: Floats, theirs: Floats, of: Floats, exact: bool, reason: str) -> tuple[Interval, Floats]:
+    """Return the gains (4,) of turns `of` (P, 3), ours or smoothed, with intervals by blocks of them, and the two
+    regressions (2, 4) of ours. Smoothing changes the product with the reference alone, as errors of neither change it.
+    """
+    if reason:
+        unknown = np.full(4, np.nan)
+        return Interval(value=unknown, low=unknown, high=unknown, error=unknown), np.full((2, 4), np.nan)
+    products = np.stack([ours * theirs, theirs**2, ours**2, of * theirs], axis=1)
+    products = np.concatenate([products, products.sum(2, keepdims=True)], axis=2)  # (P, 4, 4)
+    blocks = min(len(ours) // PER_BLOCK, GAIN_BLOCKS)
+    sums = segment_sums(products, np.arange(len(ours)) * blocks // len(ours), blocks)
+
+    @np.errstate(all="ignore")
+    def gain(totals: Floats) -> Floats:
+        ab, bb, aa, sb = np.moveaxis(totals, -2, 0)
+        return np.asarray(sb / np.where(bb > 0, bb if exact else np.abs(ab) * np.sqrt(bb / aa), np.nan), np.float64)
+
+    ab, bb, aa, _ = sums.sum(0)
+    with np.errstate(all="ignore"):
+        return bootstrap(sums, gain, BootstrapSettings()), np.stack([ab / bb, aa / ab])
+
+
+def _drift(time_s: Floats, R: Floats, R_reference: Floats, stretch: Rows, reason: str) -> tuple[Floats, Floats]:
+    """Return the drift (3,) of orientations (K, 3, 3), degrees a minute, and its standard error.
+    Errors are modelled as c + d t + R b: constant in the lab, drift, constant in the body. `stretch` (K,): those of the
+    reference; from one to the next the error is taken to go on.
+    """
+    if reason:
+        return np.full(3, np.nan), np.full(3, np.nan)
+    error = _unwrapped(R @ _in_one_body(R_reference, R, stretch).mT, stretch)
+    along, lab = (time_s - time_s.mean())[:, None, None] / np.ptp(time_s), np.broadcast_to(np.eye(3), R.shape)
+    design = np.concatenate([lab, along * lab, R], axis=2).reshape(-1, 9)
+    inverse = np.linalg.inv(design.T @ design + np.diag([0.0] * 6 + [1.0] * 3))  # b is 0, with one frame's weight
+    body = (inverse @ (design.T @ error.ravel()))[6:]
+    # The error in the body is not known exactly: a drift about an axis about which the ball turns little may be one.
+    worse = np.sqrt(inverse.diagonal()[3:6] * np.square(along).sum())
+    slope, sigma = _slope(time_s, error - R @ body)
+    return np.rad2deg(slope) * 60, np.rad2deg(sigma * np.maximum(worse, 1.0)) * 60
+
+
+def _in_one_body(R_reference: Floats, R: Floats, stretch: Rows) -> Floats:
+    """Return the reference (K, 3, 3) with the body axes of R, by the mean rotation over each stretch."""
+    of = np.unique(stretch, return_inverse=True)[1]
+    sums = segment_sums(R_reference.mT @ R, of, int(of.max()) + 1)
+    U, _, Vt = np.linalg.svd(sums)
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    return np.asarray(R_reference @ (U @ Vt)[of], np.float64)
+
+
+def _unwrapped(E: Floats, stretch: Rows) -> Floats:
+    """Return the rotation vectors (K, 3) of errors (K, 3, 3), which may grow beyond a half turn: of their branches that
+    nearest to the sum of the changes.
+    """
+    change = np.where(np.diff(stretch)[:, None] == 0, _turns(E), 0.0)
+    error = rotation_vectors(E)
+    rough = error[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(change, axis=0)])
+    angle = np.linalg.norm(error, axis=1, keepdims=True)
+    axis = error / np.where(angle > 0, angle, 1.0)
+    along = (rough * axis).sum(1, keepdims=True)
+    return np.asarray((angle + 2 * np.pi * np.round((along - angle) / (2 * np.pi))) * axis, np.float64)
+
+
+def _slope(time_s: Floats, error: Floats) -> tuple[Floats, Floats]:
+    """Return slope (3,) and standard error of errors (K, 3) over time, by least squares on the means of blocks whose
+    errors are correlated as rho^distance, rho by the restricted likelihood: independent blocks to nearly a random walk.
+    Source: Patterson and Thompson 1971, Biometrika 58, 545.
+    """
+    blocks = min(len(time_s) // PER_BLOCK, DRIFT_BLOCKS)
+    of = np.arange(len(time_s)) * blocks // len(time_s)
+    means = segment_sums(np.column_stack([time_s, error]), of, blocks) / np.bincount(of)[:, None]
+    usual_s = np.diff(means[:, 0]).mean()
+    at, y = (means[:, 0] - means[:, 0].mean()) / usual_s, means[:, 1:]
+    X, freedom = np.stack([np.ones(blocks), at], axis=1), blocks - 2
+    V = CORRELATIONS[:, None, None] ** np.abs(at[:, None] - at)  # (C, M, M)
+    VX = np.linalg.solve(V, np.broadcast_to(X, (len(V), blocks, 2)))
+    inverse = np.linalg.inv(X.T @ VX)
+    fitted = inverse @ (VX.mT @ y)  # (C, 2, 3)
+    rest = y - X @ fitted
+    square = np.maximum((rest * np.linalg.solve(V, rest)).sum(1) / freedom, np.finfo(np.float64).tiny)  # (C, 3)
+    size = np.linalg.slogdet(V)[1] - np.linalg.slogdet(inverse)[1]
+    best = (size[:, None] + freedom * np.log(square)).argmin(0), np.arange(3)
+    slope, sigma = fitted[:, 1][best], np.sqrt(square * inverse[:, 1, 1, None])[best]
+    return slope / usual_s, sigma / usual_s
+
+
+def _walk(time_s: Floats, R: Floats, R_reference: Floats, use: Mask) -> tuple[float, float, float]:
+    """Return the difference of the headings at the end, rad, the ratio of the paths' lengths, and the distance of their
+    ends over the length; of several stretches the sums, since what happened between them is not known.
+    """
+    masked = [np.where(use[:, None, None], one, np.nan) for one in (R, R_reference)]
+    ours, theirs = (walk_of(time_s, one) for one in masked)
+    turns = [arcs(one.turn_rad) for one in (ours, theirs)]
+    about, length = (
+        [float(np.nansum(part)) for part in parts]
+        for parts in ([turn[2] for turn in turns], [np.hypot(turn[0], turn[1]) for turn in turns])
+    )
+    last = use & ~np.append(use[1:], False)
+    apart = float(np.linalg.norm(ours.path[last] - theirs.path[last], axis=1).sum())
+    if not length[1] > 0:
+        return np.nan, np.nan, np.nan
+    return about[0] - about[1], length[0] / length[1], apart / length[1]
