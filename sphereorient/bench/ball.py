@@ -45,6 +45,7 @@ from sphereorient.synth.write import write_truth
 from sphereorient.trajectory.rotations import rotation_vectors
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 RATE_HZ = 100.0
 RADIUS_MM = 5.0
@@ -69,7 +70,7 @@ class Paint:
 
 @dataclass(frozen=True, kw_only=True)
 class BallScene:
-    """One scene, with what peers print of theirs: median and 95 % of the steps, degrees, and drift, degrees a minute."""
+    """One scene; what peers print of theirs: median and 95 % of the steps, degrees, and drift, degrees a minute."""
 
     motion: str = "walk"  # or saccades: a third of the way, the same turns
     paint: Paint = field(default_factory=Paint)
@@ -290,7 +291,7 @@ class _Film:
         picture = cv2.GaussianBlur(picture * self._gain * np.float32(gain), (0, 0), scene.blur_px)
         noise = np.sqrt(scene.read_noise**2 + scene.shot_noise**2 * picture.clip(0, 255) / 255)
         noisy = picture + self._rng.standard_normal(picture.shape, np.float32) * noise
-        return noisy.round().clip(0, 255).astype(np.uint8)
+        return np.asarray(noisy.round().clip(0, 255), np.uint8)
 
     def body(self) -> NDArray[np.uint8]:
         """Return the mask of the animal's body: black where it hides the ball."""
@@ -299,10 +300,10 @@ class _Film:
             self._ellipse(mask, 0.0, 1.1)
         return mask
 
-    def _ellipse(self, picture: NDArray[np.generic], grey: float, larger: float = 1.0) -> None:
+    def _ellipse(self, picture: NDArray[Any], grey: float, larger: float = 1.0) -> None:
         (u, v), r = self.middle, self.radius_px
         axes = (int(0.38 * r * larger), int(0.22 * r * larger))
-        cv2.ellipse(picture, (int(u), int(v - 0.78 * r)), axes, 0, 0, 360, grey, -1, cv2.LINE_AA)  # type: ignore[call-overload]
+        cv2.ellipse(picture, (int(u), int(v - 0.78 * r)), axes, 0, 0, 360, grey, -1, cv2.LINE_AA)
 
     def _put_animal(self, picture: Floats, k: int) -> None:
         """Draw a body and legs that walk, 12 steps a second."""
@@ -324,7 +325,7 @@ class _Film:
 
 
 def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, progress: Progress = silent) -> Path:
-    """Render a scene with exact truth in a folder and return its experiment.yaml, which names no map and no diameter."""
+    """Render a scene with exact truth and return its experiment.yaml, which names no map and no diameter."""
     rng, camera = np.random.default_rng(seed), _camera(scene)
     X = _place(scene, camera)
     film = _Film(scene, camera, X, painted(scene.paint, rng), rng)
@@ -373,21 +374,20 @@ class BallErrors:
     behaviour: Behaviour
 
     @classmethod
-    def of(cls, time_s: Tensor, R: Tensor, covariance: Tensor, R_true: Tensor) -> "BallErrors":
+    def of(cls, time_s: Doubles, ours: Doubles, covariance: Doubles, true: Doubles) -> "BallErrors":
         """Compare orientations (N, 3, 3), NaN: none, and their covariances (N, 3, 3), lab, with true ones."""
-        ours, true = R.numpy(), R_true.numpy()
-        known = np.isfinite(ours).all((1, 2))
+        known: NDArray[np.bool_] = np.asarray(np.isfinite(ours).all((1, 2)))
         linked = known[1:] & known[:-1]
         turns = [rotation_vectors(one[1:] @ one[:-1].transpose(0, 2, 1)) for one in (ours, true)]
         steps = (turns[0] - turns[1])[linked]
-        variance = torch.diagonal(covariance, dim1=1, dim2=2).numpy()
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
         stated = np.sqrt((variance[1:] + variance[:-1])[linked])
         return cls(
             found=int(known.sum()),
             step_deg=np.rad2deg(np.linalg.norm(steps, axis=1)),
             orientation_deg=aligned_errors_deg(ours[known], true[known], "both"),
             over_sigma=float(np.sqrt(np.mean((steps / stated) ** 2))),
-            behaviour=behaviour_of(time_s.numpy(), ours, true, exact=True, align=True),
+            behaviour=behaviour_of(time_s, ours, true, exact=True, align=True),
         )
 
 
@@ -422,7 +422,7 @@ class BallRow:
 def measured(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
     """Track a scene from nothing; `refine`: by the precise method as well, with the map of the first pass."""
     with h5py.File(path.with_name("truth.h5")) as file:
-        R_true = torch.from_numpy(file["orientation"][()])
+        R_true = file["orientation"][()]
     with open_recording(path, None, textured=False) as recording, one_thread():
         place = fixed_place(recording, settings.paint, settings.locate)
         adjustment = first_adjustment(recording, place, progress)
@@ -435,10 +435,8 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
         time_s = recording.timeline.time_s
         radius_px = float(place.views[0].radius_px(place.position_lab_mm[0], place.radius_mm))
     none = torch.full((3, 3), torch.nan, dtype=torch.float64)
-    R, covariance = (
-        torch.stack([of(one) if supported(one) else none for one in poses])
-        for of in (lambda one: one.R_lab_body[0], lambda one: one.covariance[0, :3, :3])
-    )
+    R = torch.stack([one.R_lab_body[0] if supported(one) else none for one in poses]).numpy()
+    covariance = torch.stack([one.covariance[0, :3, :3] if supported(one) else none for one in poses]).numpy()
     refined = None
     if refine:
         texture = path.with_name("learnt.png")
@@ -446,8 +444,7 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
             write_map(adjustment.texture(), texture)
         mapped = load_experiment(path).with_sphere(texture_path=texture)
         (track,) = run_tracks(Request(experiment=mapped), MemoryStore(), progress=progress).values()
-        ours, covariance = (torch.from_numpy(part) for part in (track.orientation, track.orientation_cov))
-        refined = BallErrors.of(time_s, ours, covariance, R_true)
+        refined = BallErrors.of(time_s, track.orientation, track.orientation_cov, R_true)
     return BallRow(
         name=path.parent.name,
         first=BallErrors.of(time_s, R, covariance, R_true),

@@ -224,6 +224,88 @@ def balls_curve(given: _BallsOptions) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _BallOptions:
+    out: RunFolder
+    scenes: Annotated[str | None, Option(help="Some of them: clean_fly,noisy; else all.")] = None
+    frames: Annotated[int, Option(min=300, help="Of each movie, 100 a second; 6000 show the drift.")] = 1000
+    seed: Annotated[int, Option(min=0, help="Another one: other paint and motion.")] = 0
+    first: Annotated[bool, Option("--first", help="The first pass alone, without the precise method after it.")] = False
+    quiet: Quiet = False
+
+
+@bench.command("ball")
+def ball_scenes(given: _BallOptions) -> None:
+    """Track a ball under an animal of which nothing is known, in scenes as another program publishes its own."""
+    check_writable(given.out, folder_made=True)
+    from sphereorient.bench.ball import SCENES, measured, write_ball_scene
+    from sphereorient.methods.settings import Settings
+
+    names = list(SCENES) if given.scenes is None else names_in(given.scenes)
+    for name in names:
+        if name not in SCENES:
+            expected, got = ", ".join(SCENES), repr(name)[:40]
+            raise SettingsError(refusal("--scenes", expected=expected, got=got, do="choose some of these"))
+    rows = []
+    for name in names:
+        done = given.out / f"{name}-{given.frames}-{given.seed}.json"
+        if not done.exists():
+            folder = done.with_suffix("")
+            with progress_bar(given.quiet) as advance, writing(force=True):  # of this run
+                path = write_ball_scene(folder, SCENES[name], given.frames, given.seed, advance)
+                row = measured(path, Settings(), not given.first, advance)
+                write_text(done, json.dumps({"scene": name, **row.numbers()}, indent=1))
+        rows.append(json.loads(done.read_text()))
+    if not given.quiet:
+        _print_scenes(rows)
+
+
+def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
+    """Print what was measured of scenes, beside what other programs print of theirs."""
+    from rich.table import Table
+
+    from sphereorient.bench.ball import SCENES
+
+    title = (
+        "Nothing known before; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack prints them, of its pictures"
+    )
+    columns = (
+        "scene",
+        "found",
+        "first pass: step",
+        "orientation",
+        "refined: step",
+        "orientation",
+        "gain, axes",
+        "drift/min",
+    )
+    table = Table(*columns, "step / sigma", "CPU ms", "FicTrac", "spintrack", title=title)
+    for row in rows:
+        first, refined = row["first"], row.get("refined")
+        best, scene = refined or first, SCENES[row["scene"]]
+        walk = best["behaviour"]
+        drift = (f"{a:.2f}±{b:.2f}" for a, b in zip(walk["drift_deg_min"], walk["drift_sigma_deg_min"], strict=True))
+        table.add_row(
+            row["scene"],
+            f"{first['found']}",
+            *(_errors_of(first)),
+            *(_errors_of(refined) if refined else ("", "")),
+            " ".join(f"{one:.4f}" for one in walk["gain"]["value"][:3]),
+            " ".join(drift),
+            " ".join(f"{one['over_sigma']:.2f}" for one in (first, refined) if one),
+            f"{row['cpu_ms']:.1f}",
+            *(f"{median:.3f} ({most:.3f})" for median, most, _ in (scene.fictrac, scene.spintrack)),
+        )
+    print_table(table)
+
+
+def _errors_of(of: dict[str, Any]) -> tuple[str, str]:
+    return (
+        f"{of['step_p50_deg']:.4f} ({of['step_p95_deg']:.3f})",
+        f"{of['orientation_p50_deg']:.4f} ({of['orientation_p95_deg']:.3f})",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class _LiveDelayOptions:
     experiment: ExperimentPath
     rate: Annotated[str, Option(help="Frames a second; several, one after the other: 100,200,500.")] = "200"
