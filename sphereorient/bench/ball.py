@@ -375,7 +375,7 @@ class BallErrors:
 
     @classmethod
     def of(cls, time_s: Doubles, ours: Doubles, covariance: Doubles, true: Doubles) -> "BallErrors":
-        """Compare orientations (N, 3, 3), NaN: none, and their covariances (N, 3, 3), lab, with true ones."""
+        """Compare orientations (N, 3, 3), NaN: none, with true ones; covariances (N, 3, 3), lab, of what varies."""
         known: NDArray[np.bool_] = np.asarray(np.isfinite(ours).all((1, 2)))
         linked = known[1:] & known[:-1]
         turns = [rotation_vectors(one[1:] @ one[:-1].transpose(0, 2, 1)) for one in (ours, true)]
@@ -443,8 +443,11 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
         with writing(force=True):
             write_map(adjustment.texture(), texture)
         mapped = load_experiment(path).with_sphere(texture_path=texture)
-        (track,) = run_tracks(Request(experiment=mapped), MemoryStore(), progress=progress).values()
-        refined = BallErrors.of(time_s, track.orientation, track.orientation_cov, R_true)
+        store = MemoryStore()
+        (track,) = run_tracks(Request(experiment=mapped), store, progress=progress).values()
+        (known,) = (store.known or {}).values()
+        varying = track.orientation_cov - known.lasting.alone[0, :3, :3].numpy()
+        refined = BallErrors.of(time_s, track.orientation, varying, R_true)
     return BallRow(
         name=path.parent.name,
         first=BallErrors.of(time_s, R, covariance, R_true),

@@ -17,5 +17,5 @@ from sphereorient.cameras.camera import (
     without_perspective,
 )
 from sphereorient.cameras.io.cameras_yaml import add_model, load_cameras, load_covariance, save_cameras
-from sphereorient.cameras.model import PinholeCamera
+from sphereorient.cameras.model import PinholeCamera, field_of_focal
 from sphereorient.cameras.port import Port, PortCamera, in_air

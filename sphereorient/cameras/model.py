@@ -199,6 +199,11 @@ def focal_of_field(height_px: int, vfov_deg: float) -> float:
     return 0.5 * height_px / math.tan(math.radians(vfov_deg) / 2)
 
 
+def field_of_focal(height_px: int, f_px: float) -> float:
+    """Return the vertical field of view, degrees, of a focal length, px."""
+    return 2 * math.degrees(math.atan(0.5 * height_px / f_px))
+
+
 def middle_of_picture(image_size: tuple[int, int]) -> Tensor:
     """Return the middle of a W x H picture, (2,) float64 px; whole numbers are pixel centres."""
     return (torch.tensor(image_size, dtype=torch.float64) - 1) / 2

@@ -96,13 +96,15 @@ def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path |
     target = experiment.new_map_path()
     check_writable(target)
     with progress_bar(given.quiet) as advance:
-        found = first_map_of(experiment, settings, given.names, advance)
+        found, remarks = first_map_of(experiment, settings, given.names, advance)
     with writing(force=False):
         write_map(found, target)
     if not given.quiet:
         share = 100 if found.unseen is None else 100 * (1 - unseen_share(found.unseen))
         about = f"{share:.0f} % of the ball, by the first frames; its axes are the lab's at the first of them"
         typer.echo(f"note: no map: wrote {target}, {about}; `sphereorient map` learns a finer one.")
+        for remark in remarks:
+            typer.echo(f"note: {remark}")
         if experiment.texture_path is None:
             typer.echo(f"next: write texture: {target.name} in sphere: of {path}")
     return experiment.with_sphere(texture_path=target)

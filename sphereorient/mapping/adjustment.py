@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import centre_lab_mm
+from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import UNKNOWN, TextureMap
 from sphereorient.files.threads import Progress, counted, side_by_side, silent
 from sphereorient.mapping.disks import Crops
-from sphereorient.mapping.iterations import BLACK, WHITE
+from sphereorient.mapping.iterations import BLACK, WHITE, lowest
 from sphereorient.mapping.paint_cells import BallView, PaintCells
-from sphereorient.pose.camera_view import FIRST_BLUR_PX
+from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView
 from sphereorient.sphere.texture import map_directions
 
 LEVELS = 4.0, 2.0, 1.0  # pixels in the disk's middle along a cell, of one adjustment after the other
@@ -38,6 +38,8 @@ BLACKEST = 1e-3  # of the brightest light: the least
 ROBUST = 4.0  # deviations from the paint from which a picture counts less: what hides the ball, glare
 PRIOR = 0.05  # of the radius: error of the place at the start
 HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
+FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and how many to either side
+FOCAL_FRAMES = 60
 FARTHEST = 0.1  # of the radius, of a step: a place is near
 AT_ONCE = 4096  # cells
 LEAST = 1e-6  # of a weight
@@ -67,13 +69,15 @@ class Adjustment:
         return TextureMap(grey=grey.masked_fill(unseen, UNKNOWN), unseen=unseen if bool(unseen.any()) else None)
 
 
-def adjusted(crops: Crops, R_lab_body: Tensor, progress: Progress = silent) -> Adjustment:
+def adjusted(
+    crops: Crops, R_lab_body: Tensor, progress: Progress = silent, levels: Sequence[float] = LEVELS
+) -> Adjustment:
     """Return what all crops of a ball that stays in its place have in common, from near turns (N, 3, 3) and a near
-    place: coarse to fine.
+    place: coarse to fine, `levels` as `LEVELS`.
     """
     light = [_mean_light(crops, c) for c in range(len(crops.views))]
     found = Adjustment(crops=crops, R_lab_body=R_lab_body, cells=cells_of(crops), light=light, left=math.inf)
-    for pixels in counted("adjustment", LEVELS, len(LEVELS), progress):
+    for pixels in counted("adjustment", levels, len(levels), progress):
         found = replace(found, cells=cells_of(crops, pixels))
         near = NEAR * math.sqrt(4 * math.pi) / found.cells.side  # radii
         for _ in range(MOST_STEPS):
@@ -85,6 +89,43 @@ def adjusted(crops: Crops, R_lab_body: Tensor, progress: Progress = silent) -> A
             if _moved(step, found) < near and float(turn.norm(dim=1).median()) < near:
                 break
     return found
+
+
+def focal_ratio(found: Adjustment) -> float:
+    """Return by which factor the focal length of an only pinhole camera explains the pictures best, to some per cent; 1
+    where none that is 1.5 times longer or shorter does: seen from nearer, more of the ball's sides turns away.
+    """
+    rows = torch.linspace(0, len(found.R_lab_body) - 1, min(FOCAL_FRAMES, len(found.R_lab_body))).long()
+    begin = replace(found, crops=found.crops.where(rows), R_lab_body=found.R_lab_body[rows])
+
+    def at(log: float, start: Adjustment) -> Adjustment:
+        return adjusted(_with_focal(start.crops, math.exp(log)), start.R_lab_body, levels=LEVELS[:2])
+
+    tried = {log: at(log, begin) for log in (-FOCAL_STEP, 0.0, FOCAL_STEP)}
+    if min(tried, key=lambda log: tried[log].left) == 0.0:
+        return 1.0
+    tried |= {k * FOCAL_STEP: at(k * FOCAL_STEP, begin) for k in range(-FOCAL_STEPS, FOCAL_STEPS + 1) if abs(k) > 1}
+    log = min(tried, key=lambda log: tried[log].left)
+    here, step = tried[log], FOCAL_STEP / 4
+    for _ in range(FOCAL_STEPS):
+        before, after = at(-step, here), at(step, here)
+        best = min(before, here, after, key=lambda one: one.left)
+        if best is here:
+            break
+        here, log = best, log + (step if best is after else -step)
+    return math.exp(log + step * lowest(*(one.left**2 for one in (before, here, after))))
+
+
+def _with_focal(crops: Crops, ratio: float) -> Crops:
+    """Return a ball that one pinhole camera sees of the same size, but with another focal length."""
+    (view,) = crops.views
+    coarse = view.camera if isinstance(view.camera, CoarserCamera) else None
+    camera = view.camera if coarse is None else coarse.camera
+    assert isinstance(camera, PinholeCamera)
+    other: Camera = replace(camera, f_px=ratio * camera.f_px)
+    other = other if coarse is None else replace(coarse, camera=other)
+    X = ratio * (crops.position_lab_mm - (centre := centre_lab_mm(camera))) + centre
+    return replace(crops, views=[CameraView.of(view.name, other, view.scene)], position_lab_mm=X)
 
 
 def cells_of(place: Crops, pixels: float = 1.0) -> PaintCells:

@@ -83,6 +83,11 @@ class Crops:
         X = self.position_lab_mm[:1].expand(len(rows), 3)
         return replace(self, crops=list(zip(*rows, strict=True)), position_lab_mm=X, seen=use)
 
+    def where(self, rows: Tensor) -> "Crops":
+        """Return some frames (M,) int64."""
+        crops = [[row[k] for k in rows.tolist()] for row in self.crops]
+        return replace(self, crops=crops, position_lab_mm=self.position_lab_mm[rows], seen=self.seen[rows])
+
     def frames_with_ball(self) -> Tensor:
         """Return the frames (M,) int64 in which a camera sees the sphere; raise PaintError if fewer than two."""
         frames = torch.nonzero(self.seen.any(1))[:, 0]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from sphereorient.cameras import PinholeCamera, field_of_focal
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Recording, TextureMap, open_recording
@@ -14,6 +15,7 @@ from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.provenance import provenance
 from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
+from sphereorient.mapping.adjustment import focal_ratio
 from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
 from sphereorient.mapping.disks import fixed_place
 from sphereorient.mapping.first_pass import first_adjustment
@@ -95,12 +97,22 @@ def learn_map(
 
 def first_map_of(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, progress: Progress
-) -> TextureMap:
-    """Return the map of a ball in its place, of which there is none, see `first_adjustment`; raise as that does."""
+) -> tuple[TextureMap, list[str]]:
+    """Return the map of a ball in its place, of which there is none, and what the pictures contradict; see
+    `first_adjustment`, and raise as that does.
+    """
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         progress("place", 0, 1)
         place = fixed_place(recording, settings.paint, settings.locate)
-        return first_adjustment(recording, place, progress).texture()
+        found, remarks = first_adjustment(recording, place, progress), list[str]()
+        (name, camera), *others = recording.cameras.items()
+        if isinstance(camera, PinholeCamera) and not others:
+            ratio, height = focal_ratio(found), camera.image_size[1]
+            given, seen = (field_of_focal(height, float(camera.f_px) * one) for one in (1.0, ratio))
+            if ratio != 1.0:
+                told = f"the pictures tell a vertical field of view of about {seen:.3g} degrees, not {given:.3g}"
+                remarks.append(f"{name}: {told}: turns and heading are wrong by it; correct vfov_deg, and learn again")
+        return found.texture(), remarks
 
 
 def _own(kept: Path | None, name: str) -> Path | None:
