@@ -40,6 +40,7 @@ PRIOR = 0.05  # of the radius: error of the place at the start
 HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
 FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and how many to either side
 FOCAL_FRAMES = 60
+NEAREST = 2.0  # radii, of a camera from the ball's centre
 FARTHEST = 0.1  # of the radius, of a step: a place is near
 AT_ONCE = 4096  # cells
 LEAST = 1e-6  # of a weight
@@ -104,7 +105,9 @@ def focal_ratio(found: Adjustment) -> float:
     tried = {log: at(log, begin) for log in (-FOCAL_STEP, 0.0, FOCAL_STEP)}
     if min(tried, key=lambda log: tried[log].left) == 0.0:
         return 1.0
-    tried |= {k * FOCAL_STEP: at(k * FOCAL_STEP, begin) for k in range(-FOCAL_STEPS, FOCAL_STEPS + 1) if abs(k) > 1}
+    steps = (k * FOCAL_STEP for k in range(-FOCAL_STEPS, FOCAL_STEPS + 1) if abs(k) > 1)
+    distance = float(sights(begin.crops).norm())  # radii
+    tried |= {log: at(log, begin) for log in steps if distance * math.exp(log) > NEAREST}
     log = min(tried, key=lambda log: tried[log].left)
     here, step = tried[log], FOCAL_STEP / 4
     for _ in range(FOCAL_STEPS):
