@@ -174,28 +174,36 @@ def _gain(ours: Floats, theirs: Floats, of: Floats, exact: bool, reason: str) ->
 
 
 def _drift(time_s: Floats, R: Floats, R_reference: Floats, stretch: Rows, reason: str) -> tuple[Floats, Floats]:
-    """Return the drift (3,) of orientations (K, 3, 3), degrees a minute, and its standard error.
-    Errors are modelled as c + d t + R b: constant in the lab, drift, constant in the body. `stretch` (K,): those of the
-    reference; from one to the next the error is taken to go on.
+    """Return the drift (3,) of orientations (K, 3, 3), degrees a minute, and its standard error. Errors are modelled as
+    d t + c + R b: the drift, and constants in the lab and in the body, of each `stretch` (K,) of the reference.
     """
     if reason:
         return np.full(3, np.nan), np.full(3, np.nan)
-    error = _errors(R, R_reference, stretch)
-    along, lab = (time_s - time_s.mean())[:, None, None] / np.ptp(time_s), np.broadcast_to(np.eye(3), R.shape)
-    design = np.concatenate([lab, along * lab, R], axis=2).reshape(-1, 9)
-    inverse = np.linalg.inv(design.T @ design + np.diag([0.0] * 6 + [1.0] * 3))  # b is 0, with one frame's weight
-    body = (inverse @ (design.T @ error.ravel()))[6:]
-    # The error in the body is not known exactly: a drift about an axis about which the ball turns little may be one.
-    worse = np.sqrt(inverse.diagonal()[3:6] * np.square(along).sum())
-    slope, sigma = _slope(time_s, error - R @ body)
-    return np.rad2deg(slope) * 60, np.rad2deg(sigma * np.maximum(worse, 1.0)) * 60
-
-
-def _errors(R: Floats, R_reference: Floats, stretch: Rows) -> Floats:
-    """Return the rotation vectors (K, 3), rad, lab, from the reference (K, 3, 3), in the body axes of R by the first
-    frames of each stretch, to R. They grow on beyond a half turn, and from stretch to stretch.
-    """
     first, of = np.unique(stretch, return_index=True, return_inverse=True)[1:]
+    error = _errors(R, R_reference, first, of)[..., None]
+    along, lab = (time_s - time_s.mean())[:, None, None] / np.ptp(time_s), np.broadcast_to(np.eye(3), R.shape)
+    both = np.concatenate([lab, R], axis=2)
+    # One frame's weight for b = 0: of a ball that does not turn, c and b are the same.
+    square = segment_sums(both.mT @ both, of, len(first)) + np.diag([0.0] * 3 + [1.0] * 3)
+
+    def constants(vectors: Floats) -> Floats:
+        return np.asarray(
+            both @ np.linalg.solve(square, segment_sums(both.mT @ vectors, of, len(first)))[of], np.float64
+        )
+
+    rest = along * (along * lab - constants(along * lab))
+    inverse = np.linalg.inv(rest.sum(0))
+    drift = inverse @ (along * (error - constants(error))).sum(0)
+    slope, sigma = _slope(time_s, (error - constants(error - along * drift))[..., 0])
+    # A drift about an axis about which the ball turns little may be a constant in the body.
+    worse = np.sqrt(np.maximum(inverse.diagonal() * np.square(along).sum(), 1.0))
+    return np.rad2deg(slope) * 60, np.rad2deg(sigma * worse) * 60
+
+
+def _errors(R: Floats, R_reference: Floats, first: Rows, of: Rows) -> Floats:
+    """Return the rotation vectors (K, 3), rad, lab, from the reference (K, 3, 3), in the body axes of R by the first
+    frames of each stretch, to R; they grow on beyond a half turn. `first` (S,): where a stretch begins; `of` (K,).
+    """
     early = np.arange(len(R)) - first[of] < PER_BLOCK
     U, _, Vt = np.linalg.svd(segment_sums((R_reference.mT @ R)[early], of[early], len(first)))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
@@ -203,15 +211,13 @@ def _errors(R: Floats, R_reference: Floats, stretch: Rows) -> Floats:
     error = rotation_vectors(E)
     # Of the branches of a rotation vector the one nearest to the sum of the changes, which alone would gather noise.
     change = np.concatenate([error[:1], _turns(E)])
-    change[first[1:]] = error[first[1:]]
+    change[first] = error[first]
     rough = np.cumsum(change, axis=0)
     rough -= (rough - change)[first][of]
     angle = np.linalg.norm(error, axis=1, keepdims=True)
     axis = error / np.where(angle > 0, angle, 1.0)
     along = (rough * axis).sum(1, keepdims=True)
-    error = (angle + 2 * np.pi * np.round((along - angle) / (2 * np.pi))) * axis
-    ends = error[np.append(first[1:], len(R)) - 1]
-    return np.asarray(error + (np.cumsum(ends, axis=0) - ends)[of], np.float64)
+    return np.asarray((angle + 2 * np.pi * np.round((along - angle) / (2 * np.pi))) * axis, np.float64)
 
 
 def _slope(time_s: Floats, error: Floats) -> tuple[Floats, Floats]:
