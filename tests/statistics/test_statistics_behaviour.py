@@ -142,6 +142,13 @@ def test_alignment_takes_off_a_constant_turn_of_the_lab_and_only_where_it_is_ask
     assert abs(compared(LAB @ ours, theirs).gain.value[1] - 1) > 0.1
 
 
+def test_alignment_is_a_rotation_also_where_the_third_axis_is_noise():
+    turns = turns_of(600) * [1.0, 1.0, 0.01]
+    found = compared(turned(turns * [1.0, 1.0, -1.0]), turned(turns), align=True)
+    assert found.gain.value[2] < -0.5
+    assert found.apart_deg < 1
+
+
 def test_lost_frames_and_gaps_in_time_are_not_spanned():
     turns = turns_of(400)
     true = turned(turns)
@@ -234,7 +241,9 @@ def test_too_little_gives_nan_and_the_reason():
     assert np.isnan(found.drift_sigma_deg_min).all()
     assert found.length_ratio == pytest.approx(1.0)  # the walk needs no error
     about_y = turned(np.tile([0.0, 0.05, 0.0], (200, 1)))
-    assert "about one axis only" in compared(about_y, about_y, align=True).reason
+    found = compared(about_y, about_y, align=True)
+    assert "about one axis only" in found.reason
+    assert np.isnan([found.length_ratio, found.apart_deg]).all()
     found = compared(about_y, about_y)
     assert np.isnan(found.gain.value[0])
     assert found.gain.value[1] == pytest.approx(1.0)
