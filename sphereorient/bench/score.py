@@ -1,7 +1,7 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.files.hdf5 import UNNAMED, ball_groups
+from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.rotations import distance_deg, rotation_vectors, rotations
 from sphereorient.trajectory.walk import FICTRAC
@@ -156,11 +157,17 @@ def true_orientations(path: Path, time_s: Floats, sphere: str = UNNAMED) -> Floa
 
 def orientations_at(path: Path, frame: Frames) -> Floats:
     """Return R_lab_body (N, 3, 3) of truth.h5 in frames (N,), from 0; raise TrackError if there are too few."""
-    R = _read_truth(path)["orientation"]
-    if len(frame) and (frame.min() < 0 or frame.max() >= len(R)):
-        expected, got = f"frames 0 .. {len(R) - 1}", f"{frame.min()} .. {frame.max()}"
+    return _truth_at(path, frame)[1]
+
+
+def _truth_at(path: Path, frame: Frames) -> tuple[Floats, Floats]:
+    """Return times (N,), s, and the same."""
+    truth = _read_truth(path)
+    count = len(truth["time"])
+    if len(frame) and (frame.min() < 0 or frame.max() >= count):
+        expected, got = f"frames 0 .. {count - 1}", f"{frame.min()} .. {frame.max()}"
         raise TrackError(refusal(f"truth {path}", expected=expected, got=got, do=DO))
-    return R[frame]
+    return truth["time"][frame], truth["orientation"][frame]
 
 
 def _read_truth(path: str | Path, *names: str, sphere: str = UNNAMED, also: Sequence[str] = ()) -> dict[str, Floats]:
@@ -185,15 +192,6 @@ def _read_truth(path: str | Path, *names: str, sphere: str = UNNAMED, also: Sequ
     return truth
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Reference:
-    """Orientations to compare a track of N frames with; made by `reference_of`. NaN: none in this frame."""
-
-    R_lab_body: Floats  # (N, 3, 3)
-    start: NDArray[np.bool_]  # (N,), frames in which another tracker began anew
-    exact: bool  # the truth; else another tracker's
-
-
 def reference_of(path: Path, track: Trajectory) -> Reference:
     """Read the reference of a track: truth.h5 or another track.h5, by time, or FicTrac's .dat, by the frame number.
     Raise TrackError (of another kind, or no time in common) or BenchError (no FicTrac file).
@@ -204,7 +202,7 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
         row, there = _nearest(frame.astype(np.float64), track.time * track.frame_rate)
         R[there], start[there] = orientation[row[there]], begins[row[there]]
     elif not _is_track(path):
-        return Reference(R_lab_body=true_orientations(path, track.time, track.sphere), start=start, exact=True)
+        return Reference(R_lab_body=true_orientations(path, track.time, track.sphere))
     else:
         tracks = Tracks.load(path)
         other = next(iter((tracks if len(tracks) == 1 else tracks.picked(track.sphere)).values()))
@@ -214,6 +212,23 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
         do = "pass a result on the same movie, and frame_rate in experiment.yaml for FicTrac's"
         raise TrackError(refusal(f"reference {path}", expected="frames of the track", got="none of them", do=do))
     return Reference(R_lab_body=R, start=start, exact=False)
+
+
+def against(reference: Reference, track: Trajectory, align: str = "none") -> tuple[Floats, Behaviour]:
+    """Return errors of orientation (N,), degrees, as `aligned_errors_deg`, and behaviour of a track."""
+    errors_deg = aligned_errors_deg(track.orientation, reference.R_lab_body, align)
+    return errors_deg, behaviour_of(track, reference, align == "both")
+
+
+def another_result(truth_path: Path, frame: Frames, R: Floats) -> tuple[Trajectory, Floats]:
+    """Return another program's orientations (N, 3, 3) in frames (N,) of a ball in its place as a track, and the true
+    ones; raise TrackError if the truth has too few.
+    """
+    time_s, R_true = _truth_at(truth_path, frame)
+    still, cov = np.zeros((len(frame), 3)), np.tile(np.eye(3), (len(frame), 1, 1))
+    empty = Trajectory.empty(time_s)
+    track = replace(empty, orientation=R, position=still, position_cov=cov, valid=np.ones(len(frame), bool))
+    return track, R_true
 
 
 def _is_track(path: Path) -> bool:
@@ -262,7 +277,7 @@ def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
         got = f"{rows.shape[0]} lines of {rows.shape[1]}"
         raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
     sequence = rows[:, FICTRAC["sequence"]].ravel()
-    begins = np.diff(sequence, prepend=sequence[:1]) < (1 if sequence.any() else 0)
+    begins = np.append(False, np.diff(sequence) < (1 if sequence.any() else 0))  # without a counter it is 0
     return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]]), begins
 
 
@@ -277,7 +292,7 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
     """
     if align not in ALIGNMENTS:
         raise BenchError(refusal("--align", expected="none, body or both", got=repr(align)[:40], do="choose one"))
-    known = np.isfinite(R).all((1, 2))
+    known = np.isfinite(R + R_true).all((1, 2))
     out = np.full(len(R), np.nan)
     if known.any():
         measured, true = R[known], R_true[known]

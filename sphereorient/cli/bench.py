@@ -11,6 +11,7 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import (
+    Align,
     Cameras,
     ExperimentPath,
     Quiet,
@@ -22,6 +23,8 @@ from sphereorient.cli.options import (
     tracks_in,
 )
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.hdf5 import UNNAMED
+from sphereorient.files.provenance import without_nan
 from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import write_text, writing
 
@@ -29,6 +32,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from sphereorient.bench import BenchSettings, Results, Score
+    from sphereorient.bench.score import Floats
+    from sphereorient.statistics import Interval
+    from sphereorient.statistics.behaviour import Behaviour
 
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
@@ -65,23 +71,90 @@ def synth(
 @app.command()
 def score(
     track: TrackPath,
-    truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
+    reference: Annotated[
+        Path, Argument(metavar="REFERENCE", help="truth.h5; or another tracker's: track.h5, or FicTrac's .dat.")
+    ],
     sphere: SphereName = None,
     alike: Annotated[list[str] | None, Option(help="Balls whose names may be exchanged: a,c; repeatable.")] = None,
+    align: Align = "none",
+    as_json: Annotated[bool, Option("--json", help="Print orientation errors and behaviour as JSON.")] = False,
 ) -> None:
-    """Print the errors of a track against the exact truth of a synthetic experiment."""
+    """Print the errors of a track against exact truth, and gain, drift and walk against truth or another tracker."""
     from sphereorient.bench import score_track
-    from sphereorient.bench.score import given_to_others, named_as_true
+    from sphereorient.bench.score import against, given_to_others, named_as_true, reference_of
 
-    tracks = tracks_in(track, None)
+    tracks, numbers = tracks_in(track, None), []
+    given: dict[str, tuple[int, int]] = {}
     for names in alike or ():
-        tracks = named_as_true(tracks, truth, names_in(names))
-    given = given_to_others(tracks, truth) if len(tracks) > 1 else {}
+        tracks = named_as_true(tracks, reference, names_in(names))
     for name, one in tracks.picked(sphere).items():
-        print_table(error_table(score_track(one, truth), name))
+        of = reference_of(reference, one)
+        errors, behaviour = against(of, one, align)
+        if as_json:
+            numbers.append({"ball": name, "exact": of.exact, **error_numbers(errors), **behaviour.numbers()})
+            continue
+        if of.exact and align == "none":
+            print_table(error_table(score_track(one, reference), name))
+        else:
+            print_errors(errors, name, "error" if of.exact else "difference")
+        print_table(behaviour_table(behaviour, name, exact=of.exact))
+        given = given or (given_to_others(tracks, reference) if of.exact and len(tracks) > 1 else {})
         if name in given:
             wrong, changes = given[name]
             typer.echo(f"ball {name}: {wrong} frames given to another ball, {changes} exchanges")
+    if as_json:
+        about = {"track": str(track), "reference": str(reference), "align": align, "balls": numbers}
+        typer.echo(json.dumps(without_nan(about)))
+
+
+def error_numbers(errors_deg: "Floats") -> dict[str, Any]:
+    """Return how many errors of orientation (N,), degrees, are known, and their percentiles, for JSON."""
+    import numpy as np
+
+    known = errors_deg[np.isfinite(errors_deg)]
+    percentiles = np.percentile(known, (50, 95, 100)).tolist() if len(known) else [np.nan] * 3
+    return {"known": len(known), "error_deg": dict(zip(("median", "95 %", "largest"), percentiles, strict=True))}
+
+
+def print_errors(errors_deg: "Floats", ball: str, word: str = "error") -> None:
+    """Print how many errors of orientation (N,), degrees, are known, and their percentiles."""
+    from sphereorient.bench.results import WRONG_DEG
+
+    found = error_numbers(errors_deg)
+    typer.echo(f"{ball_words(ball)}{found['known']} of {len(errors_deg)} frames have an orientation")
+    if found["known"]:
+        percentiles = ", ".join(f"{name} {value:.4g}" for name, value in found["error_deg"].items())
+        wrong = float((errors_deg > WRONG_DEG).sum()) / found["known"]
+        typer.echo(f"{word}, degrees: {percentiles}; above {WRONG_DEG:g}: {100 * wrong:.3g} %")
+
+
+def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> "Table":
+    """Return gain, drift, heading and path against a reference as a table."""
+    from rich.table import Table
+
+    of, against = f" of ball {ball}" if ball else "", "the exact truth" if exact else "another tracker"
+    title = f"Behaviour{of} against {against}, {found.pairs} turns from frame to frame"
+    table = Table("quantity", "x", "y", "z", "along the rotation", title=title)
+
+    def gains(name: str, gain: "Interval") -> None:
+        table.add_row(name, *(f"{value:.4f}" for value in gain.value))
+        table.add_row("  95 %", *(f"{a:.4f} .. {b:.4f}" for a, b in zip(gain.low, gain.high, strict=True)))
+
+    gains("gain", found.gain)
+    if not exact:
+        table.add_row("  bounds", *(f"{a:.4f} .. {b:.4f}" for a, b in found.gain_bounds.T))
+    if found.gain_smooth is not None:
+        gains("gain, smoothed", found.gain_smooth)
+    drifts = zip(found.drift_deg_min, found.drift_sigma_deg_min, strict=True)
+    table.add_row("drift (degrees a minute)", *(f"{value:.3f} \u00b1 {sigma:.3f}" for value, sigma in drifts))
+    table.add_section()
+    if found.length_ratio == found.length_ratio:
+        table.add_row("heading at the end, difference (rad)", f"{found.heading_rad:.4f}")
+        table.add_row("length of the path, ratio", f"{found.length_ratio:.4f}")
+        table.add_row("ends of the paths apart, of the length", f"{100 * found.end_share:.3f} %")
+    table.add_row("lab axes apart (degrees)", f"{found.apart_deg:.3f}")
+    table.caption = found.reason and f"no gain, no drift: {found.reason}"
+    return table
 
 
 def error_table(found: "Score", ball: str | None = None) -> "Table":
@@ -393,38 +466,25 @@ def score_result(
     result: Annotated[Path, Argument(metavar="RESULT", help="track.h5, or another program's file.")],
     truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the scene.")],
     of: Annotated[str, Option("--format", help="sphereorient, or fictrac for its .dat.")] = "sphereorient",
-    align: Annotated[
-        str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
-    ] = "none",
+    align: Align = "none",
 ) -> None:
     """Print the errors of a track, or of another program's result, against the exact truth."""
-    import numpy as np
-
-    from sphereorient.bench.results import WRONG_DEG
-    from sphereorient.bench.score import READERS, aligned_errors_deg, orientations_at, true_orientations
-    from sphereorient.files.hdf5 import UNNAMED
+    from sphereorient.bench.score import READERS, against, another_result, true_orientations
+    from sphereorient.statistics.behaviour import Reference
 
     found = {}
     if of == "sphereorient":
         for name, track in tracks_in(result, None).items():
-            found[name] = track.orientation, true_orientations(truth, track.time, name)
+            found[name] = track, true_orientations(truth, track.time, name)
     elif of in READERS:
-        frame, R = READERS[of](result)
-        found[UNNAMED] = R, orientations_at(truth, frame)
+        found[UNNAMED] = another_result(truth, *READERS[of](result))
     else:
         known = ", ".join(["sphereorient", *READERS])
         raise SettingsError(refusal("--format", expected=known, got=repr(of)[:40], do="choose one"))
-    for name, (R, R_true) in found.items():
-        errors = aligned_errors_deg(R, R_true, align)
-        finite = errors[np.isfinite(errors)]
-        typer.echo(f"{ball_words(name)}{len(finite)} of {len(errors)} frames have an orientation")
-        if len(finite):
-            p50, p95, largest = np.percentile(finite, (50, 95, 100))
-            wrong = float((finite > WRONG_DEG).mean())
-            typer.echo(
-                f"error, degrees: median {p50:.4g}, 95 % {p95:.4g}, largest {largest:.4g}; "
-                f"above {WRONG_DEG:g}: {100 * wrong:.3g} %"
-            )
+    for name, (track, R_true) in found.items():
+        errors, behaviour = against(Reference(R_lab_body=R_true), track, align)
+        print_errors(errors, name)
+        print_table(behaviour_table(behaviour, name, exact=True))
 
 
 def _print(found: "Results") -> None:

@@ -19,6 +19,9 @@ YAML = (".yaml", ".yml")
 ExperimentPath = Annotated[Path, Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
 TrackPath = Annotated[Path, Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
 SphereName = Annotated[str | None, Option("--sphere", help="Of several balls, only this one.")]
+Align = Annotated[
+    str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
+]
 Cameras = Annotated[str | None, Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
 SettingsPath = Annotated[Path | None, Option(help="YAML as `sphereorient settings` writes it.")]
 Overrides = Annotated[list[str] | None, Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")]

@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import (
+    Align,
     CommonOptions,
     ExperimentPath,
     Quiet,
@@ -32,20 +33,28 @@ class _ReportOptions(CommonOptions):
     out: Annotated[Path, Option("--out", "-o", help="Folder to write: index.html, figures, tables.")]
     experiment: Annotated[list[Path] | None, Option(help="experiment.yaml: pictures, size, flow; repeatable.")] = None
     sphere: SphereName = None
+    against: Annotated[Path | None, Option(help="Reference: truth.h5, another track.h5, or FicTrac's .dat.")] = None
+    align: Align = "none"
 
 
 @app.command()
 def report(given: _ReportOptions) -> None:
     """Write statistics of tracks with error bars, figures, and a page with the findings."""
     check_writable(given.out, folder_made=True)
+    from sphereorient.bench.score import against, reference_of
     from sphereorient.experiment import load_experiment
     from sphereorient.report.build import write_report
 
     chosen = given.chosen("report").statistics
     known = [load_experiment(path) for path in given.experiment or ()]
     loaded, command = load_tracks(given.tracks, given.sphere), command_line()
+    found = {}
+    if given.against is not None:
+        for name, track in loaded.items():
+            found[name] = against(reference_of(given.against, track), track, given.align)[1]
     with progress_bar(given.quiet, unit="") as advance:
-        words = write_report(loaded, given.out, experiments=known, settings=chosen, progress=advance, command=command)
+        write = partial(write_report, experiments=known, settings=chosen, progress=advance, behaviours=found)
+        words = write(loaded, given.out, command=command)
     for verdict in words:
         doubt = verdict.grade == "doubt"
         if doubt or not given.quiet:

@@ -23,11 +23,12 @@ from sphereorient.report.gallery import gallery
 from sphereorient.report.page import page_html, strip_html
 from sphereorient.report.plots import report_figures
 from sphereorient.report.plots.style import Plan, of_tracks, write_figure
-from sphereorient.report.tables import tables_of, write_tables
+from sphereorient.report.tables import behaviour_tables, tables_of, write_tables
 from sphereorient.report.texture_map import worn_figure
 from sphereorient.report.verdicts import Verdict, verdicts
 from sphereorient.sphere import load_texture
 from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
+from sphereorient.statistics.behaviour import Behaviour
 from sphereorient.statistics.cameras import camera_distances
 from sphereorient.trajectory import Trajectory
 
@@ -51,9 +52,11 @@ def write_report(
     settings: StatisticsSettings | None = None,
     progress: Progress = silent,
     command: str = "",
+    behaviours: Mapping[str, Behaviour] | None = None,
 ) -> list[Verdict]:
     """Write the report of tracks, by file name, whole or not at all, and return its findings.
     `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
+    `behaviours`: those of tracks that have a reference.
     Raises TrackError (no valid frame, or tracks of kernels and of smoothers together), ExperimentError (one without a
     track, or two that contradict each other), OutputError (`out` cannot be written, or contains something else).
     """
@@ -66,7 +69,7 @@ def write_report(
     of = summary, tracks, camera_distances(list(tracks.values()), rough)
     words = verdicts(*of)
     with _folder(out) as aside:
-        tables = tables_of(*of)
+        tables = [*tables_of(*of), *behaviour_tables(behaviours or {})]
         page = page_html(
             summary,
             tracks,

@@ -46,7 +46,7 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "tiles": _tiles(summary, tracks),
         "each": _each(tables["tracks"]) if len(tracks) > 1 else None,
-        "grids": [grid for grid in (*_moments(summary), _flow(tables)) if grid["rows"]],
+        "grids": [grid for grid in (_behaviour(tables), *_moments(summary), _flow(tables)) if grid["rows"]],
         "settings": str(yaml.safe_dump(settings, sort_keys=False)).rstrip(),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
         "footer": f"sphereorient {versions()['sphereorient']}; {command}",
@@ -191,6 +191,24 @@ def _flow(tables: Mapping[str, Table]) -> Grid:
     cells = [[(row["name"], ""), (row["formula"], ""), (f"{row['value']:.4g}", "")] for row in rows]
     about = "Components' rms, corrected if the errors are known."
     return {"title": "The sphere and its flow", "about": about, "head": ["", "", "value"], "rows": cells}
+
+
+def _behaviour(tables: Mapping[str, Table]) -> Grid:
+    shown = {"heading_rad": "heading, rad", "length_ratio": "path, ratio", "end_share": "ends apart, of the path"}
+    rows = tables["behaviour"].rows if "behaviour" in tables else ()
+    cells = []
+    for row in rows:
+        gains = [
+            (f"{row[key]:.4f}", f"{row[f'{key}_low']:.4f} to {row[f'{key}_high']:.4f}")
+            if math.isfinite(row[key])
+            else ("\u2013", row["reason"])
+            for key in ("gain", "gain_smooth")
+        ]
+        drift = _plain(row["drift_deg_min"]), f"\u00b1 {_plain(row['drift_sigma_deg_min'])}"
+        walk = [(_plain(row[key]), "") for key in shown]
+        cells.append([(f"{row['file']}, {row['about']}", ""), *gains, drift, *walk])
+    head = ["", "gain", "gain, smoothed", "drift, \u00b0 a minute", *shown.values()]
+    return {"title": "Against the reference", "about": "About the lab's axes.", "head": head, "rows": cells}
 
 
 def _provenance(name: str, track: Trajectory) -> dict[str, Any]:

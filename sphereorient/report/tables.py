@@ -15,6 +15,7 @@ from sphereorient.files.whole_file import put_aside
 from sphereorient.report.columns import plain_cell
 from sphereorient.report.frame_warnings import stated_error
 from sphereorient.statistics import Interval, Summary
+from sphereorient.statistics.behaviour import Behaviour
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.density import Density, stretched_exponential
 from sphereorient.statistics.isotropy import Isotropy
@@ -68,6 +69,14 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
         found += [(name, f"{of.about}, {level}", _rows(**of.columns())) for name, of in tabled.items()]
     tables = [Table(name=name, about=about, rows=list(rows)) for name, about, rows in found]
     return [table for table in tables if table.rows]
+
+
+def behaviour_tables(found: Mapping[str, Behaviour]) -> list[Table]:
+    """Return the table of gain, drift and walk against a reference, by file name; none where there is none."""
+    rows = [row for name, one in found.items() for row in _rows(file=name, **one.columns())]
+    return (
+        [Table(name="behaviour", about="gain, drift and walk against the reference, 95 %", rows=rows)] if rows else []
+    )
 
 
 def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import ShapeError, refusal
 from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.rotations import rotation_vectors
 from sphereorient.trajectory.walk import arcs, walk_of
 
@@ -44,6 +45,22 @@ class Behaviour:
     end_share: float  # distance between the ends of the paths over the length of the reference's
     reason: str
 
+    def columns(self) -> dict[str, Any]:
+        """Return a row for each gain, by names of columns with their units, for tables."""
+        unknown = Interval(**dict.fromkeys(("value", "low", "high", "error"), np.full(4, np.nan)))
+        drift, sigma = (np.append(part, np.nan) for part in (self.drift_deg_min, self.drift_sigma_deg_min))
+        return {
+            "about": list(ABOUT),
+            "gain": self.gain,
+            "gain_smooth": unknown if self.gain_smooth is None else self.gain_smooth,
+            "drift_deg_min": drift,
+            "drift_sigma_deg_min": sigma,
+            "heading_rad": self.heading_rad,
+            "length_ratio": self.length_ratio,
+            "end_share": self.end_share,
+            "reason": self.reason,
+        }
+
     def numbers(self) -> dict[str, Any]:
         """Return all as numbers, lists and texts, for JSON."""
 
@@ -56,58 +73,56 @@ class Behaviour:
         return {"about": list(ABOUT), **plain, "gain": listed(self.gain), "gain_smooth": smooth}
 
 
-def behaviour_of(
-    time_s: Floats,
-    R_lab_body: Floats,
-    R_reference: Floats,
-    *,
-    exact: bool,
-    align: bool = False,
-    fixed: bool = True,
-    start: Mask | None = None,
-    R_smooth: Floats | None = None,
-) -> Behaviour:
-    """Compare orientations (N, 3, 3) at times (N,), s, with those of a reference; NaN: not measured.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference:
+    """Orientations to compare a track of N frames with, at its times. NaN: none in this frame."""
+
+    R_lab_body: Floats  # (N, 3, 3)
+    start: Mask | None = None  # (N,), frames in which another tracker began anew; None: it never did
+    exact: bool = True  # the truth; else another tracker's
+
+
+def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -> Behaviour:
+    """Compare the orientations of a track, measured and smoothed, with those of a reference.
 
     A constant rotation of the body axes is taken off always, one of the lab axes with `align`: the axes are then those
     of a reference that is `exact`, else those of the track. Against an exact reference a gain is the regression through
-    zero of our turns on its; else the geometric mean of the two regressions. `fixed`: the ball stays in its place, and
-    has a walk. `start` (N,): frames in which the reference begins anew. `R_smooth`: the smoothed orientations.
+    zero of our turns on its; else the geometric mean of the two regressions. A ball that moves has no walk.
     Raises ShapeError: not the same number of frames. Source: docs/accuracy.md, Behaviour.
     """
-    frames = len(time_s)
-    begins = np.zeros(frames, bool) if start is None else start
-    smooth = np.full((frames, 3, 3), np.nan) if R_smooth is None else R_smooth
-    if not frames == len(R_lab_body) == len(R_reference) == len(begins) == len(smooth):
-        got, do = f"{len(R_lab_body)} and {len(R_reference)}", "give both at the times of the track"
-        raise ShapeError(refusal("behaviour_of", expected=f"{frames} orientations each", got=got, do=do))
-    known: Mask = np.asarray(np.isfinite(R_lab_body + R_reference).all(axis=(1, 2)))
+    frames, time_s = len(track), track.time
+    begins = np.zeros(frames, bool) if reference.start is None else reference.start
+    if not frames == len(reference.R_lab_body) == len(begins):
+        got, do = f"{len(reference.R_lab_body)} and {len(begins)}", "give the reference at the times of the track"
+        raise ShapeError(refusal("reference", expected=f"{frames} orientations and starts", got=got, do=do))
+    R, R_true = track.orientation, reference.R_lab_body
+    known: Mask = np.asarray(np.isfinite(R + R_true).all(axis=(1, 2)))
     step_s = np.diff(time_s)
     usual_s = float(np.median(step_s)) if frames > 1 else np.inf
     linked = known[1:] & known[:-1] & ~begins[1:] & (step_s <= GAP * usual_s)
-    ours, theirs = (_turns(R)[linked] for R in (R_lab_body, R_reference))
+    ours, theirs, smooth = (_turns(of)[linked] for of in (R, R_true, track.orientation_smooth))
     A, second = _lab_axes(ours, theirs)
-    apart = float(np.linalg.norm(rotation_vectors(A[None])))
-    reason = _why_not(int(linked.sum()), second if align else 1.0)
-    left = A if align and second > ONE_AXIS else np.eye(3)
-    of_track, of_reference = (left.T, np.eye(3)) if exact else (np.eye(3), left)
-    R, R_true = of_track @ R_lab_body, of_reference @ R_reference
-    ours, theirs, smoothed = ours @ of_track.T, theirs @ of_reference.T, _turns(smooth)[linked] @ of_track.T
-    gain, bounds = _gain(ours, theirs, ours, exact, reason)
-    there = np.isfinite(smoothed).all(1)
-    again = reason or _why_not(int(there.sum()), 1.0)
-    gain_smooth = _gain(ours[there], theirs[there], smoothed[there], exact, again)[0] if there.any() else None
+    sure = second > ONE_AXIS
+    reason = _why_not(int(linked.sum()), sure or not align)
+    left = A if align and sure else np.eye(3)
+    of_track, of_reference = (left.T, np.eye(3)) if reference.exact else (np.eye(3), left)
+    R, R_true = of_track @ R, of_reference @ R_true
+    ours, theirs, smooth = ours @ of_track.T, theirs @ of_reference.T, smooth @ of_track.T
+    gain, bounds = _gain(ours, theirs, ours, reference.exact, reason)
+    there = np.isfinite(smooth).all(1)
+    again = reason or _why_not(int(there.sum()), True)
+    gain_smooth = _gain(ours[there], theirs[there], smooth[there], reference.exact, again)[0]
     drift, sigma = _drift(time_s[known], R[known], R_true[known], np.cumsum(begins)[known], reason)
-    walk = _walk(time_s, R, R_true, known & ~begins) if fixed and second > 0 else (np.nan,) * 3
+    walk = _walk(time_s, R, R_true, known & ~begins) if track.held and (sure or not align) else (np.nan,) * 3
     return Behaviour(
         frames=int(known.sum()),
         pairs=int(linked.sum()),
         gain=gain,
         gain_bounds=bounds,
-        gain_smooth=gain_smooth,
+        gain_smooth=gain_smooth if there.any() else None,
         drift_deg_min=drift,
         drift_sigma_deg_min=sigma,
-        apart_deg=float(np.rad2deg(apart)),
+        apart_deg=float(np.rad2deg(np.linalg.norm(rotation_vectors(A[None])))) if sure else np.nan,
         heading_rad=walk[0],
         length_ratio=walk[1],
         end_share=walk[2],
@@ -120,10 +135,10 @@ def _turns(R: Floats) -> Floats:
     return rotation_vectors(R[1:] @ R[:-1].mT)
 
 
-def _why_not(pairs: int, second: float) -> str:
+def _why_not(pairs: int, sure: bool) -> str:
     if pairs < FEWEST_BLOCKS * PER_BLOCK:
         return f"{pairs} pairs of neighbouring frames in both, at least {FEWEST_BLOCKS * PER_BLOCK} needed"
-    return "" if second > ONE_AXIS else "the ball turns about one axis only: the lab axes cannot be aligned"
+    return "" if sure else "the ball turns about one axis only: the lab axes cannot be aligned"
 
 
 def _lab_axes(ours: Floats, theirs: Floats) -> tuple[Floats, float]:
@@ -159,39 +174,46 @@ def _gain(ours: Floats, theirs: Floats, of: Floats, exact: bool, reason: str) ->
 
 
 def _drift(time_s: Floats, R: Floats, R_reference: Floats, stretch: Rows, reason: str) -> tuple[Floats, Floats]:
-    """Return the drift (3,) of orientations (K, 3, 3), degrees a minute, and its standard error.
-    Errors are modelled as c + d t + R b: constant in the lab, drift, constant in the body. `stretch` (K,): those of the
-    reference; from one to the next the error is taken to go on.
+    """Return the drift (3,) of orientations (K, 3, 3), degrees a minute, and its standard error. Errors are modelled as
+    d t + c + R b: the drift, and constants in the lab and in the body, of each `stretch` (K,) of the reference.
     """
     if reason:
         return np.full(3, np.nan), np.full(3, np.nan)
-    error = _unwrapped(R @ _in_one_body(R_reference, R, stretch).mT, stretch)
+    first, of = np.unique(stretch, return_index=True, return_inverse=True)[1:]
+    error = _errors(R, R_reference, first, of)[..., None]
     along, lab = (time_s - time_s.mean())[:, None, None] / np.ptp(time_s), np.broadcast_to(np.eye(3), R.shape)
-    design = np.concatenate([lab, along * lab, R], axis=2).reshape(-1, 9)
-    inverse = np.linalg.inv(design.T @ design + np.diag([0.0] * 6 + [1.0] * 3))  # b is 0, with one frame's weight
-    body = (inverse @ (design.T @ error.ravel()))[6:]
-    # The error in the body is not known exactly: a drift about an axis about which the ball turns little may be one.
-    worse = np.sqrt(inverse.diagonal()[3:6] * np.square(along).sum())
-    slope, sigma = _slope(time_s, error - R @ body)
-    return np.rad2deg(slope) * 60, np.rad2deg(sigma * np.maximum(worse, 1.0)) * 60
+    both = np.concatenate([lab, R], axis=2)
+    # One frame's weight for b = 0: of a ball that does not turn, c and b are the same.
+    square = segment_sums(both.mT @ both, of, len(first)) + np.diag([0.0] * 3 + [1.0] * 3)
+
+    def constants(vectors: Floats) -> Floats:
+        return np.asarray(
+            both @ np.linalg.solve(square, segment_sums(both.mT @ vectors, of, len(first)))[of], np.float64
+        )
+
+    rest = along * (along * lab - constants(along * lab))
+    inverse = np.linalg.inv(rest.sum(0))
+    drift = inverse @ (along * (error - constants(error))).sum(0)
+    slope, sigma = _slope(time_s, (error - constants(error - along * drift))[..., 0])
+    # A drift about an axis about which the ball turns little may be a constant in the body.
+    worse = np.sqrt(np.maximum(inverse.diagonal() * np.square(along).sum(), 1.0))
+    return np.rad2deg(slope) * 60, np.rad2deg(sigma * worse) * 60
 
 
-def _in_one_body(R_reference: Floats, R: Floats, stretch: Rows) -> Floats:
-    """Return the reference (K, 3, 3) with the body axes of R, by the mean rotation over each stretch."""
-    of = np.unique(stretch, return_inverse=True)[1]
-    sums = segment_sums(R_reference.mT @ R, of, int(of.max()) + 1)
-    U, _, Vt = np.linalg.svd(sums)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return np.asarray(R_reference @ (U @ Vt)[of], np.float64)
-
-
-def _unwrapped(E: Floats, stretch: Rows) -> Floats:
-    """Return the rotation vectors (K, 3) of errors (K, 3, 3), which may grow beyond a half turn: of their branches that
-    nearest to the sum of the changes.
+def _errors(R: Floats, R_reference: Floats, first: Rows, of: Rows) -> Floats:
+    """Return the rotation vectors (K, 3), rad, lab, from the reference (K, 3, 3), in the body axes of R by the first
+    frames of each stretch, to R; they grow on beyond a half turn. `first` (S,): where a stretch begins; `of` (K,).
     """
-    change = np.where(np.diff(stretch)[:, None] == 0, _turns(E), 0.0)
+    early = np.arange(len(R)) - first[of] < PER_BLOCK
+    U, _, Vt = np.linalg.svd(segment_sums((R_reference.mT @ R)[early], of[early], len(first)))
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    E = R @ (R_reference @ (U @ Vt)[of]).mT
     error = rotation_vectors(E)
-    rough = error[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(change, axis=0)])
+    # Of the branches of a rotation vector the one nearest to the sum of the changes, which alone would gather noise.
+    change = np.concatenate([error[:1], _turns(E)])
+    change[first] = error[first]
+    rough = np.cumsum(change, axis=0)
+    rough -= (rough - change)[first][of]
     angle = np.linalg.norm(error, axis=1, keepdims=True)
     axis = error / np.where(angle > 0, angle, 1.0)
     along = (rough * axis).sum(1, keepdims=True)

@@ -1,19 +1,23 @@
-"""`sphereorient score`: the errors of a track, and refusals in one line."""
+"""`sphereorient score`: the errors of a track, its behaviour against any reference, and refusals in one line."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from conftest import REPO
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from sphereorient.bench import score_track
 from sphereorient.cli import app
-from sphereorient.errors import TrackError
+from sphereorient.errors import BenchError, TrackError
 from sphereorient.trajectory import Tracks, Trajectory
 
 TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"
@@ -61,9 +65,9 @@ def test_the_errors_of_a_track_are_printed(track):
     assert all(name in words for name in ("acceleration", "omega_body", "alpha_lab", "alpha_body"))
 
 
-def refused(*arguments: object) -> str:
+def refused(*arguments: object, error: type[Exception] = TrackError) -> str:
     run = CliRunner().invoke(app, ["score", *map(str, arguments)])
-    assert isinstance(run.exception, TrackError), (run.exception, run.output)
+    assert isinstance(run.exception, error), (run.exception, run.output)
     assert "\n" not in str(run.exception)
     return str(run.exception)
 
@@ -75,7 +79,11 @@ def test_files_of_another_kind_are_refused_in_one_line(track, tmp_path):
     assert "none.h5" in refused(tmp_path / "none.h5", TRUTH)
     assert "none.h5" in refused(track, tmp_path / "none.h5")
     assert "truth.h5" in refused(TRUTH, track)  # swapped
-    assert "got a track" in refused(track, track)
+    assert "expected lines of numbers between commas" in refused(track, tmp_path / "none.dat", error=BenchError)
+    later = Trajectory.load(track)
+    replace(later, time=later.time + 100.0).save(tmp_path / "later.h5")
+    assert "later.h5: expected frames of the track, got none of them" in refused(track, tmp_path / "later.h5")
+    assert "--align: expected none, body or both" in refused(track, TRUTH, "--align", "frame", error=BenchError)
 
 
 def swarm(folder: Path) -> tuple[Path, Path]:
@@ -113,3 +121,90 @@ def test_several_balls_are_scored_by_name_and_alike_ones_may_be_exchanged(tmp_pa
 def refused_of_one(folder: Path, truth: Path) -> str:
     replace(Tracks.load(folder / "tracks.h5")["a"], sphere="").save(folder / "one.h5")
     return refused(folder / "one.h5", truth)
+
+
+TURN = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
+
+
+@pytest.fixture
+def on_a_ball(tmp_path: Path) -> Trajectory:
+    """The track of a ball in its place, 200 frames, whose turns about y are too small by 3 %; its truth and FicTrac's
+    table, in other axes, beside it.
+    """
+    rng = np.random.default_rng(4)
+    turns = 0.02 * rng.normal(size=(200, 3)) + np.array([0.0, 0.06, 0.0])
+    small = turns * np.array([1.0, 0.97, 1.0])
+    true, ours = (
+        np.stack(list(accumulate(Rotation.from_rotvec(t).as_matrix(), lambda R, T: T @ R))) for t in (turns, small)
+    )
+    time = np.arange(200) / 100.0
+    with h5py.File(tmp_path / "truth.h5", "w") as file:
+        file["time"], file["orientation"], file["position"] = time, true, np.zeros((200, 3))
+    rows = np.zeros((200, 25))
+    rows[:, 0], rows[:, 22] = np.arange(200), np.arange(1, 201)
+    rows[:, 8:11] = Rotation.from_matrix(TURN @ true @ true[0].T @ TURN.T).as_rotvec()
+    np.savetxt(tmp_path / "theirs.dat", np.delete(rows, 50, axis=0), delimiter=", ")
+    empty = Trajectory.empty(time, cameras=("cam1",), frame_rate=100.0, method="precise")
+    cov = np.tile(0.01**2 * np.eye(3), (200, 1, 1))
+    track = replace(empty, orientation=ours, orientation_cov=cov, orientation_smooth=ours, position_cov=cov)
+    track = replace(track, position=np.zeros((200, 3)), valid=np.ones(200, bool))
+    track.save(tmp_path / "track.h5")
+    return track
+
+
+def scored(*arguments: object) -> dict[str, Any]:
+    run = CliRunner().invoke(app, ["score", *map(str, arguments), "--json"])
+    assert run.exit_code == 0, run.exception
+    (ball,) = json.loads(run.output)["balls"]
+    return dict(ball)
+
+
+def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_track(on_a_ball, tmp_path):
+    of_truth = scored(tmp_path / "track.h5", tmp_path / "truth.h5")
+    assert of_truth["exact"]
+    assert of_truth["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=1e-6)
+    assert of_truth["gain_smooth"] == of_truth["gain"]
+    of_fictrac = scored(tmp_path / "track.h5", tmp_path / "theirs.dat", "--align", "both")
+    assert not of_fictrac["exact"]
+    assert of_fictrac["pairs"] == 197  # frame 50 is not in it
+    assert of_fictrac["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
+    assert of_fictrac["apart_deg"] == pytest.approx(np.rad2deg(Rotation.from_matrix(TURN).magnitude()), abs=0.3)
+    with h5py.File(tmp_path / "truth.h5") as file:
+        replace(on_a_ball, orientation=file["orientation"][()]).save(tmp_path / "other.h5")
+    reversed_ = scored(tmp_path / "other.h5", tmp_path / "track.h5")
+    assert reversed_["gain"]["value"][1] == pytest.approx(1 / 0.97, abs=1e-6)
+
+
+def test_a_table_whose_counter_begins_anew_is_cut_there(on_a_ball, tmp_path):
+    rows = np.loadtxt(tmp_path / "theirs.dat", delimiter=",")
+    turned = Rotation.from_rotvec(rows[100:, 8:11]) * Rotation.from_rotvec(rows[100, 8:11]).inv()
+    rows[100:, 8:11], rows[100:, 22] = turned.as_rotvec(), np.arange(1, 100)
+    np.savetxt(tmp_path / "theirs.dat", rows, delimiter=", ")
+    found = scored(tmp_path / "track.h5", tmp_path / "theirs.dat", "--align", "both")
+    assert found["pairs"] == 196
+    assert found["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
+
+
+def test_behaviour_is_printed_and_a_short_track_says_why_not(on_a_ball, tmp_path):
+    told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
+    assert "0.9700" in told
+    assert all(word in told for word in ("gain, smoothed", "drift (degrees a minute)", "length of the path, ratio"))
+    told = CliRunner().invoke(app, ["bench", "score", str(tmp_path / "theirs.dat"), str(tmp_path / "truth.h5"),
+                                    "--format", "fictrac", "--align", "both"]).output  # fmt: skip
+    assert "1.0000 .. 1.0000" in told
+    on_a_ball[:40].save(tmp_path / "short.h5")
+    short = scored(tmp_path / "short.h5", tmp_path / "truth.h5")
+    assert short["gain"]["value"] == [None] * 4
+    assert short["reason"] == "39 pairs of neighbouring frames in both, at least 80 needed"
+
+
+def test_a_report_has_the_behaviour_against_its_reference(on_a_ball, tmp_path):
+    track, truth, out = (tmp_path / name for name in ("track.h5", "truth.h5", "report"))
+    run = CliRunner().invoke(app, ["report", str(track), "--against", str(truth), "--out", str(out)])
+    assert run.exit_code == 0, run.exception
+    page = (out / "index.html").read_text()
+    assert "Against the reference" in page
+    assert "0.9700" in page
+    rows = (out / "tables" / "behaviour.csv").read_text().splitlines()
+    assert rows[0].startswith("file,about,gain,gain_low,gain_high,gain_smooth")
+    assert len(rows) == 5
