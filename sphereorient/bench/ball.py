@@ -273,13 +273,12 @@ class _Film:
             cv2.remap(self._paint, u.numpy(), v.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32
         )
 
-    def frame(self, k: int, count: int, R_before: Tensor, R: Tensor) -> NDArray[np.uint8]:
-        """Return the picture of frame k."""
-        scene, open_ = self.scene, np.zeros(1)
+    def frame(self, k: int, count: int, R: Tensor, turns: tuple[Tensor, Tensor]) -> NDArray[np.uint8]:
+        """Return the picture of frame k, whose exposure has its middle at R; `turns` (3,): to it, and on to the next."""
+        scene, share = self.scene, np.zeros(1)
         if scene.exposure:
-            open_ = scene.exposure * (np.arange(EXPOSURES) + 0.5) / EXPOSURES
-        turn = so3.log(R @ R_before.mT)
-        paint = np.mean([self._seen(so3.exp(-share * turn) @ R) for share in open_], axis=0)
+            share = scene.exposure * ((np.arange(EXPOSURES) + 0.5) / EXPOSURES - 0.5)
+        paint = np.mean([self._seen(so3.exp(one * turns[one > 0]) @ R) for one in share.tolist()], axis=0)
         fine = np.stack([paint * self._shade + self._glint, self._hit], -1)
         height, width = (side // SAMPLES for side in fine.shape[:2])
         light, cover = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
@@ -337,7 +336,7 @@ def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, pro
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for k in range(frames):
             progress("render", k, frames)
-            yield film.frame(k, frames, R[max(0, k - 1)], R[k])
+            yield film.frame(k, frames, R[k], (turns[k], turns[min(k + 1, frames - 1)]))
 
     make_folder(folder, f"folder {folder}")
     write_ffv1(folder / "cam1.mkv", pictures(), RATE_HZ)
