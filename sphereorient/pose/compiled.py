@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sphereorient.cameras import in_air, sphere_disk_px
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
 from sphereorient.pose import fit
@@ -168,6 +170,9 @@ def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float
     found = torch.empty(len(views), len(position_lab_mm), 3, dtype=torch.float64)
     X, count = ctypes.c_void_p(at(position_lab_mm, torch.float64)), ctypes.c_int64(len(position_lab_mm))
     for view, to in zip(views, found, strict=True):
+        if isinstance(in_air(view.camera), FisheyeCamera):  # this code measures along the camera's x
+            to[:, :2], to[:, 2] = sphere_disk_px(view.camera, position_lab_mm, radius_mm)
+            continue
         scene, _alive = _of_view(view)
         code.disks(ctypes.byref(scene), X, ctypes.c_double(radius_mm), ctypes.c_void_p(to.data_ptr()), count)
     return found[..., :2], found[..., 2]

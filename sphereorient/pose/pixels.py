@@ -95,8 +95,9 @@ class LinesOfSight:
             torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
         )
         rays = camera.rays(torch.stack([u, v], dim=-1))
-        self.direction = rays.direction_lab.float().movedim(-1, 0).contiguous()  # (3, H, W)
-        origin = rays.origin_lab_mm
+        self.sees = torch.isfinite(rays.direction_lab).all(-1).numpy()  # (H, W) bool, pixels with a line of sight
+        self.direction = rays.direction_lab.nan_to_num().float().movedim(-1, 0).contiguous()  # (3, H, W)
+        origin = rays.origin_lab_mm.nan_to_num()
         self.one_origin = bool((origin == origin[0, 0]).all())
         self.origin = origin.float().movedim(-1, 0)[:, :1, :1] if self.one_origin else origin.float().movedim(-1, 0)
         self.axes = camera.R_cam_lab[:2].float()
