@@ -16,8 +16,8 @@ NEAR_AXIS = 0.03  # rad; below it the series in the angle are exact to 1e-16
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FisheyeCamera(PolynomialCamera):
-    """Kannala-Brandt's lens, OpenCV's `fisheye` model: a point at the angle theta from the axis, also behind the camera,
-    appears at the distance f theta (1 + k1 theta^2 + ... + k4 theta^8) from `centre_px`. With k = 0 equidistant.
+    """Kannala-Brandt's lens, OpenCV's `fisheye` model: a point at the angle theta from the axis, up to pi, appears at the
+    distance f theta (1 + k1 theta^2 + ... + k4 theta^8) from `centre_px`. With k = 0 equidistant.
     Pixels beyond the fold of the polynomial, or theta = pi, see nothing (NaN): the corners of many such pictures.
     Source: Kannala and Brandt 2006, eq. (6), without their asymmetric terms.
     """
@@ -78,7 +78,7 @@ class FisheyeCamera(PolynomialCamera):
         """Return points at their angle from the axis, rad, in their direction about it; not seen is the axis behind."""
         aside2, depth = x_cam_mm[..., :2].square().sum(-1, keepdim=True), x_cam_mm[..., 2:]
         near = (depth > 0) & (aside2 < NEAR_AXIS**2 * depth.square())
-        seen = near | (aside2 > (16 * torch.finfo(depth.dtype).eps * depth).square())  # less is rounding only
+        seen = near | (aside2 > torch.finfo(depth.dtype).eps * depth.square())  # less is rounding only
         one = torch.ones_like(depth)
         ahead = torch.where(near, depth, one)
         t2 = torch.where(near, aside2, torch.zeros_like(aside2)) / ahead.square()
