@@ -16,9 +16,9 @@ NEAR_AXIS = 0.03  # rad; below it the series in the angle are exact to 1e-16
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FisheyeCamera(PolynomialCamera):
-    """Kannala-Brandt's lens, OpenCV's `fisheye` model: a point at the angle theta from the axis, up to pi, appears at the
-    distance f theta (1 + k1 theta^2 + ... + k4 theta^8) from `centre_px`. With k = 0 equidistant.
-    Pixels beyond the fold of the polynomial, or theta = pi, see nothing (NaN): the corners of many such pictures.
+    """Kannala-Brandt's lens, OpenCV's `fisheye` model: a point at the angle theta from the axis, below pi, appears at
+    the distance f theta (1 + k1 theta^2 + ... + k4 theta^8) from `centre_px`. With k = 0 it is equidistant. Pixels
+    beyond the fold of the polynomial, or theta = pi, see nothing (NaN): often the corners of the picture.
     Source: Kannala and Brandt 2006, eq. (6), without their asymmetric terms.
     """
 

@@ -196,6 +196,8 @@ def settle(
             frame = frames[b][c]
             shot[b * cameras + c] = _Shot(frame.ctypes.data, *frame.strides, frame.itemsize, round(u), round(v))
     near.scene, near.shot = ctypes.addressof(scene), ctypes.addressof(shot)
+    axes = [view.sight.axes_at(middles) for view, middles in zip(disks.views, disks.middle_px, strict=True)]
+    near.axes = at(torch.stack(axes, 1))
     near.moved = at(begin.moved, torch.float64) if instants > 1 else None
     if disks.hidden is not None:
         near.some_hidden = at(disks.hidden[:, thinned_places(disks.hidden.shape[1], FIRST_EVERY)])
