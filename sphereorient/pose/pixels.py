@@ -23,6 +23,7 @@ OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  
 # Side of a tile: least, in standard deviations of the blur (3 px: errors over sigma are 1.0 with 14 px, 1.4 with 6),
 # and how many there are at least across half a disk.
 TILE_PX, TILE_BLURS, FEWEST_TILES = 6, 10.0, 3
+BACKWARD = -0.17  # cosine to the axis of lines of sight that are used: beyond, a disk is twice as wide as high
 INNER = 0.67  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
@@ -96,7 +97,8 @@ class LinesOfSight:
             torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
         )
         rays = camera.rays(torch.stack([u, v], dim=-1))
-        self.sees = torch.isfinite(rays.direction_lab).all(-1).numpy()  # (H, W) bool, pixels with a line of sight
+        ahead = rays.direction_lab @ camera.R_cam_lab[2]
+        self.sees = (ahead > BACKWARD).numpy()  # (H, W) bool; False also without a line of sight
         self.direction = rays.direction_lab.nan_to_num().float().movedim(-1, 0).contiguous()  # (3, H, W)
         origin = rays.origin_lab_mm.nan_to_num()
         self.one_origin = bool((origin == origin[0, 0]).all())

@@ -283,8 +283,10 @@ def test_pixels_without_a_line_of_sight_do_not_count():
     assert view.background.shown is not None
     assert not view.background.shown[0, 0]
     assert view.background.shown[21, 29]
+    assert view.background.shown[21, 42]  # 1.56 rad from the axis
+    assert not view.background.shown[21, 44]  # 1.81 rad: a ball there is no disk
     assert torch.isfinite(view.sight.direction).all()
-    cut = cut_pixels(places(), view.background, view.sight, (4.0, 4.0), disk_stencil(9.0))
+    cut = cut_pixels(places(), view.background, view.sight, (16.0, 12.0), disk_stencil(9.0))
     assert 0 < int(cut.inside.sum()) < cut.inside.numel()
     assert CameraView.of("cam1", camera("pinhole"), scene).background.shown is None
 
