@@ -8,7 +8,7 @@ beside the results.
 import math
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +39,10 @@ from sphereorient.report.texture_map import write_map
 from sphereorient.run import MemoryStore, Request
 from sphereorient.run.stages import run_tracks
 from sphereorient.sphere.texture import map_directions
-from sphereorient.statistics.behaviour import Behaviour, behaviour_of
+from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
 from sphereorient.synth.motion import Motion6D
 from sphereorient.synth.write import write_truth
+from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.rotations import rotation_vectors
 
 Floats = NDArray[np.float32]
@@ -274,7 +275,7 @@ class _Film:
         )
 
     def frame(self, k: int, count: int, R: Tensor, turns: tuple[Tensor, Tensor]) -> NDArray[np.uint8]:
-        """Return the picture of frame k, whose exposure has its middle at R; `turns` (3,): to it, and on to the next."""
+        """Return the picture of frame k, at R in the middle of the exposure; `turns` (3,): to it, and to the next."""
         scene, share = self.scene, np.zeros(1)
         if scene.exposure:
             share = scene.exposure * ((np.arange(EXPOSURES) + 0.5) / EXPOSURES - 0.5)
@@ -386,8 +387,23 @@ class BallErrors:
             step_deg=np.rad2deg(np.linalg.norm(steps, axis=1)),
             orientation_deg=aligned_errors_deg(ours[known], true[known], "both"),
             over_sigma=float(np.sqrt(np.mean((steps / stated) ** 2))),
-            behaviour=behaviour_of(time_s, ours, true, exact=True, align=True),
+            behaviour=behaviour_of(_track_of(time_s, ours), Reference(R_lab_body=true), align=True),
         )
+
+
+def _track_of(time_s: Doubles, R_lab_body: Doubles) -> Trajectory:
+    """Return a track with orientations alone, of a ball in its place."""
+    none = Trajectory.empty(
+        time_s,
+        cameras=("cam1",),
+        frame_rate=RATE_HZ,
+        method="precise",
+        settings="",
+        experiment="",
+        provenance={},
+        length_unit="radii",
+    )
+    return replace(none, orientation=R_lab_body)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

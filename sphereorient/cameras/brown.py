@@ -97,10 +97,9 @@ def shrinkage(bend: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PolynomialCamera(CentralCamera):
-    """Perspective with Brown's polynomial on a plane that the model defines."""
+    """A lens with Brown's polynomial on a plane that the model defines."""
 
-    k: Tensor  # (3,), radial k1, k2, k3
-    p: Tensor  # (2,), tangential p1, p2
+    k: Tensor  # (n,), radial k1, k2, ...
 
     def __post_init__(self) -> None:
         """Refuse also a distortion that folds inside the picture; its rim is enough."""
@@ -113,8 +112,9 @@ class PolynomialCamera(CentralCamera):
             raise camera_error("k, p", "a distortion that can be undone in the picture", got, do)
 
     @property
+    @abstractmethod
     def _p_opencv(self) -> Tensor:
-        return self.p
+        """(2,), tangential, in OpenCV's order."""
 
     @abstractmethod
     def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
@@ -140,6 +140,7 @@ class BrownCamera(PolynomialCamera):
     """Perspective with Brown-Conrady distortion of X/Z and Y/Z; k, p without unit, as OpenCV's k1, k2, p1, p2, k3."""
 
     f_px: Tensor  # (2,), fx and fy
+    p: Tensor  # (2,), tangential p1, p2
 
     MODEL: ClassVar[str] = "brown"
     KEYS: ClassVar[tuple[Key, ...]] = (
@@ -156,6 +157,10 @@ class BrownCamera(PolynomialCamera):
         """(2,), pixels per unit of slope."""
         return self.f_px
 
+    @property
+    def _p_opencv(self) -> Tensor:
+        return self.p
+
     def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
         return (uv_px - self.centre_px.to(uv_px)) / self.f_px.to(uv_px)
 
@@ -170,6 +175,7 @@ class OpenPTVCamera(PolynomialCamera):
     Source: OpenPTV: sensor shift, polynomial, affine part x' = scx x - sin(she) y, y' = cos(she) y (its classic form).
     """
 
+    p: Tensor  # (2,), tangential p1, p2
     f_mm: Tensor  # (), principal distance
     pixel_pitch_mm: Tensor  # (2,)
     scx: Tensor  # (), scale of x
@@ -220,7 +226,7 @@ class OpenPTVCamera(PolynomialCamera):
 
 def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
     """Apply the polynomial to points (..., 2), any unit, about the distortion's centre; NaN, gradient 0, past the fold.
-    k (3,): radial k1, k2, k3, unit^-2, -4, -6. p (2,): tangential p1, p2 in OpenCV's order, unit^-1.
+    k (n,): radial k1, k2, ..., unit^-2, -4, ... p (2,): tangential p1, p2 in OpenCV's order, unit^-1.
     Source: Brown 1966 as OpenCV writes it: x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2).
     """
     ahead = _before_fold(xy, k, p)
@@ -249,9 +255,8 @@ def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 def fold2(k: Tensor) -> float:
     """Return the squared radius at which the radial polynomial folds; infinite without fold."""
-    k1, k2, k3 = k.detach().tolist()
-    # 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 = 0, solved for 1/s: the leading coefficient is then 1 for any k.
-    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    # 1 + 3 k1 s + 5 k2 s^2 + ... = 0, solved for 1/s: the leading coefficient is then 1 for any k.
+    roots = np.roots([1.0, *(each * (2 * n + 3) for n, each in enumerate(k.detach().tolist()))])
     inverse = float(roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].max(initial=0.0))
     return 1.0 / inverse if inverse > 1e-300 else math.inf
 
@@ -259,17 +264,24 @@ def fold2(k: Tensor) -> float:
 def _bent(xy: Tensor, k: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
     """Return moved points and the entries xx, xy, yy of the symmetric Jacobian."""
     x, y = xy.unbind(-1)
-    k1, k2, k3 = k.unbind()
     p1, p2 = p.unbind()
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    rise = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # twice d radial / d r^2
+    radial = 1 + r2 * _series(r2, k)
+    rise = 2 * _series(r2, k * (torch.arange(len(k)).to(k) + 1))  # twice d radial / d r^2
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     xx = radial + rise * x * x + 2 * p1 * y + 6 * p2 * x
     xy_slope = rise * x * y + 2 * p1 * x + 2 * p2 * y
     yy = radial + rise * y * y + 6 * p1 * y + 2 * p2 * x
     return torch.stack([u, v], dim=-1), torch.stack([xx, xy_slope, yy], dim=-1)
+
+
+def _series(r2: Tensor, k: Tensor) -> Tensor:
+    """Return k1 + k2 r2 + k3 r2^2 + ... in the shape of r2."""
+    *others, total = k.unbind()
+    for each in reversed(others):
+        total = each + r2 * total
+    return total
 
 
 def _newton(xy: Tensor, goal: Tensor, k: Tensor, p: Tensor) -> Tensor:
@@ -287,11 +299,11 @@ def _before_fold(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
-    k1, k2, k3 = k.unbind()
+    by_r = k * (2 * torch.arange(len(k)).to(k) + 3)
 
     def value_and_slope(r: Tensor) -> tuple[Tensor, Tensor]:
         r2 = r * r
-        return r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) - goal, 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3))
+        return r * (1 + r2 * _series(r2, k)) - goal, 1 + r2 * _series(r2, by_r)
 
     low, high = torch.zeros_like(goal), goal.clamp_max(fold)
     for _ in range(10):  # until the root lies in the upper half of the bracket, or 1000 times away from the goal

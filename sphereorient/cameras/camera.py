@@ -95,6 +95,9 @@ class Camera(Protocol):
     def rays(self, uv_px: Tensor) -> Rays:
         """Return the rays of pixels (..., 2); behind a wall they start on its liquid side."""
 
+    def across_lab(self, x_lab_mm: Tensor) -> Tensor:
+        """Return the unit direction, (3,) or (..., 3), along which a sphere at points (..., 3) shows its radius."""
+
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Return the pixels (..., 2) at which the same camera without distortion images what `uv_px` images."""
 
@@ -143,6 +146,10 @@ class CoarserCamera:
     def rays(self, uv_px: Tensor) -> Rays:
         """Return the rays of pixels (..., 2)."""
         return self.camera.rays(self._fine(uv_px))
+
+    def across_lab(self, x_lab_mm: Tensor) -> Tensor:
+        """As of the camera."""
+        return self.camera.across_lab(x_lab_mm)
 
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Return the pixels (..., 2) of the camera without distortion."""
@@ -231,9 +238,11 @@ def centre_lab_mm(camera: Camera) -> Tensor:
 
 
 def sphere_disk_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return middle (..., 2) and radius (...) along x, px, of a sphere's picture at positions (..., 3), mm, lab."""
-    right = camera.R_cam_lab[0] * radius_mm
-    centre, rim = camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
+    """Return middle (..., 2) and radius (...), px, of a sphere's picture at positions (..., 3), mm, lab.
+    The radius is along the camera's x, of a fisheye lens about its axis.
+    """
+    aside = camera.across_lab(position_lab_mm) * radius_mm
+    centre, rim = camera.project(torch.stack([position_lab_mm, position_lab_mm + aside]))
     return centre, (rim - centre).norm(dim=-1)
 
 

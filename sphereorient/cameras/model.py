@@ -89,6 +89,10 @@ class CameraModel(ABC):
     def rays(self, uv_px: Tensor) -> Rays:
         """Return the rays of pixels (..., 2)."""
 
+    def across_lab(self, x_lab_mm: Tensor) -> Tensor:
+        """Return the camera's x axis, (3,): along it a sphere shows its radius."""
+        return self.R_cam_lab[0].to(x_lab_mm)
+
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Return the pixels (..., 2) of the camera without distortion; this default changes nothing."""
         check_points("uv_px", uv_px, 2)
@@ -112,27 +116,36 @@ class CentralCamera(CameraModel):
     @property
     @abstractmethod
     def focal_px(self) -> Tensor:
-        """(2,), pixels per unit of slope X/Z and Y/Z on the axis."""
+        """(2,), pixels per unit of slope X/Z and Y/Z, or per rad, on the axis."""
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that are not in front of the camera."""
+        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that the camera does not see."""
         check_points("x_lab_mm", x_lab_mm, 3)
         x_cam_mm = x_lab_mm @ self.R_cam_lab.to(x_lab_mm).mT + self.T_cam_lab_mm.to(x_lab_mm)
-        depth = x_cam_mm[..., 2:]
-        before = depth > 0
-        # Both branches of where need a finite argument, or the gradient of the unused one is NaN.
-        slope = x_cam_mm[..., :2] / torch.where(before, depth, torch.ones_like(depth))
-        uv_px = self.distort(slope * self.focal_px.to(slope) + self.centre_px.to(slope))
-        return torch.where(before, uv_px, torch.full_like(uv_px, torch.nan))
+        flat, seen = self._flattened(x_cam_mm)
+        uv_px = self.distort(flat * self.focal_px.to(flat) + self.centre_px.to(flat))
+        return torch.where(seen, uv_px, torch.full_like(uv_px, torch.nan))
 
     def rays(self, uv_px: Tensor) -> Rays:
         """Return the rays (..., 3) of pixels (..., 2), which start at the projection centre."""
         check_points("uv_px", uv_px, 2)
-        slope = (self.undistort(uv_px) - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
-        direction_cam = torch.cat([slope, torch.ones_like(slope[..., :1])], dim=-1)
-        direction_cam = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
-        direction_lab = direction_cam @ self.R_cam_lab.to(uv_px)  # rows: R_lab_cam applied to every direction
+        flat = (self.undistort(uv_px) - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
+        direction_lab = self._direction_cam(flat) @ self.R_cam_lab.to(uv_px)  # rows: R_lab_cam of every direction
         return Rays(origin_lab_mm=self.centre_lab_mm.to(uv_px).expand_as(direction_lab), direction_lab=direction_lab)
+
+    def _flattened(self, x_cam_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points (..., 3) on the plane that `focal_px` scales, here slopes, and whether they are seen, (..., 1);
+        others have finite values there, or the gradient of the unused branch is NaN.
+        """
+        depth = x_cam_mm[..., 2:]
+        before = depth > 0
+        return x_cam_mm[..., :2] / torch.where(before, depth, torch.ones_like(depth)), before
+
+    def _direction_cam(self, flat: Tensor) -> Tensor:
+        """Return the unit directions (..., 3) of points (..., 2) of that plane."""
+        direction_cam = torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1)
+        unit: Tensor = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
+        return unit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

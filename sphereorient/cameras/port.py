@@ -155,6 +155,10 @@ class PortCamera:
         """Return the pixels (..., 2) that `undistort` takes to `uv_px`, px."""
         return self.camera.distort(uv_px)
 
+    def across_lab(self, x_lab_mm: Tensor) -> Tensor:
+        """Return that of the camera in air."""
+        return self.camera.across_lab(x_lab_mm)
+
     def rays(self, uv_px: Tensor) -> Rays:
         """Return the rays in the liquid of pixels (..., 2), from the wall's liquid side; NaN beside the wall."""
         return self.port.refract(self.camera.rays(uv_px))

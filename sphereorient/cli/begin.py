@@ -140,7 +140,8 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
     known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
     missing = _write_experiment([look], target, [*known, *changes], {look.name: mask.name} if hidden else None)
     R_cam_lab = said.R_animal_cam.mT.tolist()  # the lab is the animal's frame
-    _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab))
+    model = "fisheye" if said.fisheye else "pinhole"
+    _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab, model))
     if not quiet:
         typer.echo(_found(look))
         _end(target, missing, _next(target, cameras, [look]), made)

@@ -97,8 +97,8 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     if len(cameras) > 1:
         axes = [each.rays((torch.tensor(each.image_size, dtype=torch.float64) - 1) / 2) for each in cameras.values()]
         middle, _ = nearest_point(axes)
-    right_lab = camera.R_cam_lab[0] * diameter_mm / 2
-    rim = camera.project(torch.stack([middle - right_lab, middle + right_lab]))
+    aside_lab = camera.across_lab(middle) * diameter_mm / 2
+    rim = camera.project(torch.stack([middle - aside_lab, middle + aside_lab]))
     diameter_px = float((rim[1] - rim[0]).norm())
     if not 4 < diameter_px < max(camera.image_size):
         got = f"a sphere of {diameter_px:.3g} px in the middle of the volume"

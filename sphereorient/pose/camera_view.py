@@ -45,7 +45,11 @@ class CameraView:
     @classmethod
     def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":
         """Return the view of a camera whose scene is known."""
-        return cls(name=name, camera=camera, sight=LinesOfSight(camera), **vars(scene))
+        sight, background = LinesOfSight(camera), scene.background
+        if not sight.sees.all():
+            shown = sight.sees if background.shown is None else sight.sees & background.shown
+            scene = replace(scene, background=replace(background, shown=shown))
+        return cls(name=name, camera=camera, sight=sight, **vars(scene))
 
     @property
     def scene(self) -> CameraScene:

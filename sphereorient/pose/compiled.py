@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sphereorient.cameras import in_air, sphere_disk_px
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
 from sphereorient.pose import fit
@@ -168,6 +170,9 @@ def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float
     found = torch.empty(len(views), len(position_lab_mm), 3, dtype=torch.float64)
     X, count = ctypes.c_void_p(at(position_lab_mm, torch.float64)), ctypes.c_int64(len(position_lab_mm))
     for view, to in zip(views, found, strict=True):
+        if isinstance(in_air(view.camera), FisheyeCamera):  # this code measures along the camera's x
+            to[:, :2], to[:, 2] = sphere_disk_px(view.camera, position_lab_mm, radius_mm)
+            continue
         scene, _alive = _of_view(view)
         code.disks(ctypes.byref(scene), X, ctypes.c_double(radius_mm), ctypes.c_void_p(to.data_ptr()), count)
     return found[..., :2], found[..., 2]
@@ -191,6 +196,8 @@ def settle(
             frame = frames[b][c]
             shot[b * cameras + c] = _Shot(frame.ctypes.data, *frame.strides, frame.itemsize, round(u), round(v))
     near.scene, near.shot = ctypes.addressof(scene), ctypes.addressof(shot)
+    axes = [view.sight.axes_at(middles) for view, middles in zip(disks.views, disks.middle_px, strict=True)]
+    near.axes = at(torch.stack(axes, 1))
     near.moved = at(begin.moved, torch.float64) if instants > 1 else None
     if disks.hidden is not None:
         near.some_hidden = at(disks.hidden[:, thinned_places(disks.hidden.shape[1], FIRST_EVERY)])

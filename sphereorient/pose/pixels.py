@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.cameras import Camera
+from sphereorient.cameras import Camera, R_cam_view, in_air
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.locate import Background
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
@@ -22,6 +23,7 @@ OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  
 # Side of a tile: least, in standard deviations of the blur (3 px: errors over sigma are 1.0 with 14 px, 1.4 with 6),
 # and how many there are at least across half a disk.
 TILE_PX, TILE_BLURS, FEWEST_TILES = 6, 10.0, 3
+BACKWARD = -0.17  # cosine to the axis of lines of sight that are used: beyond, a disk is twice as wide as high
 INNER = 0.67  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
@@ -95,11 +97,15 @@ class LinesOfSight:
             torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
         )
         rays = camera.rays(torch.stack([u, v], dim=-1))
-        self.direction = rays.direction_lab.float().movedim(-1, 0).contiguous()  # (3, H, W)
-        origin = rays.origin_lab_mm
+        ahead = rays.direction_lab @ camera.R_cam_lab[2]
+        self.sees = (ahead > BACKWARD).numpy()  # (H, W) bool; False also without a line of sight
+        self.direction = rays.direction_lab.nan_to_num().float().movedim(-1, 0).contiguous()  # (3, H, W)
+        origin = rays.origin_lab_mm.nan_to_num()
         self.one_origin = bool((origin == origin[0, 0]).all())
         self.origin = origin.float().movedim(-1, 0)[:, :1, :1] if self.one_origin else origin.float().movedim(-1, 0)
-        self.axes = camera.R_cam_lab[:2].float()
+        self.R_cam_lab = camera.R_cam_lab.float()
+        self.axes = self.R_cam_lab[:2]
+        self.wide = isinstance(in_air(camera), FisheyeCamera)
         self.size = width, height
         self.pitch_rad = _to_next_pixel(self.direction)
         apart = not self.one_origin
@@ -109,6 +115,16 @@ class LinesOfSight:
         """Return the change of the line of sight to the next pixel: angle, rad, and start, mm; each (1,)."""
         there = self.pitch_mm.shape[0] > 1
         return self.pitch_rad[v, u : u + 1], self.pitch_mm[v * there, u * there : u * there + 1]
+
+    def axes_at(self, middle_px: Tensor) -> Tensor:
+        """Return x and y of disks about B places (B, 2), px, in the lab, (B, 2, 3): the camera's. Those of a fisheye
+        camera are turned to the line of sight, which may be along its x.
+        """
+        if not self.wide:
+            return self.axes.expand(len(middle_px), 2, 3)
+        u, v = middle_px.nan_to_num().round().long().clamp_min(0).minimum(torch.tensor(self.size) - 1).unbind(-1)
+        turned = R_cam_view(self.direction[:, v, u].mT @ self.R_cam_lab.mT)
+        return (self.R_cam_lab.mT @ turned.nan_to_num()).mT[:, :2]
 
     def about(self, middle_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Return the lines of sight nearest to B places (B, 2), px: direction and origin (B, 3), and `pitch` (B,)."""
@@ -246,7 +262,7 @@ def cut_pixels(
         clipped=torch.from_numpy(clipped)[None],
         direction=flat.index_select(1, at)[None],
         origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],
-        axes=sight.axes[None],
+        axes=sight.axes_at(torch.tensor([[u, v]])),
         pitch_rad=pitch_rad,
         pitch_mm=pitch_mm,
         moved=torch.zeros(1, 6, dtype=torch.float64),

@@ -1154,6 +1154,7 @@ typedef struct {
     Stencil some, all; /* of the first stage, and of the second */
     const Scene *scene; /* (cameras) */
     const Shot *shot;   /* (poses, cameras) */
+    const float *axes;   /* (poses, cameras, 2, 3), of the disks */
     const double *moved; /* (poses, 6), or none */
     int64_t some_more, all_more; /* further iterations after a long step */
     double near_rad;             /* a longer step is long */
@@ -1245,7 +1246,7 @@ static void cut_disks(const Near *n, const Cut *cut, int64_t pose) {
         }
         float *single = cut->single;
         for (int i = 0; i < 3 && t->origins == 1; i++) single[c * 3 + i] = scene->origin[i];
-        for (int i = 0; i < 6; i++) single[3 * t->cameras + c * 6 + i] = scene->axes[i];
+        for (int i = 0; i < 6; i++) single[3 * t->cameras + c * 6 + i] = n->axes[(pose * t->cameras + c) * 6 + i];
         const int64_t here = within(shot->v, height - 1) * (width - 1) + within(shot->u, width - 1);
         single[9 * t->cameras + c] = scene->pitch_rad[here];
         single[10 * t->cameras + c] = scene->pitch_mm[scene->origins > 1 ? here : 0];

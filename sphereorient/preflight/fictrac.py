@@ -17,9 +17,9 @@ from sphereorient.sphere.view import fitted_circle
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 DO = "name the config.txt with which FicTrac ran"
-# Keys that change the picture and are not taken over: values without effect, what is expected, and what to do.
+# Keys that change the picture: values that are taken over, what is expected, and what to do.
 NOT_READ = {
-    "fisheye": (("n", ""), "n, a lens without fisheye", "undistort the movie, then calibrate its camera"),
+    "fisheye": (("n", "y", ""), "y or n", "correct it"),
     "thr_rgb_tfrm": (("grey", "gray", ""), "grey, all colours", "write a movie of this colour alone, in grey"),
 }
 
@@ -31,6 +31,7 @@ class FicTracConfig:
     movie: Path
     rate_hz: float | None  # None: that of the file
     vfov_deg: float  # field of view, from the top of the picture to its bottom
+    fisheye: bool  # equidistant: vfov_deg / height is the angle of every pixel
     ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
     circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
     R_animal_cam: Tensor  # (3, 3): x ahead, y to the right, z down, of the animal
@@ -48,8 +49,10 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
         if not values.get(name):
             raise refused(f"{path}, {name}", what, "none", DO)
     vfov = _numbers(values["vfov"])
-    if len(vfov) != 1 or not 0 < vfov[0] < 180:
-        raise refused(f"{path}, vfov", "degrees, 0 to 180", f"'{values['vfov'][:40]}'", "correct it")
+    fisheye = values.get("fisheye", "").lower() == "y"
+    widest = 360 if fisheye else 180
+    if len(vfov) != 1 or not 0 < vfov[0] < widest:
+        raise refused(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
     for name, (usual, what, do) in NOT_READ.items():
         if values.get(name, usual[0]).lower() not in usual:
             raise refused(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
@@ -64,6 +67,7 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
         movie=path.parent / values["src_fn"],
         rate_hz=rate[0] if len(rate) == 1 and rate[0] > 0 else None,
         vfov_deg=vfov[0],
+        fisheye=fisheye,
         ignored=tuple(_polygons(path, values.get("roi_ignr", ""))),
         circle_px=fitted_circle(limb.reshape(-1, 2)) if len(limb) >= 6 and len(limb) % 2 == 0 else None,
         R_animal_cam=so3.exp(torch.tensor(turn, dtype=torch.float64)),

@@ -182,12 +182,14 @@ def field_key(look: FirstLook, vfov_deg: float | None) -> DraftKey:
     return DraftKey(name=name, value=known or ..., comment=comment, example=WIDE_DEG, asked=True)
 
 
-def camera_keys(look: FirstLook, field: DraftKey, R: Sequence[Sequence[float]] | None = None) -> list[DraftKey]:
+def camera_keys(
+    look: FirstLook, field: DraftKey, R: Sequence[Sequence[float]] | None = None, model: str = "pinhole"
+) -> list[DraftKey]:
     """Return the keys of cameras.yaml for one camera of which at most the field of view, `field_key`, is known.
-    R: R_cam_lab, where the lab is not the camera's own frame.
+    R: R_cam_lab, where the lab is not the camera's own frame; model: pinhole or fisheye.
     """
     height, width = look.movie.frame_shape
-    entry: dict[str, Any] = {"model": "pinhole", "image_size": [width, height]}
+    entry: dict[str, Any] = {"model": model, "image_size": [width, height]}
     told = f"WRITE THIS: vfov_deg: N, {field.comment}"
     if field.value is not ...:
         entry["vfov_deg"] = field.value

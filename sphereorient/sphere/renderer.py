@@ -212,7 +212,7 @@ def aperture_matrix(size_px: int, supersampling: int, sigma_px: float) -> Tensor
 def rim_directions(camera: Camera, position_lab_mm: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return unit directions from centres (..., 3) to the rim, (..., count, 3), and the rays' directions (..., 3)."""
     sight = camera.rays(camera.project(position_lab_mm)).direction_lab
-    across = torch.linalg.cross(sight, camera.R_cam_lab[0].to(sight).expand_as(sight))
+    across = torch.linalg.cross(sight, camera.across_lab(position_lab_mm).to(sight).expand_as(sight))
     across = across / across.norm(dim=-1, keepdim=True)
     angle = torch.arange(count, dtype=sight.dtype, device=sight.device) * (2 * math.pi / count)
     second = torch.linalg.cross(sight, across)

@@ -115,7 +115,7 @@ class PixelRays:
         wider = _wider(window, 1, camera.image_size[::-1])
         v, u = torch.meshgrid(*(torch.arange(side.start, side.stop).double() for side in wider), indexing="ij")
         rays = camera.rays(torch.stack([u, v], -1))
-        exact = torch.stack([rays.origin_lab_mm, rays.direction_lab]).movedim(-1, 1).contiguous().numpy()
+        exact = torch.stack([rays.origin_lab_mm, rays.direction_lab]).movedim(-1, 1).nan_to_num().contiguous().numpy()
         linear = np.stack([exact, *np.gradient(exact, axis=(3, 2))], 1).astype(np.float32)
         return cls(window=wider, exact=exact, linear=linear).within(window)
 

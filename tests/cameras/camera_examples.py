@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.cameras.model import TelecentricCamera
 
 SIZE = (650, 480)
@@ -61,6 +62,18 @@ def brown(**changes: object) -> BrownCamera:
     return BrownCamera(**(parameters | changes))
 
 
+def fisheye(**changes: object) -> FisheyeCamera:
+    parameters: dict[str, object] = {
+        "image_size": SIZE,
+        "R_cam_lab": turned(),
+        "T_cam_lab_mm": f64(T_MM),
+        "centre_px": f64((331.0, 228.5)),
+        "f_px": f64((700.0, 715.0)),
+        "k": f64((-0.02, 0.005, -0.004, 0.001)),
+    }
+    return FisheyeCamera(**(parameters | changes))
+
+
 def telecentric(**changes: object) -> TelecentricCamera:
     parameters: dict[str, object] = {
         "image_size": SIZE,
@@ -89,6 +102,7 @@ def openptv(**changes: object) -> OpenPTVCamera:
 
 
 MODELS = {"tsai": tsai, "pinhole": pinhole, "brown": brown, "telecentric": telecentric, "openptv": openptv}
+MODELS |= {"fisheye": fisheye}
 
 
 def port(**changes: object) -> Port:

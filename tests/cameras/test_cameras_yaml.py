@@ -109,7 +109,7 @@ FAULTS = {
         TSAI.replace("tsai", "tsay"),
         "model: expected one of tsai, pinhole, brown.*, got 'tsay'; write 'tsai'",
     ),
-    "model of another": (TSAI.replace("tsai", "fisheye"), "expected one of tsai, pinhole, .*, got 'fisheye'"),
+    "model of another": (TSAI.replace("tsai", "cahvor"), "expected one of tsai, pinhole, .*, got 'cahvor'"),
     "model as a list": (TSAI.replace("tsai", "[tsai]"), "model: expected one of tsai, pinhole"),
     "no model": (TSAI.replace("    model: tsai\n", ""), "cam1, model: expected one of tsai, pinhole, .* got none"),
     "half a port": (

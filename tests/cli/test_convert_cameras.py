@@ -9,6 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from sphereorient.cameras import PortCamera, load_cameras
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 from sphereorient.cli import app
@@ -44,6 +45,19 @@ def test_opencv_files_become_named_cameras(folder):
     assert list(cameras) == ["cam1", "cam2"]
     x = torch.tensor([10.0, -20.0, 500.0], dtype=torch.float64)
     assert torch.equal(cameras["cam2"].project(x), load_opencv(folder / "right.xml", (650, 480)).project(x))
+
+
+def test_an_opencv_fisheye_file_becomes_a_fisheye_camera(folder):
+    storage = cv2.FileStorage(str(folder / "wide.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("fisheye_model", 1)
+    storage.write("camera_matrix", np.array([[300.0, 0, 320], [0, 300, 240], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([-0.02, 0.005, -0.004, 0.001]))
+    storage.release()
+    done = convert(folder / "wide.yml", "--out", folder / "cameras.yaml", "--image-size", "640,480")
+    assert done.exit_code == 0, done.output
+    camera = load_cameras(folder / "cameras.yaml")["wide"]
+    assert isinstance(camera, FisheyeCamera)
+    assert camera.k.tolist() == [-0.02, 0.005, -0.004, 0.001]
 
 
 def test_an_openptv_camera_keeps_its_wall_and_its_distortion(folder):

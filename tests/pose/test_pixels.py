@@ -13,7 +13,10 @@ from conftest import assert_close
 from refine_examples import LOOKS, camera_of, f64, scene_of
 
 from sphereorient.cameras import Camera
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.cameras.model import TelecentricCamera
+from sphereorient.locate import CameraScene
+from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.pixels import VECTOR, LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked, whole_vectors
 
 WIDTH, HEIGHT = 60, 44
@@ -263,3 +266,35 @@ def test_cameras_of_one_and_of_many_origins_stand_in_one_record():
     assert both.origin[0].equal(one.origin[0].expand(3, PLACES))
     assert both.origin[1].equal(many.origin[0])
     assert both.direction[2].equal(one.direction[0])
+
+
+def wide(**changes: object) -> FisheyeCamera:
+    """A lens of which the picture shows more than all directions."""
+    common = {"R_cam_lab": f64(LOOKS[0]), "T_cam_lab_mm": f64([0.0, 0.0, 60.0]), "image_size": (WIDTH, HEIGHT)}
+    lens = {"centre_px": f64([29.5, 21.5]), "f_px": f64([8.0, 8.0]), "k": f64([0.0] * 4)}
+    return FisheyeCamera(**common | lens | changes)
+
+
+def test_pixels_without_a_line_of_sight_do_not_count():
+    far = math.hypot(29.5, 21.5) / 8.0
+    scene = CameraScene(background=scene_of(BACKGROUND), diameter_px=18.0)
+    view = CameraView.of("cam1", wide(), scene)
+    assert far > math.pi
+    assert view.background.shown is not None
+    assert not view.background.shown[0, 0]
+    assert view.background.shown[21, 29]
+    assert view.background.shown[21, 42]  # 1.56 rad from the axis
+    assert not view.background.shown[21, 44]  # 1.81 rad: a ball there is no disk
+    assert torch.isfinite(view.sight.direction).all()
+    cut = cut_pixels(places(), view.background, view.sight, (16.0, 12.0), disk_stencil(9.0))
+    assert 0 < int(cut.inside.sum()) < cut.inside.numel()
+    assert CameraView.of("cam1", camera("pinhole"), scene).background.shown is None
+
+
+@pytest.mark.parametrize("u", [29, 35, 42, 50])
+def test_axes_of_a_disk_are_square_to_its_line_of_sight_beside_a_fisheye_lens_too(u):
+    sight = LinesOfSight(wide())
+    (axes,) = sight.axes_at(torch.tensor([[u + 0.3, 20.7]]))
+    assert_close(axes @ axes.mT, torch.eye(2), atol=1e-6)
+    assert_close(axes @ sight.direction[:, 21, u], torch.zeros(2), atol=1e-6)
+    assert_close(LinesOfSight(camera("tsai")).axes_at(torch.tensor([[u, 20]]))[0], f64(LOOKS[0])[:2].float())

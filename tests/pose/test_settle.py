@@ -110,7 +110,7 @@ def test_disks_lie_where_cameras_of_all_models_project_them(name):
     assert int(within.sum()) > 200
     assert float((middles[0] - expected)[within].abs().max()) < 0.02
     assert float((radii[0] - radii_px)[within].abs().max()) < 0.02
-    if name not in ("telecentric", "port"):
+    if name not in ("telecentric", "fisheye", "port"):
         behind = 2 * centre_lab_mm(camera) - 30.0 * spread
         assert bool(compiled.disks([view], behind, 5.0)[0].isnan().all())
 
@@ -167,6 +167,27 @@ def test_lines_of_sight_may_start_at_different_places(scene, monkeypatch):
     found = behind_a_wall.settled(frames, start(X, R))
     monkeypatch.setattr(compiled, "library", lambda: None)
     assert_same(found, behind_a_wall.settled(frames, start(X, R)))
+
+
+def test_each_disk_may_have_axes_of_its_own(scene, monkeypatch):
+    fitter, pictures, X, R = scene
+    views, sight = list(fitter.views), RIG.sights[1]
+    turning = type(sight).__new__(type(sight))
+    vars(turning).update(vars(sight))
+
+    def axes_at(middle_px):  # turned about the camera's axis, by place
+        angle = middle_px.double().round()[:, :1] @ torch.tensor([[0.0, 0.0, 0.3]]).double()
+        return (so3.exp(angle) @ RIG.cameras[1].R_cam_lab)[:, :2].float()
+
+    turning.axes_at = axes_at
+    views[1] = replace(views[1], sight=turning)
+    uneven = fitter.light.black.clone()
+    uneven[:, 1] += 20.0  # along the disk's x
+    beside = replace(fitter, views=views, light=replace(fitter.light, black=uneven))
+    frames = [list(row) for row in pictures]
+    found = beside.settled(frames, start(X, R, held=True))
+    monkeypatch.setattr(compiled, "library", lambda: None)
+    assert_same(found, beside.settled(frames, start(X, R, held=True)))
 
 
 def test_a_pose_does_not_depend_on_its_batch_or_on_how_a_frame_lies_in_memory(scene):

@@ -276,7 +276,7 @@ def test_fictrac_is_taken_over(clean, tmp_path):
         ("c2a_r            : { 1, 2 }", "c2a_r: expected three numbers"),
         ("roi_ignr         : { { 1, 2, 3 } }", "roi_ignr: expected u, v"),
         ("c2a_r            :", "c2a_r: expected the turn to the animal"),
-        ("fisheye          : y", "fisheye: expected n"),
+        ("fisheye          : 2", "fisheye: expected y or n"),
         ("thr_rgb_tfrm     : red", "thr_rgb_tfrm: expected grey"),
     ],
 )
@@ -291,6 +291,17 @@ def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
 def test_keys_of_fictrac_that_change_nothing_are_taken(tmp_path):
     (tmp_path / "config.txt").write_text(CONFIG + "fisheye          : n\nthr_rgb_tfrm     : grey\n")
     assert read_fictrac_config(tmp_path / "config.txt").vfov_deg == 45.0
+
+
+def test_fictracs_fisheye_has_one_angle_for_every_pixel(clean, tmp_path):
+    two_movies(clean, tmp_path)
+    (tmp_path / "config.txt").write_text(CONFIG.replace(": 45", ": 190") + "fisheye          : y\n")  # a pinhole: < 180
+    init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml", "-q")
+    camera = load_experiment(tmp_path / "experiment.yaml").cameras["cam1"]
+    height_px = camera.image_size[1]
+    edges = camera.rays(camera.centre_px + torch.tensor([[0.0, -0.5], [0.0, 0.5]]).double() * height_px).direction_lab
+    assert math.degrees(math.acos(float(edges[0] @ edges[1]))) == pytest.approx(360 - 190)
+    assert camera.f_px.tolist() == pytest.approx([height_px / math.radians(190)] * 2)
 
 
 def test_init_replaces_its_own_file_until_somebody_changes_it(clean, tmp_path):

@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera, TsaiCamera
 from sphereorient.cameras.camera import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error, check_known, named
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.cameras.model import CameraModel, Key, PinholeCamera, TelecentricCamera
 from sphereorient.cameras.parameters import parameter_names
 from sphereorient.cameras.port import Port, PortCamera
@@ -21,12 +22,12 @@ KEYS = ("cameras", "covariance")
 MOST = 100  # cameras of a file
 Triple = tuple[float, float, float]
 IN_ITS_OWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0)  # frame: R and T
-HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple}  # by the number of a key's parts
+# By the number of a key's parts.
+HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple, 4: tuple[float, float, float, float]}
 
 # To add a model: one file with the camera, one name here.
-MODELS: dict[str, type[CameraModel]] = {
-    kind.MODEL: kind for kind in (TsaiCamera, PinholeCamera, BrownCamera, TelecentricCamera, OpenPTVCamera)
-}
+KINDS = TsaiCamera, PinholeCamera, BrownCamera, FisheyeCamera, TelecentricCamera, OpenPTVCamera
+MODELS: dict[str, type[CameraModel]] = {kind.MODEL: kind for kind in KINDS}
 
 
 class Entry(BaseModel, frozen=True, extra="forbid"):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TEXT_BYTES, check_ending, put_aside, read_whole
 from sphereorient.files.yaml_file import short
@@ -20,47 +21,48 @@ MOST = 64  # numbers of a matrix: OpenCV allocates what the file claims before i
 OPENER = re.compile(rb"[\[{]|-\s|<[^/?!]")
 MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels by indentation
 LENGTHS = (4, 5, 8, 12, 14)  # of distortion_coefficients, in OpenCV's order k1 k2 p1 p2 k3 ...
+ROS_MODELS = {"": False, "plumb_bob": False, "rational_polynomial": False, "equidistant": True}  # fisheye or not
 
 Array = NDArray[np.float64]
 
 
-def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera:
+def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera | FisheyeCamera:
     """Read a camera that OpenCV's calibration has written; the first pixel's centre is (0, 0).
     The file has `camera_matrix`, `distortion_coefficients`, optional `R` or `rvec`, `T` or `tvec` (mm; without them the
     lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px). Raises
     CameraError (no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3).
+    With `fisheye_model: 1`, or ROS' `distortion_model: equidistant`, the coefficients are k1 to k4 of cv2.fisheye.
     """
     storage = _opened(Path(path))
     try:
-        K, coefficients = _camera_matrix(storage), _coefficients(storage)
-        return BrownCamera(
-            image_size=_size(storage, image_size),
-            **_pose(storage),
-            centre_px=torch.from_numpy(K[:2, 2]),
-            f_px=torch.from_numpy(K[[0, 1], [0, 1]]),
-            k=torch.from_numpy(coefficients[[0, 1, 4]]),
-            p=torch.from_numpy(coefficients[[2, 3]]),
-        )
+        K, fisheye = _camera_matrix(storage), _is_fisheye(storage)
+        coefficients = torch.from_numpy(_coefficients(storage, 4 if fisheye else 5))
+        lens: dict[str, Any] = {"centre_px": torch.from_numpy(K[:2, 2]), "f_px": torch.from_numpy(K[[0, 1], [0, 1]])}
+        lens |= {"image_size": _size(storage, image_size)} | _pose(storage)
+        if fisheye:
+            return FisheyeCamera(k=coefficients, **lens)
+        return BrownCamera(k=coefficients[[0, 1, 4]], p=coefficients[[2, 3]], **lens)
     except CameraError as error:
         raise CameraError(f"{path}, {error}") from None
     finally:
         storage.release()
 
 
-def save_opencv(path: Path | str, camera: BrownCamera) -> None:
+def save_opencv(path: Path | str, camera: BrownCamera | FisheyeCamera) -> None:
     """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
     Raises OutputError (an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written).
     """
     path = Path(path)
     check_ending(path, "OpenCV file", SUFFIXES)
     (fx, fy), (cx, cy) = camera.f_px.tolist(), camera.centre_px.tolist()
-    (k1, k2, k3), (p1, p2) = camera.k.tolist(), camera.p.tolist()
+    coefficients = camera.k if isinstance(camera, FisheyeCamera) else torch.cat([camera.k[:2], camera.p, camera.k[2:]])
     with put_aside(path) as aside:
         storage = cv2.FileStorage(str(aside), cv2.FILE_STORAGE_WRITE)
         storage.write("image_width", camera.image_size[0])
         storage.write("image_height", camera.image_size[1])
         storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-        storage.write("distortion_coefficients", np.array([[k1], [k2], [p1], [p2], [k3]]))
+        storage.write("fisheye_model", int(isinstance(camera, FisheyeCamera)))
+        storage.write("distortion_coefficients", coefficients.detach().numpy()[:, None])
         storage.write("R", camera.R_cam_lab.detach().numpy())
         storage.write("T", camera.T_cam_lab_mm.detach().numpy()[:, None])
         storage.release()
@@ -133,16 +135,29 @@ def _camera_matrix(storage: cv2.FileStorage) -> Array:
     return K
 
 
-def _coefficients(storage: cv2.FileStorage) -> Array:
+def _is_fisheye(storage: cv2.FileStorage) -> bool:
+    """Return whether the file names OpenCV's fisheye model; CameraError for a model that is not known."""
+    model = storage.getNode("distortion_model")
+    name = model.string() if model.isString() else "" if model.empty() else "another"
+    if name not in ROS_MODELS:
+        do = "calibrate with one of these"
+        raise camera_error("distortion_model", f"one of {', '.join(ROS_MODELS)}", short(name), do)
+    flag = _whole(storage.getNode("fisheye_model"))
+    return ROS_MODELS.get(name, False) or bool(flag)
+
+
+def _coefficients(storage: cv2.FileStorage, count: int) -> Array:
     where = "distortion_coefficients"
     flat = _required(storage, where).reshape(-1)
+    if count == 4 != len(flat):
+        raise camera_error(where, "k1 to k4 of the fisheye model", f"{len(flat)} numbers", "correct the file")
     if len(flat) not in LENGTHS:
         expected = f"{', '.join(map(str, LENGTHS[:-1]))} or {LENGTHS[-1]} numbers"
         raise camera_error(where, expected, str(len(flat)), "correct the file")
     if np.any(flat[5:] != 0):
         do = "calibrate without CALIB_RATIONAL_MODEL, CALIB_THIN_PRISM_MODEL and CALIB_TILTED_MODEL"
         raise camera_error(where, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
-    return np.pad(flat, (0, 1))[:5]
+    return np.pad(flat, (0, 1))[:count]
 
 
 def _first(storage: cv2.FileStorage, keys: tuple[str, str], usual: Array) -> tuple[str, Array]:
