@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,11 +13,13 @@ from renders import error_deg
 from turning_examples import RATE_HZ, turning_ball  # noqa: F401
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, centre_lab_mm
+from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
 from sphereorient.locate import Frame
 from sphereorient.mapping import paint_cells
-from sphereorient.mapping.first_pass import FirstPass, KeptFrames
+from sphereorient.mapping.adjustment import focal_ratio
+from sphereorient.mapping.first_pass import CoarserPictures, FirstPass, KeptFrames
 from sphereorient.mapping.paint_cells import BallView, PaintCells
+from sphereorient.pose import CameraView
 from sphereorient.pose.poses import Poses, supported
 from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.trajectory import Reason
@@ -163,3 +166,50 @@ def test_frames_that_were_kept_since_an_adjustment_turn_with_it(ball):
     torch.testing.assert_close(corrected, turn)
     assert len(since.crops()[1]) == 1
     torch.testing.assert_close(frames.crops()[1][-1], turn @ far.R_lab_body[0])
+
+
+@pytest.mark.parametrize("camera", [pinhole(), brown()], ids=["pinhole", "brown"])
+def test_a_coarser_camera_sees_the_middle_of_four_pixels_where_they_meet(camera):
+    coarse = CoarserCamera(camera=camera, factor=2)
+    assert coarse.image_size == tuple(side // 2 for side in camera.image_size)
+    torch.testing.assert_close(coarse.project(X), (camera.project(X) + 0.5) / 2 - 0.5)
+    uv = torch.tensor([[0.0, 0.0], [31.0, 12.0]], dtype=torch.float64)
+    four = camera.rays(2 * uv + 0.5)
+    torch.testing.assert_close(coarse.rays(uv).direction_lab, four.direction_lab)
+    torch.testing.assert_close(coarse.distort(coarse.undistort(uv)), uv, atol=1e-6, rtol=0.0)
+
+
+def test_a_large_ball_is_followed_in_coarser_pixels(ball):
+    place = replace(ball.place, position_lab_mm=ball.X[:1])
+    assert CoarserPictures.of(place).factor == 1
+    view = place.views[0]
+    twice = 2 * np.array(view.camera.image_size)
+    large = [cv2.resize(shot.picture, twice.tolist(), interpolation=cv2.INTER_NEAREST) for shot in ball.shots[:3]]
+    back = CoarserPictures(place=place, whole=place.views, factor=2).frames([Frame(shown=one) for one in large])
+    for one, shot in zip(back, ball.shots, strict=False):
+        np.testing.assert_array_equal(one.picture, shot.picture.astype(np.float32))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [1.0, 2.5])
+def test_a_wrong_field_of_view_is_told(ball, wrong):
+    """The ball seen at its size by a pinhole camera; another one sees it from 2.5 times as far."""
+    (view,) = ball.place.views
+    width, height = view.camera.image_size
+    right = float(view.camera.focal_px[0])
+    middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+    camera = PinholeCamera(
+        image_size=(width, height),
+        f_px=torch.tensor(right * wrong, dtype=torch.float64),
+        centre_px=middle,
+        R_cam_lab=view.camera.R_cam_lab,
+        T_cam_lab_mm=view.camera.T_cam_lab_mm,
+    )
+    centre = centre_lab_mm(camera)
+    place = replace(
+        ball.place,
+        views=[CameraView.of(view.name, camera, view.scene)],
+        position_lab_mm=centre + wrong * (ball.X[:1] - centre),
+    )
+    ratio = focal_ratio(kept(ball, place).adjusted())
+    assert ratio * wrong == pytest.approx(1.0, rel=0.2)
