@@ -410,7 +410,6 @@ def _track_of(time_s: Doubles, R_lab_body: Doubles) -> Trajectory:
 class BallRow:
     """What was measured of a scene."""
 
-    name: str
     first: BallErrors  # of the first pass
     refined: BallErrors | None  # of the precise method by its map; None: left out
     cpu_ms: float  # of a frame of the first pass, decoded
@@ -431,7 +430,7 @@ class BallRow:
             }
             for way, one in ways.items()
         }
-        return {"scene": self.name, "radius_px": self.radius_px, "cpu_ms": self.cpu_ms, **rows}
+        return {"radius_px": self.radius_px, "cpu_ms": self.cpu_ms, **rows}
 
 
 def measured(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
@@ -464,7 +463,6 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
         varying = track.orientation_cov - known.lasting.alone[0, :3, :3].numpy()
         refined = BallErrors.of(time_s, track.orientation, varying, R_true)
     return BallRow(
-        name=path.parent.name,
         first=BallErrors.of(time_s, R, covariance, R_true),
         refined=refined,
         cpu_ms=1e3 * cpu_s / len(poses),

@@ -24,6 +24,7 @@ RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "al
 ALIGNMENTS = ("none", "body", "both")
 AXES = 3
 ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
+STILL_MM = 1e-6  # a true position that moves less stays in its place
 FICTRAC_COLUMNS = 23  # at least; newer versions have more
 DO = "pass the truth.h5 of this synthetic experiment"
 
@@ -196,22 +197,24 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     """Read the reference of a track: truth.h5 or another track.h5, by time, or FicTrac's .dat, by the frame number.
     Raise TrackError (of another kind, or no time in common) or BenchError (no FicTrac file).
     """
-    R, start = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool)
+    R, start, held = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool), True  # FicTrac knows no other
     if path.suffix.lower() == ".dat":
         frame, orientation, begins = _fictrac_stretches(path)
         row, there = _nearest(frame.astype(np.float64), track.time * track.frame_rate)
         R[there], start[there] = orientation[row[there]], begins[row[there]]
     elif not _is_track(path):
-        return Reference(R_lab_body=true_orientations(path, track.time, track.sphere))
+        truth = _read_truth(path, "position", sphere=track.sphere)
+        held = bool(np.ptp(truth["position"], axis=0).max() < STILL_MM)
+        return Reference(R_lab_body=truth["orientation"][_rows(truth["time"], track.time, path)], held=held)
     else:
         tracks = Tracks.load(path)
         other = next(iter((tracks if len(tracks) == 1 else tracks.picked(track.sphere)).values()))
         row, there = _nearest(other.time, track.time)
-        R[there] = other.orientation[row[there]]
+        R[there], held = other.orientation[row[there]], other.held
     if not np.isfinite(R).any():
         do = "pass a result on the same movie, and frame_rate in experiment.yaml for FicTrac's"
         raise TrackError(refusal(f"reference {path}", expected="frames of the track", got="none of them", do=do))
-    return Reference(R_lab_body=R, start=start, exact=False)
+    return Reference(R_lab_body=R, start=start, exact=False, held=held)
 
 
 def against(reference: Reference, track: Trajectory, align: str = "none") -> tuple[Floats, Behaviour]:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from sphereorient.statistics.behaviour import Behaviour
 
 
+APART_DEG = 1.0  # angle between lab axes that is worth a remark
+
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
 
@@ -98,6 +100,10 @@ def score(
         else:
             print_errors(errors, name, "error" if of.exact else "difference")
         print_table(behaviour_table(behaviour, name, exact=of.exact))
+        if align != "both" and behaviour.apart_deg > APART_DEG:
+            typer.echo(
+                f"The lab axes are {behaviour.apart_deg:.1f} degrees apart: --align both takes that off.", err=True
+            )
         given = given or (given_to_others(tracks, reference) if of.exact and len(tracks) > 1 else {})
         if name in given:
             wrong, changes = given[name]

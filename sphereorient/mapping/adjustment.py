@@ -39,7 +39,7 @@ ROBUST = 4.0  # deviations from the paint from which a picture counts less: what
 PRIOR = 0.05  # of the radius: error of the place at the start
 HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
 FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and how many to either side
-FOCAL_FRAMES = 60
+FOCAL_FRAMES, FOCAL_BETTER = 60, 0.9  # and share of what is left with the given one
 NEAREST = 2.0  # radii, of a camera from the ball's centre
 FARTHEST = 0.1  # of the radius, of a step: a place is near
 AT_ONCE = 4096  # cells
@@ -94,7 +94,7 @@ def adjusted(
 
 def focal_ratio(found: Adjustment) -> float:
     """Return by which factor the focal length of an only pinhole camera explains the pictures best, to some per cent; 1
-    where none that is 1.5 times longer or shorter does: seen from nearer, more of the ball's sides turns away.
+    where none that is 1.5 times longer or shorter does clearly: seen from nearer, more of the sides turns away.
     """
     rows = torch.linspace(0, len(found.R_lab_body) - 1, min(FOCAL_FRAMES, len(found.R_lab_body))).long()
     begin = replace(found, crops=found.crops.where(rows), R_lab_body=found.R_lab_body[rows])
@@ -109,6 +109,8 @@ def focal_ratio(found: Adjustment) -> float:
     distance = float(sights(begin.crops).norm())  # radii
     tried |= {log: at(log, begin) for log in steps if distance * math.exp(log) > NEAREST}
     log = min(tried, key=lambda log: tried[log].left)
+    if tried[log].left > FOCAL_BETTER * tried[0.0].left:  # a ball far away looks alike
+        return 1.0
     here, step = tried[log], FOCAL_STEP / 4
     for _ in range(FOCAL_STEPS):
         before, after = at(-step, here), at(step, here)

@@ -80,6 +80,7 @@ class Reference:
     R_lab_body: Floats  # (N, 3, 3)
     start: Mask | None = None  # (N,), frames in which another tracker began anew; None: it never did
     exact: bool = True  # the truth; else another tracker's
+    held: bool = False  # whether its ball is known to stay in its place
 
 
 def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -> Behaviour:
@@ -87,7 +88,8 @@ def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -
 
     A constant rotation of the body axes is taken off always, one of the lab axes with `align`: the axes are then those
     of a reference that is `exact`, else those of the track. Against an exact reference a gain is the regression through
-    zero of our turns on its; else the geometric mean of the two regressions. A ball that moves has no walk.
+    zero of our turns on its; else the geometric mean of the two regressions.
+    There is a walk where the ball stays in its place by either.
     Raises ShapeError: not the same number of frames. Source: docs/accuracy.md, Behaviour.
     """
     frames, time_s = len(track), track.time
@@ -113,7 +115,11 @@ def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -
     again = reason or _why_not(int(there.sum()), True)
     gain_smooth = _gain(ours[there], theirs[there], smooth[there], reference.exact, again)[0]
     drift, sigma = _drift(time_s[known], R[known], R_true[known], np.cumsum(begins)[known], reason)
-    walk = _walk(time_s, R, R_true, known & ~begins) if track.held and (sure or not align) else (np.nan,) * 3
+    walk = (
+        _walk(time_s, R, R_true, known & ~begins)
+        if (track.held or reference.held) and (sure or not align)
+        else (np.nan,) * 3
+    )
     return Behaviour(
         frames=int(known.sum()),
         pairs=int(linked.sum()),

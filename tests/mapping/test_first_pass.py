@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 from camera_examples import brown, pinhole
 from renders import error_deg
 from turning_examples import RATE_HZ, turning_ball  # noqa: F401
 
 from sphereorient import so3
+from sphereorient.bench.ball import SCENES, write_ball_scene
 from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
+from sphereorient.experiment import load_experiment
 from sphereorient.locate import Frame
 from sphereorient.mapping import paint_cells
 from sphereorient.mapping.adjustment import focal_ratio
 from sphereorient.mapping.first_pass import CoarserPictures, FirstPass, KeptFrames
 from sphereorient.mapping.paint_cells import BallView, PaintCells
+from sphereorient.methods.map import first_map_of
+from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView
 from sphereorient.pose.poses import Poses, supported
 from sphereorient.sphere.texture_table import octahedral_directions
@@ -191,25 +197,31 @@ def test_a_large_ball_is_followed_in_coarser_pixels(ball):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong", [1.0, 2.5])
-def test_a_wrong_field_of_view_is_told(ball, wrong):
-    """The ball seen at its size by a pinhole camera; another one sees it from 2.5 times as far."""
-    (view,) = ball.place.views
-    width, height = view.camera.image_size
-    right = float(view.camera.focal_px[0])
-    middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
-    camera = PinholeCamera(
-        image_size=(width, height),
-        f_px=torch.tensor(right * wrong, dtype=torch.float64),
-        centre_px=middle,
-        R_cam_lab=view.camera.R_cam_lab,
-        T_cam_lab_mm=view.camera.T_cam_lab_mm,
+@pytest.mark.parametrize("field_deg", [30.0, 60.0])
+def test_a_field_of_view_that_the_pictures_contradict_is_told(tmp_path, field_deg):
+    path = write_ball_scene(tmp_path / "scene", SCENES["clean_fly"], 120, 1)
+    cameras = yaml.safe_load((path.parent / "cameras.yaml").read_text())
+    del cameras["cameras"]["cam1"]["f_px"]
+    cameras["cameras"]["cam1"]["vfov_deg"] = field_deg
+    (path.parent / "cameras.yaml").write_text(yaml.safe_dump(cameras))
+    _, remarks = first_map_of(load_experiment(path), Settings(), None, lambda *_: None)
+    if field_deg == 30.0:
+        assert remarks == []
+    else:
+        (told,) = remarks
+        assert float(re.search(r"about ([0-9.]+) degrees, not 60", told)[1]) == pytest.approx(30.0, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_ball_far_away_does_not_tell_the_field_of_view(ball):
+    place = replace(ball.place, position_lab_mm=ball.X[:1])
+    camera = place.views[0].camera
+    pinhole_like = PinholeCamera(
+        image_size=camera.image_size,
+        f_px=camera.focal_px[0].clone(),
+        centre_px=camera.centre_px,
+        R_cam_lab=camera.R_cam_lab,
+        T_cam_lab_mm=camera.T_cam_lab_mm,
     )
-    centre = centre_lab_mm(camera)
-    place = replace(
-        ball.place,
-        views=[CameraView.of(view.name, camera, view.scene)],
-        position_lab_mm=centre + wrong * (ball.X[:1] - centre),
-    )
-    ratio = focal_ratio(kept(ball, place).adjusted())
-    assert ratio * wrong == pytest.approx(1.0, rel=0.2)
+    place = replace(place, views=[CameraView.of("cam1", pinhole_like, place.views[0].scene)])
+    assert focal_ratio(kept(ball, place).adjusted()) == 1.0
