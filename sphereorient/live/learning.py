@@ -14,7 +14,7 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.locate import Frame
 from sphereorient.mapping.disks import Crops
-from sphereorient.mapping.first_pass import ADJUSTED_ERROR, TURNED_RAD, FirstPass, KeptFrames
+from sphereorient.mapping.first_pass import ADJUSTED_ERROR, TURNED_RAD, CoarserPictures, FirstPass, KeptFrames
 from sphereorient.pose.camera_view import FIRST_BLUR_PX
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.lasting import Lasting
@@ -31,7 +31,8 @@ class LearningTracker:
 
     def __init__(self, place: Crops, aside: ProcessPoolExecutor) -> None:
         self.number = 1
-        self._pass, self._kept = FirstPass(place), KeptFrames(place)
+        self._coarse = CoarserPictures.of(place)
+        self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
         self.appearance = _unknown(place, self._pass)
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
@@ -40,8 +41,9 @@ class LearningTracker:
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
-        poses, searched = self._pass.next(time_s, shots)
-        self._now = (shots, poses) if supported(poses) else None
+        frames = self._coarse.frames(shots)
+        poses, searched = self._pass.next(time_s, frames)
+        self._now = (frames, poses) if supported(poses) else None
         return poses, searched
 
     def between(self) -> None:
