@@ -1,7 +1,7 @@
 """A ball under an animal, filmed by one camera, of which nothing is known: scenes as spintrack publishes theirs.
 
-Geometry, paint, light, sensor and motion have the numbers of its benchmark (NeLy-EPFL/spintrack, Apache-2.0,
-docs/benchmark.md and families.py); pictures and motions are drawn anew here. What it prints of its own pictures stands
+Geometry, paint, light, sensor and motion have the numbers of its benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of
+results and families.py); pictures and motions are drawn anew here. What it prints of its own pictures stands
 beside the results.
 """
 

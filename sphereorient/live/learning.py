@@ -1,16 +1,11 @@
 """No map at the start: orientations by a map that grows with each frame; meanwhile place and map are adjusted."""
 
-import multiprocessing
-import pickle
-import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
-import torch
+from torch import Tensor
 
 from sphereorient.experiment.recording import TextureMap
-from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.locate import Frame
 from sphereorient.mapping.disks import Crops
@@ -26,18 +21,18 @@ SINCE = 16  # of the frames that came meanwhile, evenly spread, that are added t
 
 class LearningTracker:
     """Follows a ball without a map: by one that grows with each frame. The body frame is the lab at the first one.
-    Place and map are adjusted in a process of its own. `number` is that of the map: another one after each adjustment.
+    Place and map are adjusted in a thread of its own. `number` is that of the map: another one after each adjustment.
     """
 
-    def __init__(self, place: Crops, aside: ProcessPoolExecutor) -> None:
+    def __init__(self, place: Crops) -> None:
         self.number = 1
         self._coarse = CoarserPictures.of(place)
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
         self.appearance = _unknown(place, self._pass)
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
-        self._aside = aside
-        self._adjusting: tuple[KeptFrames, Future[bytes]] | None = None
+        self._aside = ThreadPoolExecutor(1, "adjustment")
+        self._adjusting: tuple[KeptFrames, Future[tuple[Tensor, FirstPass]]] | None = None
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
@@ -51,42 +46,27 @@ class LearningTracker:
         if self._now is not None:
             self._kept.add(*self._now)
         if self._adjusting is not None and self._adjusting[1].done():
-            R_lab_body, moved = pickle.loads(self._adjusting[1].result())
+            R_lab_body, moved = self._adjusting[1].result()
             correction, since = self._kept.corrected(self._adjusting[0], R_lab_body)
             moved.shown(*since.crops(SINCE)).follow(self._pass, correction)
             self._pass, self._adjusting, self.number = moved, None, self.number + 1
         if self._adjusting is None and self._kept.count >= self._due and self._kept.turned_rad > TURNED_RAD:
             self._due, frames = MORE * self._kept.count, self._kept.so_far()
-            self._adjusting = frames, self._aside.submit(_adjusted, pickle.dumps(frames))
+            self._adjusting = frames, self._aside.submit(_adjusted, frames)
 
     def texture(self) -> TextureMap:
         """Return the map of the frames so far; this takes some seconds. PaintError: the ball has not turned."""
         return self._kept.adjusted().texture()
 
-
-@contextmanager
-def process_aside() -> Iterator[ProcessPoolExecutor]:
-    """Yield a process for adjustments, which begins at once and ends with the block, whatever it does."""
-    aside = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin)
-    aside.submit(_begin)
-    try:
-        yield aside
-    finally:
-        for process in tuple(aside._processes.values()):
-            process.terminate()
-        aside.shutdown(wait=False, cancel_futures=True)
+    def close(self) -> None:
+        """End the thread, after what it does."""
+        self._aside.shutdown(cancel_futures=True)
 
 
-def _begin() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
-    torch.set_num_threads(1)
-    limit_cores(1)
-
-
-def _adjusted(kept: bytes) -> bytes:
-    """Return orientations and a pass at the place found, pickled: no memory is shared with a process that may end."""
-    found = pickle.loads(kept).adjusted()
-    return pickle.dumps((found.R_lab_body, FirstPass(found.crops, ADJUSTED_ERROR).shown(found.crops, found.R_lab_body)))
+def _adjusted(kept: KeptFrames) -> tuple[Tensor, FirstPass]:
+    """Return orientations and a pass at the place found."""
+    found = kept.adjusted()
+    return found.R_lab_body, FirstPass(found.crops, ADJUSTED_ERROR).shown(found.crops, found.R_lab_body)
 
 
 def _unknown(place: Crops, follower: FirstPass) -> Appearance:

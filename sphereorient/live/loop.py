@@ -65,19 +65,22 @@ def _learning(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, path: Path
 ) -> Iterator[LiveSetUp]:
     # Import late: with a map nothing is learnt.
-    from sphereorient.live.learning import LearningTracker, process_aside
+    from sphereorient.live.learning import LearningTracker
     from sphereorient.mapping.disks import fixed_place
     from sphereorient.report.texture_map import write_map
 
-    with process_aside() as aside, open_recording(experiment, cameras, textured=False) as recording, one_thread():
-        tracker = LearningTracker(fixed_place(recording, settings.paint, settings.locate), aside)
+    with open_recording(experiment, cameras, textured=False) as recording, one_thread():
+        tracker = LearningTracker(fixed_place(recording, settings.paint, settings.locate))
 
         def save() -> str:
             with writing(force=True):  # that of before, by this run
                 write_map(tracker.texture(), path)
             return f"Wrote {path}"
 
-        yield LiveSetUp(recording=recording, tracker=tracker, save_map=save)
+        try:
+            yield LiveSetUp(recording=recording, tracker=tracker, save_map=save)
+        finally:
+            tracker.close()
 
 
 def run_live(

@@ -256,11 +256,11 @@ def _better_blur(state: State) -> float:
     return float(np.clip(state.blur_px * BLUR_RATIO**step, *BLUR_PX))
 
 
-def lowest(before: float, here: float, after: float, farthest: float = 1.0) -> float:
-    """Return where a parabola through values at -1, 0 and 1 is lowest, at most `farthest` from 0."""
+def lowest(before: float, here: float, after: float) -> float:
+    """Return where a parabola through values at -1, 0 and 1 is lowest, within these."""
     bend = before - 2 * here + after
-    shift = 0.5 * (before - after) / bend if bend > 0 else (farthest if after < before else -farthest)
-    return min(max(shift, -farthest), farthest)
+    shift = 0.5 * (before - after) / bend if bend > 0 else (1.0 if after < before else -1.0)
+    return min(max(shift, -1.0), 1.0)
 
 
 def _with_joint_step(state: State, smoothest: float) -> State:

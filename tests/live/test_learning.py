@@ -11,7 +11,7 @@ from turning_examples import RATE_HZ, turning_ball  # noqa: F401
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
-from sphereorient.live.learning import LearningTracker, process_aside
+from sphereorient.live.learning import LearningTracker
 from sphereorient.pose.poses import supported
 
 
@@ -34,8 +34,9 @@ def followed(tracker: LearningTracker, ball, numbers, wait: int = -1):
 
 @pytest.mark.slow
 def test_an_adjustment_takes_drift_away_and_the_body_frame_goes_on(ball):
-    with process_aside() as aside:
-        R, maps = followed(LearningTracker(ball.place, aside), ball, range(70), wait=50)
+    tracker = LearningTracker(ball.place)
+    R, maps = followed(tracker, ball, range(70), wait=50)
+    tracker.close()
     assert maps[:25] == [1] * 25
     assert maps[51] > maps[50]
     assert error_deg(R[:1], torch.eye(3, dtype=torch.float64)[None]).max() < 0.1
@@ -48,13 +49,13 @@ def test_an_adjustment_takes_drift_away_and_the_body_frame_goes_on(ball):
 
 @pytest.mark.slow
 def test_the_map_of_the_frames_so_far_shows_the_paint(ball):
-    with process_aside() as aside:
-        tracker = LearningTracker(ball.place, aside)
-        followed(tracker, ball, range(3))
-        with pytest.raises(PaintError, match="turns"):
-            tracker.texture()
-        followed(tracker, ball, range(3, 40))
-        found = tracker.texture()
+    tracker = LearningTracker(ball.place)
+    followed(tracker, ball, range(3))
+    with pytest.raises(PaintError, match="turns"):
+        tracker.texture()
+    followed(tracker, ball, range(3, 40))
+    found = tracker.texture()
+    tracker.close()
     assert found.unseen is not None
     assert 0.3 < float((~found.unseen).double().mean()) < 1.0
     assert float(found.grey[~found.unseen].std()) > 0.2
