@@ -6,7 +6,7 @@ what enters linearly, Golub and Pereyra 1973.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -61,7 +61,7 @@ class Adjustment:
     def texture(self) -> TextureMap:
         """Return the map, 0 black .. 1 white."""
         fine = replace(self, cells=cells_of(self.crops, PAINT_PX))
-        fine.cells.set(*_mean(*_together(fine, [_seen(fine, c) for c in range(len(self.crops.views))])))
+        fine.cells.set(*_mean(*_together(fine, (_seen(fine, c) for c in range(len(self.crops.views))))))
         grey, unseen = fine.cells.sample(map_directions(fine.cells.side))
         if bool(unseen.all()):
             raise PaintError(refusal("movies", expected="a ball", got="no picture of it", do="check the movies"))
@@ -102,12 +102,13 @@ def focal_ratio(found: Adjustment) -> float:
     def at(log: float, start: Adjustment) -> Adjustment:
         return adjusted(_with_focal(start.crops, math.exp(log)), start.R_lab_body, levels=LEVELS[:2])
 
-    tried = {log: at(log, begin) for log in (-FOCAL_STEP, 0.0, FOCAL_STEP)}
+    distance = float(sights(begin.crops).norm())  # radii
+    logs = [k * FOCAL_STEP for k in range(-FOCAL_STEPS, FOCAL_STEPS + 1)]
+    logs = [log for log in logs if log == 0.0 or distance * math.exp(log) > NEAREST]
+    tried = {log: at(log, begin) for log in logs if abs(log) <= FOCAL_STEP}
     if min(tried, key=lambda log: tried[log].left) == 0.0:
         return 1.0
-    steps = (k * FOCAL_STEP for k in range(-FOCAL_STEPS, FOCAL_STEPS + 1) if abs(k) > 1)
-    distance = float(sights(begin.crops).norm())  # radii
-    tried |= {log: at(log, begin) for log in steps if distance * math.exp(log) > NEAREST}
+    tried |= {log: at(log, begin) for log in logs if log not in tried}
     log = min(tried, key=lambda log: tried[log].left)
     if tried[log].left > FOCAL_BETTER * tried[0.0].left:  # a ball far away looks alike
         return 1.0
@@ -233,17 +234,19 @@ def _mean(grey: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return (weight * grey).flatten(0, -2).sum(0) / total.clamp_min(LEAST), total
 
 
-def _together(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor]:
-    """Return grey, in shares of light and of each picture's brightness, and weights of all cameras, (C, N, cells)."""
-    weight = torch.stack([one.cosine for one in seen]).square_()
-    grey = torch.stack([one.paint(light) for one, light in zip(seen, at.light, strict=True)])
+def _together(at: Adjustment, seen: Iterable[_Seen]) -> tuple[Tensor, Tensor]:
+    """Return grey, in shares of light and of each picture's brightness, and weights of all cameras, (C, N, cells).
+    What was seen is used up: these are the largest arrays.
+    """
+    each = [(one.paint(light), one.cosine.square_()) for one, light in zip(seen, at.light, strict=True)]
+    grey, weight = (part[0][None] if len(part) == 1 else torch.stack(part) for part in zip(*each, strict=True))
     mean, _ = _mean(grey, weight)
     bright = (weight * grey) @ mean / (weight @ mean.square()).clamp_min(LEAST)
     grey /= torch.where(bright > 0, bright, 1.0)[..., None]
     mean, _ = _mean(grey, weight)
     squares = (grey - mean).square_()
     usual = float((weight * squares).sum() / weight.sum())
-    return grey, weight / (1 + squares / max(ROBUST**2 * usual, LEAST**2))
+    return grey, weight.div_(squares.div_(max(ROBUST**2 * usual, LEAST**2)).add_(1.0))
 
 
 def sights(place: Crops) -> Tensor:
