@@ -358,6 +358,7 @@ def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
         "drift/min",
     )
     table = Table(*columns, "step / sigma", "CPU ms", "FicTrac", "spintrack", title=title)
+    table.columns[0].no_wrap = True
     for row in rows:
         first, refined = row["first"], row.get("refined")
         best, scene = refined or first, SCENES[row["scene"]]
