@@ -1,38 +1,49 @@
 """No map at the start: orientations by a map that grows with each frame; meanwhile place and map are adjusted."""
 
+import multiprocessing
+import signal
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import replace
+from typing import Any
 
-from torch import Tensor
+import torch
+from numpy.typing import NDArray
 
 from sphereorient.experiment.recording import TextureMap
+from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.locate import Frame
-from sphereorient.mapping.disks import Crops
+from sphereorient.mapping.adjustment import adjusted
+from sphereorient.mapping.disks import Crop, Crops
 from sphereorient.mapping.first_pass import ADJUSTED_ERROR, TURNED_RAD, CoarserPictures, FirstPass, KeptFrames
 from sphereorient.pose.camera_view import FIRST_BLUR_PX
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.poses import Poses, supported
 
+Array = NDArray[Any]
 FIRST, MORE = 24, 1.5  # frames of the first adjustment, and by how many times more of the next one
 SINCE = 16  # of the frames that came meanwhile, evenly spread, that are added to its map: it must not take long
 
 
 class LearningTracker:
     """Follows a ball without a map: by one that grows with each frame. The body frame is the lab at the first one.
-    Place and map are adjusted in a thread of its own. `number` is that of the map: another one after each adjustment.
+    Place and map are adjusted in a process of its own. `number` is that of the map: another one after each adjustment.
     """
 
     def __init__(self, place: Crops) -> None:
         self.number = 1
         self._coarse = CoarserPictures.of(place)
+        # Tensors that are sent move to other memory: before fits hold their addresses. Later, arrays alone are sent.
+        spawn, begin = multiprocessing.get_context("spawn"), (self._coarse.place,)
+        self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
+        self._aside.submit(_ready)
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
         self.appearance = _unknown(place, self._pass)
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
-        self._aside = ThreadPoolExecutor(1, "adjustment")
-        self._adjusting: tuple[KeptFrames, Future[tuple[Tensor, FirstPass]]] | None = None
+        self._adjusting: tuple[KeptFrames, Future[tuple[Array, ...]]] | None = None
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
@@ -46,27 +57,48 @@ class LearningTracker:
         if self._now is not None:
             self._kept.add(*self._now)
         if self._adjusting is not None and self._adjusting[1].done():
-            R_lab_body, moved = self._adjusting[1].result()
+            R_lab_body, X, mean, weight = (torch.from_numpy(part) for part in self._adjusting[1].result())
+            moved = FirstPass(replace(self._coarse.place, position_lab_mm=X), ADJUSTED_ERROR)
+            moved.cells.set(mean, weight)
             correction, since = self._kept.corrected(self._adjusting[0], R_lab_body)
             moved.shown(*since.crops(SINCE)).follow(self._pass, correction)
             self._pass, self._adjusting, self.number = moved, None, self.number + 1
         if self._adjusting is None and self._kept.count >= self._due and self._kept.turned_rad > TURNED_RAD:
             self._due, frames = MORE * self._kept.count, self._kept.so_far()
-            self._adjusting = frames, self._aside.submit(_adjusted, frames)
+            self._adjusting = frames, self._aside.submit(_adjusted, *frames.arrays())
 
     def texture(self) -> TextureMap:
         """Return the map of the frames so far; this takes some seconds. PaintError: the ball has not turned."""
         return self._kept.adjusted().texture()
 
     def close(self) -> None:
-        """End the thread, after what it does."""
-        self._aside.shutdown(cancel_futures=True)
+        """End the process."""
+        for process in tuple(self._aside._processes.values()):
+            process.terminate()
+        self._aside.shutdown(wait=False, cancel_futures=True)
 
 
-def _adjusted(kept: KeptFrames) -> tuple[Tensor, FirstPass]:
-    """Return orientations and a pass at the place found."""
-    found = kept.adjusted()
-    return found.R_lab_body, FirstPass(found.crops, ADJUSTED_ERROR).shown(found.crops, found.R_lab_body)
+_PLACE: list[Crops] = []  # of the process that adjusts: the one that it begins with
+
+
+def _begin(place: Crops) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
+    torch.set_num_threads(1)
+    limit_cores(1)
+    _PLACE.append(place)
+
+
+def _ready() -> None:
+    """Do nothing: the process begins with the first that it is asked."""
+
+
+def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[Array, ...]:
+    """Return orientations (N, 3, 3), the place (1, 3), mm, and the map's mean and weight of each cell."""
+    seen = _PLACE[0].holding(crops, torch.from_numpy(use))
+    found = adjusted(seen, torch.from_numpy(R_lab_body))
+    cells = FirstPass(found.crops).shown(found.crops, found.R_lab_body).cells
+    parts = found.R_lab_body, found.crops.position_lab_mm[:1], cells.mean, cells.weight
+    return tuple(part.numpy() for part in parts)
 
 
 def _unknown(place: Crops, follower: FirstPass) -> Appearance:

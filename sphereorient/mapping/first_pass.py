@@ -309,6 +309,11 @@ class KeptFrames:
         if len(self._rows) == 2 * MAPPED:
             self._rows, self._apart_rad = self._rows[::2], 2 * self._apart_rad
 
+    def arrays(self) -> tuple[list[list[Crop]], NDArray[np.bool_], NDArray[np.float64]]:
+        """Return all crops, use (N, C) and orientations (N, 3, 3), without tensors: for another process."""
+        use, R = (torch.stack([getattr(one, name) for one in self._rows]) for name in ("use", "R_lab_body"))
+        return [one.crops for one in self._rows], use.numpy(), R.numpy()
+
     def so_far(self) -> "KeptFrames":
         """Return a record of the same frames, to which no other ones come."""
         same = copy(self)
