@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.bench.score import aligned_errors_deg
+from sphereorient.bench.score import against
 from sphereorient.cameras import PinholeCamera, save_cameras
 from sphereorient.cameras.model import focal_of_field, middle_of_picture
 from sphereorient.experiment import load_experiment
@@ -29,6 +29,7 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.files.picture import write_picture
 from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import make_folder, write_text, writing
+from sphereorient.mapping.chain import chained
 from sphereorient.mapping.disks import fixed_place
 from sphereorient.mapping.first_pass import first_adjustment, followed_by
 from sphereorient.methods.method import one_thread
@@ -39,7 +40,7 @@ from sphereorient.report.texture_map import write_map
 from sphereorient.run import MemoryStore, Request
 from sphereorient.run.stages import run_tracks
 from sphereorient.sphere.texture import map_directions
-from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
+from sphereorient.statistics.behaviour import Behaviour, Reference
 from sphereorient.synth.motion import Motion6D
 from sphereorient.synth.write import write_truth
 from sphereorient.trajectory import Trajectory
@@ -330,9 +331,7 @@ def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, pro
     X = _place(scene, camera)
     film = _Film(scene, camera, X, painted(scene.paint, rng), rng)
     turns = torch.from_numpy(walked(frames, rng, 0.3 if scene.motion == "saccades" else 1.0))
-    R = [torch.eye(3, dtype=torch.float64)]
-    for turn in turns[1:]:
-        R.append(so3.exp(turn) @ R[-1])
+    R = chained(so3.exp(turns[1:]))
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for k in range(frames):
@@ -355,7 +354,7 @@ def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, pro
         position_lab_mm=X.expand(frames, 3) / RADIUS_MM,
         velocity_m_s=still,
         acceleration_m_s2=still,
-        R_lab_body=torch.stack(R),
+        R_lab_body=R,
         omega_lab_rad_s=turns * RATE_HZ,
         alpha_lab_rad_s2=still,
     )
@@ -378,32 +377,19 @@ class BallErrors:
         """Compare orientations (N, 3, 3), NaN: none, with true ones; covariances (N, 3, 3), lab, of what varies."""
         known: NDArray[np.bool_] = np.asarray(np.isfinite(ours).all((1, 2)))
         linked = known[1:] & known[:-1]
-        turns = [rotation_vectors(one[1:] @ one[:-1].transpose(0, 2, 1)) for one in (ours, true)]
+        turns = [rotation_vectors(one[1:] @ one[:-1].mT) for one in (ours, true)]
         steps = (turns[0] - turns[1])[linked]
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         stated = np.sqrt((variance[1:] + variance[:-1])[linked])
+        track = replace(Trajectory.empty(time_s), orientation=ours)
+        errors_deg, behaviour = against(Reference(R_lab_body=true), track, "both")
         return cls(
             found=int(known.sum()),
             step_deg=np.rad2deg(np.linalg.norm(steps, axis=1)),
-            orientation_deg=aligned_errors_deg(ours[known], true[known], "both"),
+            orientation_deg=errors_deg[known],
             over_sigma=float(np.sqrt(np.mean((steps / stated) ** 2))),
-            behaviour=behaviour_of(_track_of(time_s, ours), Reference(R_lab_body=true), align=True),
+            behaviour=behaviour,
         )
-
-
-def _track_of(time_s: Doubles, R_lab_body: Doubles) -> Trajectory:
-    """Return a track with orientations alone, of a ball in its place."""
-    none = Trajectory.empty(
-        time_s,
-        cameras=("cam1",),
-        frame_rate=RATE_HZ,
-        method="precise",
-        settings="",
-        experiment="",
-        provenance={},
-        length_unit="radii",
-    )
-    return replace(none, orientation=R_lab_body)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Frame
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.poses import FittedPoses, PoseStart, best_poses
+from sphereorient.pose.poses import PoseStart, best_poses
 from sphereorient.pose.residuals import EDGE_PX
 
 ROUNDS = 10  # of robust weights
@@ -67,17 +67,7 @@ def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], sc
     fine = fitter.optics.fine
     pixels = fitter.pixels([[shot.picture for shot in frames[k]] for k in rows], X, fine)
     fit = fitter.fit(pixels, PoseStart(X, R, use), fine, ITERATIONS)
-    return centre_of(fitter, pixels, fit, use)
-
-
-def centre_of(
-    fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, position_lab_mm: Tensor | None = None
-) -> FixedCentre:
-    """Return the centre of n fits with free positions, of the pixels' disks, `use` (n, C); `position_lab_mm` (3,): it
-    is known to be there, and the fits tell its error alone.
-    """
     place, covariance = mean_place(fit.position_lab_mm, fit.covariance[:, 3:, 3:])
-    place = place if position_lab_mm is None else position_lab_mm
     return FixedCentre(
         position_lab_mm=place,
         covariance_mm2=covariance + _edge(fitter, place),

@@ -46,16 +46,9 @@ class OnlineTracker:
         self._number = 0
         self._last: Poses | None = None  # of the last frame, before it is remembered
 
-    def resume(self, seen: Sequence[tuple[float, Poses]]) -> None:
-        """Take the poses of the last frames, with their times, s, from who followed the ball before."""
-        for time_s, poses in seen:
-            self._time_s[self._number] = time_s
-            self._last = poses
-            self.between()
-
-    def followed(self, time_s: float, shots: Sequence[Frame]) -> Poses | None:
-        """Return the poses of the frame of a time as the frames before predict them; None where they say nothing of it,
-        or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
+    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+        """Return the poses of the frame of a time, and whether they were searched for: the frames before say nothing of
+        it, or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
         """
         self.between()
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
@@ -64,13 +57,8 @@ class OnlineTracker:
         ahead = self._tracker.ahead(self._chunk, self._number)
         if ahead is not None:
             (self._last,) = self._tracker.follow([ahead], [shots])
-        return self._last
-
-    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
-        """Return the poses of the frame of a time, and whether they were searched for; see `followed`."""
-        followed = self.followed(time_s, shots)
-        if followed is not None:
-            return followed, False
+        if self._last is not None:
+            return self._last, False
         poses = self._tracker.searched(shots)
         self._chunk.forget()  # what was before says nothing of the motion from here
         self._last = poses

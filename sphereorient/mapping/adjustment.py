@@ -186,12 +186,18 @@ def _radius_px(crops: Crops, camera: int) -> float:
 
 def _within(crops: Crops, camera: int) -> NDArray[np.bool_]:
     """Return which pixels of a camera's crops show the ball, (H, W)."""
-    view = crops.views[camera]
     crop = next(crop for crop in crops.crops[camera] if crop is not None)
     there = tuple(slice(at, at + size) for at, size in zip((crop.top, crop.left), crop.grey.shape, strict=True))
+    return within_limb(crops.views[camera], crops.position_lab_mm[0], crops.radius_mm, there)
+
+
+def within_limb(
+    view: CameraView, position_lab_mm: Tensor, radius_mm: float, there: tuple[slice, ...]
+) -> NDArray[np.bool_]:
+    """Return which pixels of a part of the picture, rows and columns, show a ball at a position (3,) well."""
     y, x = np.mgrid[there]
-    u, v = view.camera.project(crops.position_lab_mm[0]).tolist()
-    within: NDArray[np.bool_] = np.hypot(x - u, y - v) < WITHIN * _radius_px(crops, camera)
+    u, v = view.camera.project(position_lab_mm).tolist()
+    within: NDArray[np.bool_] = np.hypot(x - u, y - v) < WITHIN * float(view.radius_px(position_lab_mm, radius_mm))
     if view.background.shown is not None:
         within &= view.background.shown[there]
     return within

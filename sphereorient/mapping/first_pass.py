@@ -19,7 +19,7 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
-from sphereorient.mapping.adjustment import Adjustment, adjusted, cells_of, place_metric
+from sphereorient.mapping.adjustment import Adjustment, adjusted, cells_of, place_metric, within_limb
 from sphereorient.mapping.disks import Crop, Crops, cut_out, evenly_spread
 from sphereorient.mapping.paint_cells import BallView
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics
@@ -34,7 +34,6 @@ GREY = 128.0  # of even pictures: their mean; as the scene about the ball, so th
 CONTRAST = 50.0  # of these, the deviation from it
 WINDOW = 0.35  # half side, radii, of the neighbourhood over which light is taken as even
 EVENER = 0.25  # share of the whole disk's power that is added to that of the neighbourhood
-WITHIN = 0.98  # of the radius: pixels that count
 REACH = 1.2  # of the radius: half side of what is cut out
 CELL_PX = 0.75  # of the map, in the disk's middle
 NOISE = 10.0  # grey levels, of even pictures
@@ -106,14 +105,11 @@ class EvenLight:
         reach = int(REACH * radius_px) + 2
         self.left, self.top = max(0, round(u) - reach), max(0, round(v) - reach)
         self._there = np.s_[self.top : min(height, round(v) + reach + 1), self.left : min(width, round(u) + reach + 1)]
-        y, x = np.mgrid[self._there]
-        within = np.hypot(x - u, y - v) < WITHIN * radius_px
-        if view.background.shown is not None:
-            within &= view.background.shown[self._there]
+        within = within_limb(view, position_lab_mm, radius_mm, self._there)
         self.counts = torch.from_numpy(within)
         self._within = within.astype(np.float32)
         self._window = (2 * int(WINDOW * radius_px) + 1,) * 2
-        self._share = 1 / np.maximum(self._mean(self._within), 1e-3)
+        self._share = np.asarray(1 / np.maximum(self._mean(self._within), 1e-3), np.float32)
         self._number = float(self._within.sum())
 
     def _mean(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -311,8 +307,8 @@ class KeptFrames:
 
     def arrays(self) -> tuple[list[list[Crop]], NDArray[np.bool_], NDArray[np.float64]]:
         """Return all crops, use (N, C) and orientations (N, 3, 3), without tensors: for another process."""
-        use, R = (torch.stack([getattr(one, name) for one in self._rows]) for name in ("use", "R_lab_body"))
-        return [one.crops for one in self._rows], use.numpy(), R.numpy()
+        crops, use, R = self._parts(self._rows)
+        return crops, use.numpy(), R.numpy()
 
     def so_far(self) -> "KeptFrames":
         """Return a record of the same frames, to which no other ones come."""
@@ -346,11 +342,15 @@ class KeptFrames:
     def crops(self, most: int = 2 * MAPPED) -> tuple[Crops, Tensor]:
         """Return the frames, evenly spread if there are more, and their orientations (N, 3, 3)."""
         some = evenly_spread(torch.arange(len(self._rows)), most).tolist() if self._rows else []
-        use = torch.zeros(len(some), len(self._place.views), dtype=torch.bool)
-        R = torch.zeros(len(some), 3, 3, dtype=torch.float64)
-        for n, k in enumerate(some):
-            use[n], R[n] = self._rows[k].use, self._rows[k].R_lab_body
-        return self._place.holding([self._rows[k].crops for k in some], use), R
+        crops, use, R = self._parts([self._rows[k] for k in some])
+        return self._place.holding(crops, use), R
+
+    def _parts(self, rows: Sequence[_Kept]) -> tuple[list[list[Crop]], Tensor, Tensor]:
+        use = torch.zeros(len(rows), len(self._place.views), dtype=torch.bool)
+        R = torch.zeros(len(rows), 3, 3, dtype=torch.float64)
+        for n, one in enumerate(rows):
+            use[n], R[n] = one.use, one.R_lab_body
+        return [one.crops for one in rows], use, R
 
 
 def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> Adjustment:

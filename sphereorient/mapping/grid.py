@@ -42,8 +42,8 @@ def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
 class SplineTable(TextureTable):
     """A texture map (H, 2 H) with the blur `blur_rad`, sampled by its spline exactly; records the texels read."""
 
-    def __init__(self, texture: Tensor, blur_rad: float, unseen: TextureTable | None = None) -> None:
-        super().__init__(torch.zeros(1, 4), blur_rad, unseen)
+    def __init__(self, texture: Tensor, blur_rad: float) -> None:
+        super().__init__(torch.zeros(1, 4), blur_rad)
         self.texture = texture
         self.reads: list[tuple[Tensor, Tensor]] = []  # of each look-up: texels and weights, (L, P, 16)
 

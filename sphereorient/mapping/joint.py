@@ -66,8 +66,7 @@ def linearise(
     fitter: Fitter, paint: SplineTable, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
 ) -> Linearisation:
     """Linearise B * C disks, adjacent cameras, about a new table of a map of their blur and poses (B, 3) mm, (B, 3, 3).
-    The light of each frame is at its best; the fitter gives views and light, not the map. Pixels of paint that the
-    table marks as unseen have no weight.
+    The light of each frame is at its best; the fitter gives views and light, not the map.
     """
     model = replace(fitter.model(), paint=paint, blur_px=blur_px)
     at = residuals(pixels, position_lab_mm, R_lab_body, None, model)

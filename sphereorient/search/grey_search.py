@@ -69,10 +69,6 @@ class GreySearch(DiskSearch):
         pictures = (self._view.picture(self._paint.sample(R.mT @ normal)[0]) for R in views)
         return torch.cat([to_int8(self._normalise(some)) for some in pictures])
 
-    def prepare(self) -> None:
-        """Make the bank now, not when it is needed."""
-        self.bank.size()
-
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
         grey = torch.as_tensor(disks).float()

@@ -49,29 +49,22 @@ def pinhole(**changes: object) -> PinholeCamera:
     return PinholeCamera(**(parameters | changes))
 
 
-def brown(**changes: object) -> BrownCamera:
-    parameters: dict[str, object] = {
+def lens() -> dict[str, object]:
+    return {
         "image_size": SIZE,
         "R_cam_lab": turned(),
         "T_cam_lab_mm": f64(T_MM),
         "centre_px": f64((331.0, 228.5)),
         "f_px": f64((700.0, 715.0)),
-        "k": f64((-0.21, 0.12, -0.03)),
-        "p": f64((2e-3, -1.5e-3)),
     }
-    return BrownCamera(**(parameters | changes))
+
+
+def brown(**changes: object) -> BrownCamera:
+    return BrownCamera(**(lens() | {"k": f64((-0.21, 0.12, -0.03)), "p": f64((2e-3, -1.5e-3))} | changes))
 
 
 def fisheye(**changes: object) -> FisheyeCamera:
-    parameters: dict[str, object] = {
-        "image_size": SIZE,
-        "R_cam_lab": turned(),
-        "T_cam_lab_mm": f64(T_MM),
-        "centre_px": f64((331.0, 228.5)),
-        "f_px": f64((700.0, 715.0)),
-        "k": f64((-0.02, 0.005, -0.004, 0.001)),
-    }
-    return FisheyeCamera(**(parameters | changes))
+    return FisheyeCamera(**(lens() | {"k": f64((-0.02, 0.005, -0.004, 0.001))} | changes))
 
 
 def telecentric(**changes: object) -> TelecentricCamera:
