@@ -18,6 +18,7 @@ import numpy as np
 import torch
 import yaml
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from sphereorient import so3
@@ -30,7 +31,7 @@ from sphereorient.files.picture import write_picture
 from sphereorient.files.threads import Progress, silent
 from sphereorient.files.whole_file import make_folder, write_text, writing
 from sphereorient.mapping.chain import chained
-from sphereorient.mapping.disks import fixed_place
+from sphereorient.mapping.disks import held_place
 from sphereorient.mapping.first_pass import first_adjustment, followed_by
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.settings import Settings
@@ -54,6 +55,7 @@ RADIUS_MM = 5.0
 ROWS = 512  # of the paint
 SAMPLES = 2  # of a pixel and axis
 EXPOSURES = 4  # instants of an exposure
+SWAY_FRAMES = 8  # over which a ball that sways moves smoothly
 BEHIND, BEHIND_NOISE = 55.0, 3.0  # grey levels: a pattern that stays
 AWAY_DEG = 30.0  # by which the camera looks down at the ball
 GREY_BODY, GREY_LEG = 28.0, 22.0
@@ -91,6 +93,9 @@ class BallScene:
     exposure: float = 0.0  # share of the time between frames
     legs: int = 0
     dust: int = 0
+    sway_px: float = 0.0  # by which the ball sways in its holder, rms
+    sway_share: float = 0.0  # of its distance, rms, along the line of sight
+    sink_px: float = 0.0  # by which it sinks over the movie
     fictrac: tuple[float, float, float] = (math.nan,) * 3  # as printed
     spintrack: tuple[float, float, float] = (math.nan,) * 3
 
@@ -142,6 +147,9 @@ SCENES: Mapping[str, BallScene] = {
         fictrac=(0.253, 0.686, -0.969),
         spintrack=(0.040, 0.092, 0.025),
     ),
+    "at_rest": BallScene(half_deg=5.73),
+    "sways": BallScene(half_deg=5.73, sway_px=4.0, sway_share=0.03),
+    "sinks": BallScene(half_deg=5.73, elevation_deg=1.0, sink_px=100.0),
 }
 
 
@@ -228,20 +236,57 @@ def _place(scene: BallScene, camera: PinholeCamera) -> Tensor:
     return (ahead * RADIUS_MM / math.sin(math.radians(scene.half_deg))) @ camera.R_cam_lab
 
 
+def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.Generator) -> Tensor:
+    """Return the ball's centres in N frames, (N, 3), mm, lab."""
+    X = _place(scene, camera)
+    if not (scene.sway_px or scene.sink_px):
+        return X.expand(count, 3)
+    aside = rng.normal(size=(3, count + 8 * SWAY_FRAMES))
+    aside = gaussian_filter1d(aside, SWAY_FRAMES, axis=1)[:, 4 * SWAY_FRAMES : -4 * SWAY_FRAMES]
+    u, v, size = torch.from_numpy(aside / aside.std(axis=1, keepdims=True))
+    sunk = torch.linspace(0, scene.sink_px, count, dtype=torch.float64)
+    right = camera.across_lab(X)
+    mm_px = X.norm() / camera.f_px
+    ahead = torch.nn.functional.normalize(X, dim=0)
+    right = torch.nn.functional.normalize(right - (right @ ahead) * ahead, dim=0)
+    down = torch.linalg.cross(ahead, right)
+    share = scene.sway_px / math.sqrt(2) * mm_px
+    moved = (share * u)[:, None] * right + (share * v + sunk * mm_px)[:, None] * down
+    return X + moved + (scene.sway_share * size)[:, None] * X
+
+
 class _Film:
     """Renders the frames of a scene."""
 
     def __init__(self, scene: BallScene, camera: PinholeCamera, X: Tensor, paint: Floats, rng: np.random.Generator):
-        self.scene, self._paint, self._rng = scene, paint, rng
+        self.scene, self._camera, self._paint, self._rng = scene, camera, paint, rng
         (u, v), (width, height) = camera.project(X).tolist(), scene.size
-        radius_px = float(camera.f_px) * math.tan(math.radians(scene.half_deg)) * 1.15
-        self.radius_px, self.middle = radius_px / 1.15, (u, v)
-        self.left, self.top = max(0, int(u - radius_px)), max(0, int(v - radius_px))
+        self.radius_px, self.middle = float(camera.f_px) * math.tan(math.radians(scene.half_deg)), (u, v)
+        self._put(X)
+        rows, columns = np.mgrid[:height, :width]
+        away = (columns - width / 2) ** 2 + (rows - height / 2) ** 2
+        self._gain = (1 - scene.vignette * away / (width**2 + height**2) * 4).astype(np.float32)
+        self._behind = (BEHIND + rng.normal(0, BEHIND_NOISE, (height, width))).astype(np.float32)
+        top, left = (one.start for one in self._there)
+        bottom, right = (one.stop for one in self._there)
+        for _ in range(scene.dust):
+            dx, dy, size = rng.uniform(left, right), rng.uniform(top, bottom), rng.uniform(4, 12)
+            spot = np.exp(-((columns - dx) ** 2 + (rows - dy) ** 2) / (2 * size**2))
+            self._gain *= (1 - 0.5 * spot).astype(np.float32)
+
+    def _put(self, X: Tensor) -> None:
+        """Put the ball at a place (3,), mm, lab."""
+        if (placed := getattr(self, "_X", None)) is not None and torch.equal(placed, X):
+            return
+        scene, camera, self._X = self.scene, self._camera, X
+        (u, v), (width, height) = camera.project(X).tolist(), scene.size
+        radius_px = 1.15 * float(camera.f_px) * math.tan(math.asin(RADIUS_MM / float(X.norm())))
+        left, top = max(0, int(u - radius_px)), max(0, int(v - radius_px))
         right, bottom = min(width, int(u + radius_px) + 2), min(height, int(v + radius_px) + 2)
-        self.there = np.s_[self.top : bottom, self.left : right]
+        self._there = np.s_[top:bottom, left:right]
         across = [
             torch.arange((stop - start) * SAMPLES, dtype=torch.float64) / SAMPLES + start + (0.5 / SAMPLES - 0.5)
-            for start, stop in ((self.top, bottom), (self.left, right))
+            for start, stop in ((top, bottom), (left, right))
         ]
         y, x = torch.meshgrid(*across, indexing="ij")
         rays = camera.rays(torch.stack([x, y], -1))
@@ -256,14 +301,6 @@ class _Film:
         glint = -(mirrored * rays.direction_lab).sum(-1)
         self._shade = ((0.35 + 0.65 * lit).numpy() * self._hit).astype(np.float32)
         self._glint = (scene.specular * glint.clamp_min(0).numpy() ** 25 * self._hit).astype(np.float32)
-        rows, columns = np.mgrid[:height, :width]
-        away = (columns - width / 2) ** 2 + (rows - height / 2) ** 2
-        self._gain = (1 - scene.vignette * away / (width**2 + height**2) * 4).astype(np.float32)
-        self._behind = (BEHIND + rng.normal(0, BEHIND_NOISE, (height, width))).astype(np.float32)
-        for _ in range(scene.dust):
-            dx, dy, size = rng.uniform(self.left, right), rng.uniform(self.top, bottom), rng.uniform(4, 12)
-            spot = np.exp(-((columns - dx) ** 2 + (rows - dy) ** 2) / (2 * size**2))
-            self._gain *= (1 - 0.5 * spot).astype(np.float32)
 
     def _seen(self, R_lab_body: Tensor) -> Floats:
         """Return the paint of all samples."""
@@ -275,8 +312,9 @@ class _Film:
             cv2.remap(self._paint, u.numpy(), v.numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32
         )
 
-    def frame(self, k: int, count: int, R: Tensor, turns: tuple[Tensor, Tensor]) -> NDArray[np.uint8]:
-        """Return the picture of frame k, at R in the middle of the exposure; `turns` (3,): to it, and to the next."""
+    def frame(self, k: int, count: int, X: Tensor, R: Tensor, turns: tuple[Tensor, Tensor]) -> NDArray[np.uint8]:
+        """Return the picture of frame k, at X, and R in the middle of the exposure; `turns` (3,): to it, to the next."""
+        self._put(X)
         scene, share = self.scene, np.zeros(1)
         if scene.exposure:
             share = scene.exposure * ((np.arange(EXPOSURES) + 0.5) / EXPOSURES - 0.5)
@@ -285,7 +323,7 @@ class _Film:
         height, width = (side // SAMPLES for side in fine.shape[:2])
         light, cover = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
         picture = self._behind.copy()
-        picture[self.there] = picture[self.there] * (1 - cover) + 255 * light
+        picture[self._there] = picture[self._there] * (1 - cover) + 255 * light
         self._put_animal(picture, k)
         time_s = k / RATE_HZ
         gain = 1 + scene.flicker * math.sin(2 * math.pi * 47 * time_s) + scene.drift * math.sin(2 * math.pi * k / count)
@@ -328,20 +366,20 @@ class _Film:
 def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, progress: Progress = silent) -> Path:
     """Render a scene with exact truth and return its experiment.yaml, which names no map and no diameter."""
     rng, camera = np.random.default_rng(seed), _camera(scene)
-    X = _place(scene, camera)
-    film = _Film(scene, camera, X, painted(scene.paint, rng), rng)
+    X = _places(scene, camera, frames, rng)
+    film = _Film(scene, camera, X[0], painted(scene.paint, rng), rng)
     turns = torch.from_numpy(walked(frames, rng, 0.3 if scene.motion == "saccades" else 1.0))
     R = chained(so3.exp(turns[1:]))
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for k in range(frames):
             progress("render", k, frames)
-            yield film.frame(k, frames, R[k], (turns[k], turns[min(k + 1, frames - 1)]))
+            yield film.frame(k, frames, X[k], R[k], (turns[k], turns[min(k + 1, frames - 1)]))
 
     make_folder(folder, f"folder {folder}")
     write_ffv1(folder / "cam1.mkv", pictures(), RATE_HZ)
     save_cameras(folder / "cameras.yaml", {"cam1": camera}, comment="exact camera; X_cam = R X_lab + T, mm")
-    sphere = {"diameter": None, "fixed": True}
+    sphere = {"diameter": None, "fixed": "sways" if scene.sway_px or scene.sink_px else True}
     content = {"schema": "sphereorient-experiment/1", "name": folder.name, "frame_rate": RATE_HZ, "sphere": sphere}
     content |= {"cameras": "cameras.yaml", "movies": {"cam1": "cam1.mkv"}}
     if scene.legs:
@@ -351,7 +389,7 @@ def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, pro
     still = torch.zeros(frames, 3, dtype=torch.float64)
     truth = Motion6D(
         time_s=torch.arange(frames, dtype=torch.float64) / RATE_HZ,
-        position_lab_mm=X.expand(frames, 3) / RADIUS_MM,
+        position_lab_mm=X / RADIUS_MM,
         velocity_m_s=still,
         acceleration_m_s2=still,
         R_lab_body=R,
@@ -424,7 +462,7 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
     with h5py.File(path.with_name("truth.h5")) as file:
         R_true = file["orientation"][()]
     with open_recording(path, None, textured=False) as recording, one_thread():
-        place = fixed_place(recording, settings.paint, settings.locate)
+        place = held_place(recording, settings.paint, settings.locate)
         adjustment = first_adjustment(recording, place, progress)
         begun = time.process_time()
         for _ in recording.streams[0].pictures():

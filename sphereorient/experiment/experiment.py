@@ -33,6 +33,12 @@ class Sphere:
     diameter_mm: float | None = None  # None: unknown, lengths are in radii
     texture_path: Path | None = None  # None: to be estimated
     fixed: bool = False  # whether the centre is fixed
+    sways: bool = False  # whether it moves little or slowly about a place, in a holder
+
+    @property
+    def in_place(self) -> bool:
+        """Whether it stays in its place: it is what changes in the pictures."""
+        return self.fixed or self.sways
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,7 +119,7 @@ class Experiment:
     @property
     def mapless(self) -> bool:
         """Whether its only sphere stays in its place and has no texture map: one is learnt from the movies."""
-        return self.alone and self.fixed and (self.texture_path is None or not self.texture_path.exists())
+        return self.alone and self.sphere.in_place and (self.texture_path is None or not self.texture_path.exists())
 
     def new_map_path(self) -> Path:
         """Return where the map that is learnt is written: as named, or beside the experiment.
@@ -145,7 +151,7 @@ class SphereKeys(BaseModel, frozen=True, extra="forbid"):
 
     diameter: Positive | None
     texture: str | None = None
-    fixed: StrictBool = False
+    fixed: StrictBool | Literal["sways"] = False
 
 
 class FlowKeys(BaseModel, frozen=True, extra="forbid"):
@@ -208,7 +214,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
 
     def sphere(name: str, one: SphereKeys) -> Sphere:
         texture = None if one.texture is None else path.parent / one.texture
-        return Sphere(name=name, diameter_mm=one.diameter, texture_path=texture, fixed=one.fixed)
+        return Sphere(name=name, diameter_mm=one.diameter, texture_path=texture, fixed=one.fixed is True, sways=one.fixed == "sways")
 
     spheres = keys.spheres if keys.sphere is None else {UNNAMED: keys.sphere}
     return Experiment(

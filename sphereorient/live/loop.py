@@ -66,11 +66,11 @@ def _learning(
 ) -> Iterator[LiveSetUp]:
     # Import late: with a map nothing is learnt.
     from sphereorient.live.learning import LearningTracker
-    from sphereorient.mapping.disks import fixed_place
+    from sphereorient.mapping.disks import held_place
     from sphereorient.report.texture_map import write_map
 
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
-        tracker = LearningTracker(fixed_place(recording, settings.paint, settings.locate))
+        tracker = LearningTracker(held_place(recording, settings.paint, settings.locate))
 
         def save() -> str:
             with writing(force=True):  # that of before, by this run

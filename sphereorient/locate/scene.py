@@ -14,7 +14,7 @@ from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
-from sphereorient.locate.background import LOUD, Background, even_scene, filled, measure_background, without_ball
+from sphereorient.locate.background import FREE, LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
@@ -26,6 +26,7 @@ LOUD_SHARE = 0.1  # share of loud pixels in the disk that triggers `_quieter`
 CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in sigmas
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
+TOGETHER = 8  # frames in a row, of those that are spread, in which a ball that sways is taken as fixed
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
 BORDER = 0.03  # of the shorter side: the border of a photograph shows what is around the sphere
 LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
@@ -46,7 +47,7 @@ class CameraScene:
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
     """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
     experiment = recording.experiment
-    if settings.diameter_px is None and (recording.photograph or (experiment.fixed and experiment.diameter_mm is None)):
+    if settings.diameter_px is None and (recording.photograph or (experiment.sphere.in_place and experiment.diameter_mm is None)):
         return None
     return settings.diameter_px or expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
 
@@ -70,9 +71,10 @@ def find_scenes(
     sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
     empty, background = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None
     photograph = stream.photograph and len(each) == 1
-    in_place = photograph or all(one.experiment.fixed for one in each.values())
+    in_place = photograph or all(one.experiment.sphere.in_place for one in each.values())
     if in_place and (empty is None or None in sizes.values()):
-        find = still_ball if photograph else fixed_ball
+        sways = not all(one.experiment.fixed for one in each.values())
+        find = still_ball if photograph else swaying_ball if sways else fixed_ball
         outline, guess = find(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
         background = guess if empty is None else None
@@ -206,6 +208,57 @@ def fixed_ball(
         raise _none_fixed("no circle about what changes")
     scene = _around(middle, scatter, outline, full_scale)
     return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
+
+
+def swaying_ball(
+    pictures: NDArray[Any],
+    locating: LocateSettings,
+    empty: NDArray[np.float32] | None = None,
+    shown: NDArray[np.bool_] | None = None,
+) -> tuple[Outline, Background]:
+    """Find a rotating sphere that sways, or moves slowly, in frames (n, H, W) in order of time: in a few of them its
+    centre is nearly fixed. Return the median of its outlines, and the background with a guess where it always is.
+    Arguments and errors as those of `fixed_ball`.
+    """
+    groups, found = np.array_split(pictures, max(1, len(pictures) // TOGETHER)), list[Outline | None]()
+    for group in groups:
+        try:
+            found.append(fixed_ball(group, locating, empty, shown)[0])
+        except ExperimentError:
+            found.append(None)  # it rests
+    seen = [one for one in found if one is not None]
+    if not seen:
+        raise _none_fixed("nothing round that changes in a few frames")
+    size_px = 2 * float(np.median([one.radius_px for one in seen]))
+    first, covered = replace(measure_background(pictures, empty), shown=shown), np.zeros(pictures.shape, bool)
+    nearest = [min(seen, key=lambda one, k=k: abs(found.index(one) - k)) for k in range(len(groups))]
+    for mask, disk in zip(covered, (one for one, group in zip(nearest, groups) for _ in group), strict=True):
+        cover(mask, disk, RIM, True)
+    disks: list[Outline] = seen
+    for _ in range(ROUNDS):
+        background = _where_always(without_ball(first, pictures, covered), covered, size_px) if empty is None else first
+        each = [find_ball(picture, background, size_px, locating)[0] for picture in pictures]
+        if sum(one is not None for one in each) <= len(disks):
+            break
+        disks = [one for one in each if one is not None]
+        for mask, disk in zip(covered, each, strict=True):
+            if disk is not None:
+                mask[:] = False
+                cover(mask, disk, RIM, True)
+    middle = np.median([disk.circle for disk in disks], axis=0).tolist()
+    return replace(disks[0], u_px=middle[0], v_px=middle[1], radius_px=middle[2]), background
+
+
+def _where_always(background: Background, covered: NDArray[np.bool_], size_px: float) -> Background:
+    """Return a background with the median of its surroundings where a ball covers pixels in nearly all frames."""
+    always = (len(covered) - covered.sum(0) < FREE).astype(np.uint8)
+    reach = 2 * int((RING - RIM) * size_px / 2) + 1
+    around = (cv2.dilate(always, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > always)
+    around = around if around.any() else always == 0
+    mean, noise = background.mean.copy(), background.noise.copy()
+    for part in (mean, noise):
+        part[always > 0] = np.median(part[around]) if around.any() else np.median(part)
+    return replace(background, mean=mean, noise=noise)
 
 
 def still_ball(

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator, make_lsq_spline
+from scipy.interpolate import PchipInterpolator, make_lsq_spline, make_smoothing_spline
+from scipy.ndimage import median_filter
 from torch import Tensor
 
 from sphereorient.errors import ExperimentError, Flag, Reason, ShapeError, refusal
@@ -15,6 +16,7 @@ from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline, 
 from sphereorient.locate.settings import LocateSettings
 
 DEGREE = 3  # of the spline
+FEWEST, BESIDE, OUTLYING = 8, 7, 5.0  # places of a ball that sways: least number; frames of a median; deviations from it
 Found = tuple[Outline | None, Reason]
 
 
@@ -151,6 +153,23 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
     centre_px, radius_px = (torch.from_numpy(part.copy()) for part in (track[:, :2], track[:, 2]))
     places = replace(sightings, centre_px=centre_px, radius_px=radius_px)
     return replace(places, outline_rms_px=rms, covariance_px2=covariance, flags=flags, reason=reason)
+
+
+def smoothed(sightings: Sightings) -> Sightings:
+    """Return a place in every frame, of a ball that is nearly at rest: a smoothing spline through what was found, whose
+    smoothness is learnt from it (generalised cross-validation), without outliers; all flags and reasons stay.
+    """
+    track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
+    known = np.flatnonzero(np.isfinite(track[:, 2]))
+    if len(known) < FEWEST:
+        return sightings
+    away = np.abs(track[known] - median_filter(track[known], (BESIDE, 1), mode="nearest"))
+    usual = 1.4826 * np.median(away, axis=0)
+    known = known[(away <= OUTLYING * usual + 1e-9).all(1)]
+    frames = np.arange(len(track)).clip(known[0], known[-1]).astype(float)
+    smooth = np.column_stack([make_smoothing_spline(known.astype(float), one)(frames) for one in track[known].T])
+    centre_px, radius_px = (torch.from_numpy(part.copy()) for part in (smooth[:, :2], smooth[:, 2]))
+    return replace(sightings, centre_px=centre_px, radius_px=radius_px)
 
 
 def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:

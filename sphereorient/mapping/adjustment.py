@@ -57,6 +57,7 @@ class Adjustment:
     cells: PaintCells  # in which it was found, of paint in shares of the light
     light: Sequence[Picture]  # of each camera, in the pixels of its crops
     left: float  # root mean square of what the pictures differ from the paint
+    moved_mm: Tensor  # (3,), by which the places found are off those given, in the mean
 
     def texture(self) -> TextureMap:
         """Return the map, 0 black .. 1 white."""
@@ -71,25 +72,32 @@ class Adjustment:
 
 
 def adjusted(
-    crops: Crops, R_lab_body: Tensor, progress: Progress = silent, levels: Sequence[float] = LEVELS
+    crops: Crops,
+    R_lab_body: Tensor,
+    progress: Progress = silent,
+    levels: Sequence[float] = LEVELS,
+    scatter: float = 0.0,
 ) -> Adjustment:
     """Return what all crops of a ball that stays in its place have in common, from near turns (N, 3, 3) and a near
-    place: coarse to fine, `levels` as `LEVELS`.
+    place: coarse to fine, `levels` as `LEVELS`. `scatter`, radii in pictures: of places, where each crop has its own.
     """
+    places = 1 if crops.fixed else len(R_lab_body)
+    expected = crops.position_lab_mm[:places] / crops.radius_mm
+    spread = PRIOR**2 + scatter**2 * torch.eye(places, dtype=torch.float64)
     light = [_mean_light(crops, c) for c in range(len(crops.views))]
-    found = Adjustment(crops=crops, R_lab_body=R_lab_body, cells=cells_of(crops), light=light, left=math.inf)
+    found = Adjustment(crops=crops, R_lab_body=R_lab_body, cells=cells_of(crops), light=light, left=math.inf, moved_mm=torch.zeros(3))
     for pixels in counted("adjustment", levels, len(levels), progress):
         found = replace(found, cells=cells_of(crops, pixels))
         near = NEAR * math.sqrt(4 * math.pi) / found.cells.side  # radii
         for _ in range(MOST_STEPS):
             seen = [_seen(found, c) for c in range(len(crops.views))]
             found = replace(found, light=[_light(found, one, c) for c, one in enumerate(seen)])
-            step, turn, left = _step(found, seen)  # radii, rad
+            step, turn, left = _step(found, seen, expected, spread)  # radii, rad
             crops = replace(crops, position_lab_mm=crops.position_lab_mm + step * crops.radius_mm)
             found = replace(found, crops=crops, R_lab_body=found.R_lab_body @ so3.exp(turn), left=left)
             if _moved(step, found) < near and float(turn.norm(dim=1).median()) < near:
                 break
-    return found
+    return replace(found, moved_mm=crops.position_lab_mm[:places].mean(0) - expected.mean(0) * crops.radius_mm)
 
 
 def focal_ratio(found: Adjustment) -> float:
@@ -102,7 +110,7 @@ def focal_ratio(found: Adjustment) -> float:
     def at(log: float, start: Adjustment) -> Adjustment:
         return adjusted(_with_focal(start.crops, math.exp(log)), start.R_lab_body, levels=LEVELS[:2])
 
-    distance = float(sights(begin.crops).norm())  # radii
+    distance = float(sights(begin.crops)[:, 0].norm())  # radii
     logs = [k * FOCAL_STEP for k in range(-FOCAL_STEPS, FOCAL_STEPS + 1)]
     logs = [log for log in logs if log == 0.0 or distance * math.exp(log) > NEAREST]
     tried = {log: at(log, begin) for log in logs if abs(log) <= FOCAL_STEP}
@@ -160,8 +168,9 @@ class _Seen:
 
 def _seen(at: Adjustment, camera: int) -> _Seen:
     crops, view = at.crops, at.crops.views[camera]
-    ball = BallView.of(view.camera, crops.position_lab_mm[0], crops.radius_mm)
-    counts = torch.from_numpy(_within(crops, camera))
+    places = crops.position_lab_mm[:1] if crops.fixed else crops.position_lab_mm
+    balls = [BallView.of(view.camera, X, crops.radius_mm) for X in places]
+    counts = [torch.from_numpy(_within(crops, camera, k)) for k in range(len(places))]
     blur_px = BLUR * _radius_px(crops, camera) * math.sqrt(4 * math.pi) / at.cells.side
 
     def one(k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -170,7 +179,8 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
             none = torch.zeros(at.cells.side**2)
             return none, none, none.int()
         grey = torch.from_numpy(_blurred(crop.grey.astype(np.float32), blur_px))
-        return at.cells.see(ball, grey, counts, (crop.left, crop.top), at.R_lab_body[k])
+        place = 0 if crops.fixed else k
+        return at.cells.see(balls[place], grey, counts[place], (crop.left, crop.top), at.R_lab_body[k])
 
     grey, cosine, pixel = zip(*side_by_side(one, range(len(at.R_lab_body))), strict=True)
     return _Seen(grey=torch.stack(grey), cosine=torch.stack(cosine), pixel=torch.stack(pixel))
@@ -184,22 +194,24 @@ def _radius_px(crops: Crops, camera: int) -> float:
     return float(crops.views[camera].radius_px(crops.position_lab_mm[0], crops.radius_mm))
 
 
-def _within(crops: Crops, camera: int) -> NDArray[np.bool_]:
-    """Return which pixels of a camera's crops show the ball, (H, W)."""
-    crop = next(crop for crop in crops.crops[camera] if crop is not None)
+def _within(crops: Crops, camera: int, frame: int = 0) -> NDArray[np.bool_]:
+    """Return which pixels of a crop of a camera show the ball, (H, W); of a frame that it has not seen, of another."""
+    crop = crops.crops[camera][frame] or next(crop for crop in crops.crops[camera] if crop is not None)
     there = tuple(slice(at, at + size) for at, size in zip((crop.top, crop.left), crop.grey.shape, strict=True))
-    return within_limb(crops.views[camera], crops.position_lab_mm[0], crops.radius_mm, there)
+    return within_limb(crops.views[camera], crops.position_lab_mm[frame], crops.radius_mm, there)
 
 
 def within_limb(
     view: CameraView, position_lab_mm: Tensor, radius_mm: float, there: tuple[slice, ...]
 ) -> NDArray[np.bool_]:
     """Return which pixels of a part of the picture, rows and columns, show a ball at a position (3,) well."""
-    y, x = np.mgrid[there]
+    y, x = np.ogrid[there]
     u, v = view.camera.project(position_lab_mm).tolist()
     within: NDArray[np.bool_] = np.hypot(x - u, y - v) < WITHIN * float(view.radius_px(position_lab_mm, radius_mm))
+    width, height = view.camera.image_size
+    within &= (x >= 0) & (x < width) & (y >= 0) & (y < height)
     if view.background.shown is not None:
-        within &= view.background.shown[there]
+        within &= view.background.shown[y.clip(0, height - 1), x.clip(0, width - 1)]
     return within
 
 
@@ -256,78 +268,85 @@ def _together(at: Adjustment, seen: Iterable[_Seen]) -> tuple[Tensor, Tensor]:
 
 
 def sights(place: Crops) -> Tensor:
-    """Return the lines of sight from all cameras to a ball's first position, (C, 3) float64, radii, lab."""
+    """Return the lines of sight from all cameras to a ball's N positions, (C, N, 3) float64, radii, lab."""
     centres = torch.stack([centre_lab_mm(view.camera) for view in place.views])
-    return (place.position_lab_mm[0] - centres) / place.radius_mm
+    return (place.position_lab_mm - centres[:, None]) / place.radius_mm
 
 
 def place_metric(place: Crops) -> Tensor:
     """Return the metric (3, 3) of moves of a ball's place, by what they move in pictures, 1/radii^2 of each camera:
     along a line of sight a ball but grows.
     """
-    sight = sights(place)
+    sight = sights(place).mean(1)
     square = sight.square().sum(1)[:, None, None]
     ahead = sight[:, :, None] * sight[:, None] / square
     return (torch.eye(3) - ahead + ahead / square).sum(0)
 
 
 def _moved(step: Tensor, at: Adjustment) -> float:
-    """Return how far a step of the place moves what is seen, radii."""
-    return math.sqrt(float(step @ place_metric(at.crops) @ step))
+    """Return how far a step of places (P, 3) moves what is seen, radii, rms."""
+    return math.sqrt(float((step @ place_metric(at.crops) * step).sum(1).mean()))
 
 
-def _step(at: Adjustment, seen: Sequence[_Seen]) -> tuple[Tensor, Tensor, float]:
-    """Return one Gauss-Newton step of the place (3,), radii, and of turns (N, 3), rad, in the body; and what is left.
+def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Return one Gauss-Newton step of places (P, 3), radii, lab, and of turns (N, 3), rad, in the body; and what is
+    left. P: 1, or N of a ball that sways; `expected` (P, 3), radii, and `spread` (P, P), radii^2: what is known of them.
 
     A turn by t moves what is seen in direction n by t x n; a place that moves by d moves it by d less the part of d
     along the line of sight w that leaves the sphere: d - w (n.d) / (n.w).
     """
-    R, count = at.R_lab_body, len(at.R_lab_body)
+    R, crops, count = at.R_lab_body, at.crops, len(at.R_lab_body)
     grey, weight = _together(at, seen)
     mean, total = _mean(grey, weight)
     off = grey.sub_(mean)
     left = float((weight * off.square()).sum() / weight.sum())
     at.cells.set(mean, total)
     slopes, normals = at.cells.table.rows[:, 1:], at.cells.normals
-    sight = (sights(at.crops)[:, None, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
-    by_turn = torch.zeros(3, count, 3, count, dtype=torch.float64)
-    by_both, by_place = torch.zeros(count, 3, 3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
-    force, force_place = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    sight = (sights(crops)[:, :, None] @ R)[:, :, 0].float()  # (C, N, 3), in the body
+    places = 1 if crops.fixed else count
+    size, turns = 3 * (count + places), 3 * count
+    H, own = torch.zeros(size, size, dtype=torch.float64), torch.zeros(count, 6, 6, dtype=torch.float64)
+    force = torch.zeros(size, dtype=torch.float64)
     for part in torch.split(torch.arange(len(mean)), AT_ONCE):
         s, n = slopes[part], normals[part]
-        q, w, e, whole = torch.linalg.cross(n, s), weight[..., part], off[..., part], total[part].clamp_min(LEAST)
-        along = (sight @ s.mT) / (1 + sight @ n.mT).clamp_max(-LEAST)  # a place's: s less n times it, in the body
-        once, square, twice = w.sum(0), (w * along.square()).sum(0), (w * along).sum(0)
-        rotations = R.float().flatten(1)
-        s_lab, n_lab = ((one.mT @ rotations).reshape(-1, 3, 3) for one in (once, twice))
-        p = ((s_lab @ s[..., None]) - (n_lab @ n[..., None]))[..., 0] / whole[:, None]  # the mean over the pictures
-        scaled = once * whole.rsqrt()
-        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-            product = q[:, i] * q[:, j]
-            by_turn[i, :, j] += torch.diag(once @ product).double() - ((scaled * product) @ scaled.mT).double()
-        own = once @ _outer(q, s) - twice @ _outer(q, n)
-        by_both += own.reshape(count, 3, 3).double() @ R.mT - (once @ _outer(q, p)).reshape(count, 3, 3).double()
-        squares = once @ _outer(s, s) + square @ _outer(n, n) - twice @ (_outer(s, n) + _outer(n, s))
-        by_place += (R @ squares.reshape(count, 3, 3).double() @ R.mT).sum(0) - ((whole * p.mT) @ p).double()
-        force -= ((w * e).sum(0) @ q).double()
-        moved = (w * e).sum(0) @ s - (w * e * along).sum(0) @ n
-        force_place -= (R @ moved[..., None].double()).sum(0)[:, 0]
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        by_turn[j, :, i] = by_turn[i, :, j].mT
-    H = torch.zeros(3 * count + 3, 3 * count + 3, dtype=torch.float64)
-    H[:-3, :-3] = by_turn.permute(1, 0, 3, 2).reshape(3 * count, -1)
-    H[:-3, -3:] = by_both.reshape(-1, 3)
-    H[-3:, :-3] = H[:-3, -3:].mT
-    H[-3:, -3:] = by_place + left / PRIOR**2 * place_metric(at.crops)
+        turned = torch.linalg.cross(n, s).mT
+        rows = torch.zeros(size, len(part))
+        for c, w in enumerate(weight[..., part]):
+            along = (sight[c] @ s.mT) / (1 + sight[c] @ n.mT).clamp_max(-LEAST)
+            moved = R.float() @ (s.mT - along[:, None] * n.mT)  # (N, 3, cells)
+            both = torch.cat([turned.expand_as(moved), moved], dim=1)
+            weighted = w[:, None] * both
+            own += (weighted @ both.mT).double()
+            pulled = (weighted @ off[c, :, part, None]).double()
+            force[:turns] -= pulled[:, :3].reshape(-1)
+            force[turns:] -= _of_places(pulled[:, 3:, 0], places)
+            rows[:turns] += weighted[:, :3].reshape(turns, -1)
+            rows[turns:] += _of_places(weighted[:, 3:], places)
+        rows *= total[part].clamp_min(LEAST).rsqrt()
+        H -= (rows @ rows.mT).double()
+    by_turn, by_both, by_place = own[:, :3, :3], own[:, :3, 3:], own[:, 3:, 3:]
+    k, place = torch.arange(count), torch.arange(count) * (places > 1)
+    blocks = H.view(count + places, 3, count + places, 3)
+    blocks[k, :, k] += by_turn
+    blocks[k, :, count + place] += by_both
+    blocks[count + place, :, k] += by_both.mT
+    blocks[count:, :, count:].diagonal(dim1=0, dim2=2).add_(by_place.sum(0)[..., None] if places == 1 else by_place.permute(1, 2, 0))
+    metric = left * place_metric(crops)
+    known = torch.linalg.inv(spread)
+    away = crops.position_lab_mm[:places] / crops.radius_mm - expected
+    H[turns:, turns:] += torch.kron(known.contiguous(), metric.contiguous())
+    force[turns:] -= (known @ away @ metric).reshape(-1)
     diagonal = H.diagonal()
-    usual = float(diagonal[:-3].mean())
+    usual = float(diagonal[:turns].mean())
     diagonal[:3] += HELD * usual
-    diagonal[:-3] += FREE * usual + LEAST**2
-    x = torch.linalg.solve(H, torch.cat([force.reshape(-1), force_place]))
-    step = x[-3:] * (FARTHEST / max(_moved(x[-3:], at), FARTHEST))
-    return step, x[:-3].reshape(count, 3), math.sqrt(left)
+    diagonal[:turns] += FREE * usual + LEAST**2
+    x = torch.linalg.solve(H, force)
+    step = x[turns:].reshape(places, 3)
+    step = step * (FARTHEST / max(_moved(step, at), FARTHEST))
+    return step, x[:turns].reshape(count, 3), math.sqrt(left)
 
 
-def _outer(a: Tensor, b: Tensor) -> Tensor:
-    """Return outer products of rows, (M, 9)."""
-    return (a[:, :, None] * b[:, None]).flatten(1)
+def _of_places(each: Tensor, places: int) -> Tensor:
+    """Return what is of N places (N, 3, ...) for as many, or for all as one, (3 P, ...)."""
+    return each.sum(0) if places == 1 else each.flatten(0, 1)
+

@@ -18,9 +18,9 @@ from sphereorient import locate
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
-from sphereorient.files.threads import Progress
+from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.initialise import GAP_SHARE
-from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of
+from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of, smoothed
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.settings import MapSettings
@@ -70,18 +70,27 @@ class Crops:
         crop, scene = self.crops[camera][frame], self.views[camera].background.mean
         whole: Picture = scene.astype(np.float32)
         if crop is not None:
-            height, width = crop.grey.shape
-            whole[crop.top : crop.top + height, crop.left : crop.left + width] = crop.grey
+            there = np.s_[max(0, crop.top) :, max(0, crop.left) :]
+            part = crop.grey[max(0, -crop.top) :, max(0, -crop.left) :]
+            height, width = (min(sides) for sides in zip(part.shape, whole[there].shape, strict=True))
+            whole[there][:height, :width] = part[:height, :width]
         return whole
 
     def pictures(self, frames: Tensor) -> list[list[Picture]]:
         """Return all cameras' whole pictures of some frames (M,)."""
         return [[self.picture(k, c) for c in range(len(self.views))] for k in frames.tolist()]
 
-    def holding(self, rows: Sequence[Sequence[Crop]], use: Tensor) -> "Crops":
-        """Return a record of a ball in one place with crops of all cameras, N rows, of which (N, C) are used."""
-        X = self.position_lab_mm[:1].expand(len(rows), 3)
+    def holding(self, rows: Sequence[Sequence[Crop]], use: Tensor, position_lab_mm: Tensor | None = None) -> "Crops":
+        """Return a record of the ball with crops of all cameras, N rows, of which (N, C) are used, at positions (N, 3);
+        None: at its one place.
+        """
+        X = self.position_lab_mm[:1].expand(len(rows), 3) if position_lab_mm is None else position_lab_mm
         return replace(self, crops=list(zip(*rows, strict=True)), position_lab_mm=X, seen=use)
+
+    def place(self, frame: int) -> Tensor:
+        """Return the position (3,) in a frame, of all that are fixed the first."""
+        X: Tensor = self.position_lab_mm[0 if self.fixed else frame]
+        return X
 
     def where(self, rows: Tensor) -> "Crops":
         """Return some frames (M,) int64."""
@@ -162,17 +171,34 @@ def _fixed_scene(
     return outline, scene
 
 
-def fixed_place(recording: Recording, settings: MapSettings, locating: LocateSettings) -> Crops:
-    """Return an empty record with the views and the one position (1, 3) of a fixed ball; raise as `take_crops`."""
-    views, sightings = [], {}
+def held_place(
+    recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress = silent
+) -> Crops:
+    """Return an empty record with the views and the positions of a ball in its holder: one (1, 3) of a fixed ball,
+    those of all frames (N, 3) of one that sways; raise as `take_crops`.
+    """
+    experiment, views, sightings = recording.experiment, [], {}
     for stream in recording.streams:
-        outline, scene = _fixed_scene(recording, stream, settings, locating)
+        if experiment.fixed:
+            outline, scene = _fixed_scene(recording, stream, settings, locating)
+            seen = sightings_of([(outline, Reason.OK)])
+        else:
+            (scene,) = locate.find_scenes(recording, stream, 4 * settings.background_frames, locating).values()
+            shots, count = locate.screened_frames(stream, scene.background), len(recording.timeline)
+            seen = smoothed(
+                sightings_of(
+                    find_ball(shot.picture, scene.background, scene.diameter_px, locating)
+                    if shot.usable
+                    else (None, shot.reason)
+                    for shot in counted(f"{stream.name}: ball", shots, count, progress)
+                )
+            )
         views.append(CameraView.of(stream.name, stream.camera, scene))
-        sightings[stream.name] = sightings_of([(outline, Reason.OK)])
+        sightings[stream.name] = seen
     cameras, none = {view.name: view.camera for view in views}, torch.zeros(0, len(views), dtype=torch.bool)
-    X = find_positions(sightings, cameras, recording.experiment.diameter_mm).position_lab_mm
-    radius_mm = recording.experiment.radius_mm
-    return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=none, radius_mm=radius_mm, fixed=True)
+    X = find_positions(sightings, cameras, experiment.diameter_mm).position_lab_mm
+    empty = {"views": views, "crops": [[] for _ in views], "seen": none}
+    return Crops(**empty, position_lab_mm=X, radius_mm=experiment.radius_mm, fixed=experiment.fixed)
 
 
 def evenly_spread(rows: Tensor, count: int) -> Tensor:
@@ -188,13 +214,27 @@ def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Cr
     return Crop(grey=grey, top=top, left=left)
 
 
-def cut_out(place: Crops, pictures: Sequence[Picture]) -> list[Crop]:
-    """Cut a ball in a known place, position (1, 3), out of a picture of each camera."""
-    X, found = place.position_lab_mm, []
+def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor | None = None) -> list[Crop]:
+    """Cut a ball in its place, or at a position (3,) near it, out of a picture of each camera: parts of one size."""
+    usual, found = place.position_lab_mm.median(0).values, []
+    X = usual if position_lab_mm is None else position_lab_mm
     for view, picture in zip(place.views, pictures, strict=True):
-        u, v = view.camera.project(X)[0].tolist()
-        found.append(cut_crop(picture, u, v, float(view.radius_px(X, place.radius_mm))))
+        u, v = view.camera.project(X).tolist()
+        radius_px = float(view.radius_px(usual, place.radius_mm))
+        cut = cut_crop if position_lab_mm is None else _whole_crop
+        found.append(cut(picture, u, v, radius_px))
     return found
+
+
+def _whole_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
+    """Cut out as `cut_crop`, black beyond the picture, so that all are of one size."""
+    reach, (height, width) = int(np.ceil(REACH * radius_px)) + 3, picture.shape
+    top, left = round(v_px) - reach, round(u_px) - reach
+    grey = np.zeros((2 * reach + 1, 2 * reach + 1), picture.dtype)
+    there = np.s_[max(0, top) : max(0, top + 2 * reach + 1), max(0, left) : max(0, left + 2 * reach + 1)]
+    part = picture[there]
+    grey[max(0, -top) :, max(0, -left) :][: part.shape[0], : part.shape[1]] = part
+    return Crop(grey=grey, top=top, left=left)
 
 
 def pixels_of(crops: Crops, fitter: Fitter, frames: Tensor, wanted: int, extra_px: float = 0.0) -> Pixels:

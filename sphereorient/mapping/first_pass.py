@@ -41,6 +41,7 @@ LEAST_SCORE = 0.3  # of a picture that the map explains
 USUAL_OF = 200  # frames that tell the usual score
 SURE_SHARE = 0.7  # of it, where the ball is searched for over all orientations: the best of many wrong ones is less
 OUTLINE_ERROR, ADJUSTED_ERROR = 0.01, 5e-4  # of the place, radii in pictures: by an outline, by all pictures
+SWAY_ERROR = 0.005  # of the places of a ball that sways about each other
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
 WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried where it is none of these
@@ -64,7 +65,8 @@ class CoarserPictures:
     @classmethod
     def of(cls, place: Crops) -> "CoarserPictures":
         """Return those of a ball at a place."""
-        radius_px = min(float(view.radius_px(place.position_lab_mm[0], place.radius_mm)) for view in place.views)
+        X = place.position_lab_mm.median(0).values
+        radius_px = min(float(view.radius_px(X, place.radius_mm)) for view in place.views)
         factor = max(1, int(radius_px / LEAST_RADIUS_PX))
         coarse = replace(place, views=[_coarser_view(view, factor) for view in place.views])
         return cls(place=coarse, whole=place.views, factor=factor)
@@ -133,16 +135,27 @@ class EvenLight:
         return whole
 
 
+class _Seen:
+    """A ball in its place, as all cameras see it."""
+
+    def __init__(self, place: Crops, position_lab_mm: Tensor) -> None:
+        self.X = position_lab_mm  # (3,)
+        self.even = [EvenLight(view, self.X, place.radius_mm) for view in place.views]
+        self.views = [BallView.of(view.camera, self.X, place.radius_mm) for view in place.views]
+
+
 class FirstPass:
     """Follows a ball in its place by the map of the frames before: the body frame is the lab at the first one."""
 
     def __init__(self, place: Crops, error: float = OUTLINE_ERROR) -> None:
-        """`place`: a record of crops with the place as first position; `error`: of it, radii in pictures."""
-        X, radius_mm = place.position_lab_mm[0], place.radius_mm
+        """`place`: a record of crops with the place as first position; `error`: of it, radii in pictures. The place of
+        a ball that sways is given with each frame, and found anew within this error.
+        """
+        radius_mm = place.radius_mm
         self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
-        self._X, self._even = X, [EvenLight(view, X, radius_mm) for view in place.views]
-        self._views = [BallView.of(view.camera, X, radius_mm) for view in place.views]
-        diameter_px = 2 * max(float(view.radius_px(X, radius_mm)) for view in place.views)
+        self._place, self._seen = place, _Seen(place, place.position_lab_mm[0])
+        sizes = [view.radius_px(place.position_lab_mm, radius_mm).max() for view in place.views]
+        diameter_px = 2 * max(map(float, sizes))
         self.cells = cells_of(place, CELL_PX)
         noise = torch.tensor([[NOISE**2, 0.0, 0.0, 0.0]] * len(place.views))
         self._fitter = Fitter(
@@ -152,25 +165,29 @@ class FirstPass:
             light=replace(DiskLight.unknown(len(place.views), noise), known=True),
             widest_px=diameter_px / 2,
         )
-        self._precision = HELD / radius_mm**2 * torch.eye(3, dtype=torch.float64)
+        held = HELD / radius_mm**2 * torch.eye(3, dtype=torch.float64)
+        free = error < OUTLINE_ERROR and not place.fixed
+        self._precision = torch.linalg.inv(self._place_covariance) if free else held
         self._near = so3.local_grid(math.radians(STEP_DEG), math.radians(REACH_DEG))
         self._before: tuple[float, Tensor] | None = None  # time, s, and R_lab_body (3, 3)
         self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)  # rad/s, and its last change
         self._lost = 0  # frames that are not explained, in a row
         self._usual, self._count = 0.0, 1  # score of frames that are, and their number
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+    def next(self, time_s: float, shots: Sequence[Frame], position_lab_mm: Tensor | None = None) -> tuple[Poses, bool]:
         """Return the pose of the frame of a time, none where the map does not explain it, and whether it was searched
-        for; the map grows by it.
+        for; the map grows by it. `position_lab_mm` (3,): of a ball that sways.
         """
+        if position_lab_mm is not None:
+            self._seen = _Seen(self._place, position_lab_mm)
         use = torch.tensor([shot.usable for shot in shots])
         reason = [shot.reason for shot in shots]
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
-        even = [light(shot.picture) for light, shot in zip(self._even, shots, strict=True)]
+        even = [light(shot.picture) for light, shot in zip(self._seen.even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
-            self._grow(even, use, R)  # the map is this frame
+            self._grow(even, use, R, self._seen.X)  # the map is this frame
             self._before = time_s, R
             return self._told(self._settled([even], R[None], use), use, reason), True
         step_s, before = time_s - self._before[0], self._before[1]
@@ -187,19 +204,23 @@ class FirstPass:
         score = float(_mean_score(fit, use)) / int(use.sum())
         self._usual += (score - self._usual) / min(self._count, USUAL_OF)
         self._count += 1
-        self._grow(even, use, R)
+        self._grow(even, use, R, fit.position_lab_mm[0])
         return self._told(fit, use, reason), searched
 
     def _told(self, fit: FittedPoses, use: Tensor, reason: Sequence[Reason]) -> Poses:
         poses = poses_of(fit, slice(0, 1), use, reason)
-        poses.covariance[:, 3:, 3:] = self._place_covariance
+        if self._place.fixed:
+            poses.covariance[:, 3:, 3:] = self._place_covariance
         return poses
 
     def shown(self, crops: Crops, R_lab_body: Tensor) -> "FirstPass":
         """Return this pass after its map has grown by crops (N) at known orientations (N, 3, 3)."""
         for k, use in enumerate(crops.seen):
-            pictures = crops.pictures(torch.tensor([k]))[0]
-            self._grow([light(one) for light, one in zip(self._even, pictures, strict=True)], use, R_lab_body[k])
+            pictures, X = crops.pictures(torch.tensor([k]))[0], crops.place(k)
+            if not crops.fixed:
+                self._seen = _Seen(self._place, X)
+            even = [light(one) for light, one in zip(self._seen.even, pictures, strict=True)]
+            self._grow(even, use, R_lab_body[k], X)
         return self
 
     def begin(self, time_s: float, R_lab_body: Tensor) -> None:
@@ -213,8 +234,11 @@ class FirstPass:
         self._rate, self._change, self._lost = before._rate, before._change, before._lost
         self._usual, self._count = before._usual, before._count
 
-    def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor) -> None:
-        for view, light, one, seen in zip(self._views, self._even, even, use.tolist(), strict=True):
+    def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor, X: Tensor) -> None:
+        views = self._seen.views
+        if not self._place.fixed:
+            views = [BallView.of(view.camera, X, self._place.radius_mm) for view in self._place.views]
+        for view, light, one, seen in zip(views, self._seen.even, even, use.tolist(), strict=True):
             if seen:
                 self.cells.add(view, torch.from_numpy(one), light.counts, (light.left, light.top), R_lab_body)
 
@@ -239,7 +263,7 @@ class FirstPass:
         """Return the best fit near any of many orientations (M, 3, 3)."""
         frames, begin = self._start([even], R, use)
         level = self._fitter.optics.fine
-        one = self._fitter.pixels(frames, self._X[None], level).thinned(TRIED_EVERY)
+        one = self._fitter.pixels(frames, self._seen.X[None], level).thinned(TRIED_EVERY)
         tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(len(R))), begin, level, TRIED_STEPS)
         best = _mean_score(tried, use).topk(TRIED_BEST).indices
         fit = self._settled([even] * TRIED_BEST, tried.R_lab_body[best], use)
@@ -250,9 +274,9 @@ class FirstPass:
     ) -> tuple[list[list[NDArray[np.float32]]], PoseStart]:
         """Return whole pictures, and the start of fits at orientations (B, 3, 3)."""
         shapes = [view.camera.image_size[::-1] for view in self._fitter.views]
-        lights = list(zip(self._even, shapes, strict=True))
+        lights = list(zip(self._seen.even, shapes, strict=True))
         frames = [[light.framed(one, shape) for (light, shape), one in zip(lights, row, strict=True)] for row in even]
-        many = self._X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
+        many = self._seen.X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
         return frames, PoseStart(*many, held=True)
 
     def _settled(self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor) -> FittedPoses:
@@ -279,6 +303,7 @@ class _Kept:
     crops: list[Crop]  # of each camera
     use: Tensor  # (C,) bool
     R_lab_body: Tensor  # (3, 3)
+    X: Tensor  # (3,)
 
 
 class KeptFrames:
@@ -301,13 +326,15 @@ class KeptFrames:
         if self._rows and float(so3.geodesic_distance(self._rows[-1].R_lab_body, R)) < self._apart_rad:
             return
         self.count += 1
-        self._rows.append(_Kept(cut_out(self._place, [shot.picture for shot in shots]), poses.use, R))
+        X = poses.position_lab_mm[0]
+        crops = cut_out(self._place, [shot.picture for shot in shots], None if self._place.fixed else X)
+        self._rows.append(_Kept(crops, poses.use, R, X))
         if len(self._rows) == 2 * MAPPED:
             self._rows, self._apart_rad = self._rows[::2], 2 * self._apart_rad
 
     def arrays(self) -> tuple[list[list[Crop]], NDArray[np.bool_], NDArray[np.float64]]:
         """Return all crops, use (N, C) and orientations (N, 3, 3), without tensors: for another process."""
-        crops, use, R = self._parts(self._rows)
+        crops, use, R, _ = self._parts(self._rows)
         return crops, use.numpy(), R.numpy()
 
     def so_far(self) -> "KeptFrames":
@@ -337,24 +364,24 @@ class KeptFrames:
             got = f"{math.degrees(self.turned_rad):.2g} degrees in all frames together"
             do = "use a movie in which the ball turns"
             raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
-        return adjusted(*self.crops(), progress)
+        return adjusted(*self.crops(), progress, scatter=0.0 if self._place.fixed else SWAY_ERROR)
 
     def crops(self, most: int = 2 * MAPPED) -> tuple[Crops, Tensor]:
         """Return the frames, evenly spread if there are more, and their orientations (N, 3, 3)."""
         some = evenly_spread(torch.arange(len(self._rows)), most).tolist() if self._rows else []
-        crops, use, R = self._parts([self._rows[k] for k in some])
-        return self._place.holding(crops, use), R
+        crops, use, R, X = self._parts([self._rows[k] for k in some])
+        return self._place.holding(crops, use, None if self._place.fixed else X), R
 
-    def _parts(self, rows: Sequence[_Kept]) -> tuple[list[list[Crop]], Tensor, Tensor]:
+    def _parts(self, rows: Sequence[_Kept]) -> tuple[list[list[Crop]], Tensor, Tensor, Tensor]:
         use = torch.zeros(len(rows), len(self._place.views), dtype=torch.bool)
-        R = torch.zeros(len(rows), 3, 3, dtype=torch.float64)
+        R, X = torch.zeros(len(rows), 3, 3, dtype=torch.float64), torch.zeros(len(rows), 3, dtype=torch.float64)
         for n, one in enumerate(rows):
-            use[n], R[n] = one.use, one.R_lab_body
-        return [one.crops for one in rows], use, R
+            use[n], R[n], X[n] = one.use, one.R_lab_body, one.X
+        return [one.crops for one in rows], use, R, X
 
 
 def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> Adjustment:
-    """Return what the first frames of a ball near a place, see `fixed_place`, have in common; the body frame is the lab
+    """Return what the first frames of a ball near a place, see `held_place`, have in common; the body frame is the lab
     at the first frame that shows it. A few of them tell place and map; by these, more are followed and tell them again.
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
     """
@@ -364,7 +391,7 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
         found, kept = _swept(recording, coarse, FirstPass(coarse.place), count, progress)
     adjustment = kept.adjusted(progress)
     if count > len(found):
-        found, kept = _swept(recording, coarse, _after(adjustment, recording), count, progress)
+        found, kept = _swept(recording, *_after(adjustment, coarse, recording), count, progress)
         adjustment = kept.adjusted(progress)
     seen = sum(map(supported, found))
     if seen < LEAST_FOUND * len(found):
@@ -375,14 +402,18 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
 
 def followed_by(adjustment: Adjustment, recording: Recording, place: Crops, progress: Progress) -> list[Poses]:
     """Return the poses of all frames by the place and map of an adjustment of some, `place` as given to it."""
-    after, count = _after(adjustment, recording), len(recording.timeline)
-    return _swept(recording, CoarserPictures.of(place), after, count, progress)[0]
+    after = _after(adjustment, CoarserPictures.of(place), recording)
+    return _swept(recording, *after, len(recording.timeline), progress)[0]
 
 
-def _after(adjustment: Adjustment, recording: Recording) -> FirstPass:
+def _after(
+    adjustment: Adjustment, coarse: CoarserPictures, recording: Recording
+) -> tuple[CoarserPictures, FirstPass]:
+    """Return the pictures with the place that was found, and a pass with the map."""
     follower = FirstPass(adjustment.crops, ADJUSTED_ERROR).shown(adjustment.crops, adjustment.R_lab_body)
     follower.begin(float(recording.timeline.time_s[0]), adjustment.R_lab_body[0])
-    return follower
+    X = coarse.place.position_lab_mm + adjustment.moved_mm
+    return replace(coarse, place=replace(coarse.place, position_lab_mm=X)), follower
 
 
 def _swept(
@@ -393,7 +424,8 @@ def _swept(
     kept, found = KeptFrames(coarse.place), list[Poses]()
     for k, row in enumerate(counted("first pass", shots, count, progress)):
         frames = coarse.frames(row)
-        poses, _ = follower.next(float(recording.timeline.time_s[k]), frames)
+        X = None if coarse.place.fixed else coarse.place.position_lab_mm[k]
+        poses, _ = follower.next(float(recording.timeline.time_s[k]), frames, X)
         found.append(poses)
         if supported(poses):
             kept.add(frames, poses)

@@ -17,7 +17,7 @@ from sphereorient.files.threads import Progress, silent
 from sphereorient.mapping import LearntMap, fit_map
 from sphereorient.mapping.adjustment import focal_ratio
 from sphereorient.mapping.balls import SharedMap, corrected, crops_of_balls, shared_maps
-from sphereorient.mapping.disks import fixed_place
+from sphereorient.mapping.disks import held_place
 from sphereorient.mapping.first_pass import first_adjustment
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
@@ -103,7 +103,7 @@ def first_map_of(
     """
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         progress("place", 0, 1)
-        place = fixed_place(recording, settings.paint, settings.locate)
+        place = held_place(recording, settings.paint, settings.locate)
         found, remarks = first_adjustment(recording, place, progress), list[str]()
         (name, camera), *others = recording.cameras.items()
         if isinstance(camera, PinholeCamera) and not others:

@@ -10,7 +10,7 @@ from test_fixed_centre import truth
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.locate import LocateSettings, screened_frames
-from sphereorient.mapping.disks import fixed_place
+from sphereorient.mapping.disks import held_place
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
@@ -28,7 +28,7 @@ def turning_ball(tmp_path_factory):
     path = write_synthetic_experiment(tmp_path_factory.mktemp("turns"), settings)
     experiment = load_experiment(path).with_sphere(fixed=True, texture_path=None)
     with open_recording(experiment, ["cam1"], textured=False) as recording:
-        place = fixed_place(recording, SETTINGS, LocateSettings())
+        place = held_place(recording, SETTINGS, LocateSettings())
         shots = list(screened_frames(recording.streams[0], place.views[0].background))
         for shot in shots:
             _ = shot.picture
