@@ -252,7 +252,8 @@ def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.
     down = torch.linalg.cross(ahead, right)
     share = scene.sway_px / math.sqrt(2) * mm_px
     moved = (share * u)[:, None] * right + (share * v + sunk * mm_px)[:, None] * down
-    return X + moved + (scene.sway_share * size)[:, None] * X
+    places: Tensor = X + moved + (scene.sway_share * size)[:, None] * X
+    return places
 
 
 class _Film:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, StrictBool
+from pydantic import BaseModel, Field, FiniteFloat
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.cameras.checks import check_known
@@ -151,7 +151,7 @@ class SphereKeys(BaseModel, frozen=True, extra="forbid"):
 
     diameter: Positive | None
     texture: str | None = None
-    fixed: StrictBool | Literal["sways"] = False
+    fixed: Literal[True, False, "sways"] = False
 
 
 class FlowKeys(BaseModel, frozen=True, extra="forbid"):
@@ -214,7 +214,13 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
 
     def sphere(name: str, one: SphereKeys) -> Sphere:
         texture = None if one.texture is None else path.parent / one.texture
-        return Sphere(name=name, diameter_mm=one.diameter, texture_path=texture, fixed=one.fixed is True, sways=one.fixed == "sways")
+        return Sphere(
+            name=name,
+            diameter_mm=one.diameter,
+            texture_path=texture,
+            fixed=one.fixed is True,
+            sways=one.fixed == "sways",
+        )
 
     spheres = keys.spheres if keys.sphere is None else {UNNAMED: keys.sphere}
     return Experiment(

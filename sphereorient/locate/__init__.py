@@ -19,6 +19,6 @@ from sphereorient.locate.sightings import (
     fill_gaps,
     find_ball,
     sightings_of,
-    smoothed,
     size_of,
+    smoothed,
 )

@@ -14,11 +14,12 @@ from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
+from sphereorient.files.threads import side_by_side
 from sphereorient.locate.background import FREE, LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.locate.sightings import find_ball
+from sphereorient.locate.sightings import Found, find_ball
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
@@ -27,9 +28,16 @@ CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in s
 CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 TOGETHER = 8  # frames in a row, of those that are spread, in which a ball that sways is taken as fixed
+INPAINT_PX = 3.0  # about a pixel, whose surroundings it goes on from
+LOOKED_AT = 32  # of these, in which it is then looked for
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
 BORDER = 0.03  # of the shorter side: the border of a photograph shows what is around the sphere
 LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
+
+OUTLINES_MIN = 8  # that can show a scatter
+# Scatter of a ball's outlines that is none of a fixed one: px, of the radius, and of that of their size. Where outlines
+# are found badly, both scatter alike.
+WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
 
@@ -47,7 +55,9 @@ class CameraScene:
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
     """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
     experiment = recording.experiment
-    if settings.diameter_px is None and (recording.photograph or (experiment.sphere.in_place and experiment.diameter_mm is None)):
+    if settings.diameter_px is None and (
+        recording.photograph or (experiment.sphere.in_place and experiment.diameter_mm is None)
+    ):
         return None
     return settings.diameter_px or expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
 
@@ -210,6 +220,20 @@ def fixed_ball(
     return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
 
 
+def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettings) -> float:
+    """Return by how much the outlines in frames (n, H, W) of a ball taken as fixed scatter, robust sigma; 0 where that
+    is little, or not far more than their sizes do.
+    """
+    one = partial(_found, scene.background, scene.diameter_px, locating)
+    seen = np.array([ball.circle for ball, _ in side_by_side(one, pictures) if ball is not None])
+    if len(seen) < OUTLINES_MIN:
+        return 0.0
+    middle = np.median(seen, axis=0)
+    u, v, size = 1.4826 * np.median(np.abs(seen - middle), axis=0)
+    wander = float(np.hypot(u, v))
+    return wander if wander > max(WANDER_PX, WANDER_SHARE * middle[2], WANDER_SURE * size) else 0.0
+
+
 def swaying_ball(
     pictures: NDArray[Any],
     locating: LocateSettings,
@@ -220,44 +244,52 @@ def swaying_ball(
     centre is nearly fixed. Return the median of its outlines, and the background with a guess where it always is.
     Arguments and errors as those of `fixed_ball`.
     """
-    groups, found = np.array_split(pictures, max(1, len(pictures) // TOGETHER)), list[Outline | None]()
-    for group in groups:
-        try:
-            found.append(fixed_ball(group, locating, empty, shown)[0])
-        except ExperimentError:
-            found.append(None)  # it rests
-    seen = [one for one in found if one is not None]
-    if not seen:
-        raise _none_fixed("nothing round that changes in a few frames")
-    size_px = 2 * float(np.median([one.radius_px for one in seen]))
-    first, covered = replace(measure_background(pictures, empty), shown=shown), np.zeros(pictures.shape, bool)
-    nearest = [min(seen, key=lambda one, k=k: abs(found.index(one) - k)) for k in range(len(groups))]
-    for mask, disk in zip(covered, (one for one, group in zip(nearest, groups) for _ in group), strict=True):
-        cover(mask, disk, RIM, True)
-    disks: list[Outline] = seen
+    together, seen = TOGETHER, dict[int, Outline]()  # by the frame in the middle of a few
+    while 2 * len(seen) * together <= len(pictures):
+        if together >= 2 * len(pictures):
+            raise _none_fixed("no circle about what changes in a few frames")
+        groups = np.array_split(np.arange(len(pictures)), max(1, len(pictures) // together))
+        tried = {int(group[len(group) // 2]): _turning(pictures[group], locating, empty, shown) for group in groups}
+        seen, together = {k: one for k, one in tried.items() if one is not None}, 2 * together
+    some = range(0, len(pictures), max(1, len(pictures) // LOOKED_AT))
+    each = [seen[min(seen, key=lambda middle, k=k: abs(middle - k))] for k in some]  # type: ignore[misc]
+    pictures, size_px = pictures[some], 2 * float(np.median([one.radius_px for one in seen.values()]))
+    first, found = replace(measure_background(pictures, empty), shown=shown), 0
     for _ in range(ROUNDS):
-        background = _where_always(without_ball(first, pictures, covered), covered, size_px) if empty is None else first
-        each = [find_ball(picture, background, size_px, locating)[0] for picture in pictures]
-        if sum(one is not None for one in each) <= len(disks):
-            break
-        disks = [one for one in each if one is not None]
+        covered = np.zeros(pictures.shape, bool)
         for mask, disk in zip(covered, each, strict=True):
-            if disk is not None:
-                mask[:] = False
-                cover(mask, disk, RIM, True)
-    middle = np.median([disk.circle for disk in disks], axis=0).tolist()
-    return replace(disks[0], u_px=middle[0], v_px=middle[1], radius_px=middle[2]), background
+            cover(mask, disk, RIM_FIXED, True)
+        background = first if empty is not None else _where_always(without_ball(first, pictures, covered), covered)
+        now = [one for one, _ in side_by_side(partial(_found, background, size_px, locating), pictures)]
+        if (count := sum(one is not None for one in now)) <= found:
+            break
+        each, found = [new or old for new, old in zip(now, each, strict=True)], count
+    u, v, radius_px = np.median([disk.circle for disk in each], axis=0).tolist()
+    return replace(each[0], u_px=u, v_px=v, radius_px=radius_px), background
 
 
-def _where_always(background: Background, covered: NDArray[np.bool_], size_px: float) -> Background:
-    """Return a background with the median of its surroundings where a ball covers pixels in nearly all frames."""
+def _found(background: Background, diameter_px: float, locating: LocateSettings, picture: NDArray[Any]) -> Found:
+    return find_ball(picture, background, diameter_px, locating)
+
+
+def _turning(
+    pictures: NDArray[Any],
+    locating: LocateSettings,
+    empty: NDArray[np.float32] | None,
+    shown: NDArray[np.bool_] | None,
+) -> Outline | None:
+    """Return the outline of `fixed_ball`; None of a ball that rests, or moves too far in these frames."""
+    try:
+        return fixed_ball(pictures, locating, empty, shown)[0]
+    except ExperimentError:
+        return None
+
+
+def _where_always(background: Background, covered: NDArray[np.bool_]) -> Background:
+    """Return a background that goes on smoothly where a ball covers pixels in nearly all frames."""
     always = (len(covered) - covered.sum(0) < FREE).astype(np.uint8)
-    reach = 2 * int((RING - RIM) * size_px / 2) + 1
-    around = (cv2.dilate(always, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))) > always)
-    around = around if around.any() else always == 0
-    mean, noise = background.mean.copy(), background.noise.copy()
-    for part in (mean, noise):
-        part[always > 0] = np.median(part[around]) if around.any() else np.median(part)
+    noise = np.where(always > 0, np.float32(background.typical_noise), background.noise)
+    mean = np.asarray(cv2.inpaint(background.mean, always, INPAINT_PX, cv2.INPAINT_TELEA), np.float32)
     return replace(background, mean=mean, noise=noise)
 
 

@@ -16,7 +16,11 @@ from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline, 
 from sphereorient.locate.settings import LocateSettings
 
 DEGREE = 3  # of the spline
-FEWEST, BESIDE, OUTLYING = 8, 7, 5.0  # places of a ball that sways: least number; frames of a median; deviations from it
+FEWEST, BESIDE, OUTLYING = (
+    8,
+    7,
+    5.0,
+)  # places of a ball that sways: least number; frames of a median; deviations from it
 Found = tuple[Outline | None, Reason]
 
 

@@ -36,7 +36,7 @@ LIGHT_RADII = 0.08  # half side of the neighbourhood over which light is average
 LIGHT_ROUNDS, LIGHT_FRAMES = 2, 64  # in each of which it follows from the paint, and of which frames
 BLACKEST = 1e-3  # of the brightest light: the least
 ROBUST = 4.0  # deviations from the paint from which a picture counts less: what hides the ball, glare
-PRIOR = 0.05  # of the radius: error of the place at the start
+PRIOR, SCATTER = 0.05, 0.02  # of the radius: error of all places at the start, and of those of a ball that sways
 HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
 FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and how many to either side
 FOCAL_FRAMES, FOCAL_BETTER = 60, 0.9  # and share of what is left with the given one
@@ -76,18 +76,21 @@ def adjusted(
     R_lab_body: Tensor,
     progress: Progress = silent,
     levels: Sequence[float] = LEVELS,
-    scatter: float = 0.0,
 ) -> Adjustment:
     """Return what all crops of a ball that stays in its place have in common, from near turns (N, 3, 3) and a near
-    place: coarse to fine, `levels` as `LEVELS`. `scatter`, radii in pictures: of places, where each crop has its own.
+    place: coarse to fine, `levels` as `LEVELS`. Of a ball that sways each crop has its own place; by how much those
+    given scatter about the right ones is learnt.
     """
     places = 1 if crops.fixed else len(R_lab_body)
     expected = crops.position_lab_mm[:places] / crops.radius_mm
-    spread = PRIOR**2 + scatter**2 * torch.eye(places, dtype=torch.float64)
+    scatter = 0.0 if crops.fixed else SCATTER  # radii
     light = [_mean_light(crops, c) for c in range(len(crops.views))]
-    found = Adjustment(crops=crops, R_lab_body=R_lab_body, cells=cells_of(crops), light=light, left=math.inf, moved_mm=torch.zeros(3))
+    found = Adjustment(
+        crops=crops, R_lab_body=R_lab_body, cells=cells_of(crops), light=light, left=math.inf, moved_mm=torch.zeros(3)
+    )
     for pixels in counted("adjustment", levels, len(levels), progress):
         found = replace(found, cells=cells_of(crops, pixels))
+        spread = PRIOR**2 + scatter**2 * torch.eye(places, dtype=torch.float64)
         near = NEAR * math.sqrt(4 * math.pi) / found.cells.side  # radii
         for _ in range(MOST_STEPS):
             seen = [_seen(found, c) for c in range(len(crops.views))]
@@ -97,6 +100,8 @@ def adjusted(
             found = replace(found, crops=crops, R_lab_body=found.R_lab_body @ so3.exp(turn), left=left)
             if _moved(step, found) < near and float(turn.norm(dim=1).median()) < near:
                 break
+        off = crops.position_lab_mm[:places] / crops.radius_mm - expected
+        scatter = _moved(off - off.mean(0), found)
     return replace(found, moved_mm=crops.position_lab_mm[:places].mean(0) - expected.mean(0) * crops.radius_mm)
 
 
@@ -330,7 +335,9 @@ def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tenso
     blocks[k, :, k] += by_turn
     blocks[k, :, count + place] += by_both
     blocks[count + place, :, k] += by_both.mT
-    blocks[count:, :, count:].diagonal(dim1=0, dim2=2).add_(by_place.sum(0)[..., None] if places == 1 else by_place.permute(1, 2, 0))
+    blocks[count:, :, count:].diagonal(dim1=0, dim2=2).add_(
+        by_place.sum(0)[..., None] if places == 1 else by_place.permute(1, 2, 0)
+    )
     metric = left * place_metric(crops)
     known = torch.linalg.inv(spread)
     away = crops.position_lab_mm[:places] / crops.radius_mm - expected
@@ -349,4 +356,3 @@ def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tenso
 def _of_places(each: Tensor, places: int) -> Tensor:
     """Return what is of N places (N, 3, ...) for as many, or for all as one, (3 P, ...)."""
     return each.sum(0) if places == 1 else each.flatten(0, 1)
-

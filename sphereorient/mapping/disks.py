@@ -3,9 +3,9 @@
 The disks compare pictures before there is a map.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,20 @@ from sphereorient import locate
 from sphereorient.cameras import R_cam_view
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
-from sphereorient.files.threads import Progress, counted, silent
+from sphereorient.files.threads import Progress, counted, side_by_side, silent
 from sphereorient.follow.initialise import GAP_SHARE
-from sphereorient.locate import CameraScene, Found, LocateSettings, find_ball, find_positions, sightings_of, smoothed
+from sphereorient.locate import (
+    CameraScene,
+    Found,
+    Frame,
+    LocateSettings,
+    find_ball,
+    find_positions,
+    sightings_of,
+    smoothed,
+)
 from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import fixed_ball
+from sphereorient.locate.scene import fixed_ball, wander_px
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fitter import Fitter
@@ -33,10 +42,6 @@ from sphereorient.sphere.view import perspective_view
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
-OUTLINES_MIN = 8  # that can show a scatter
-# Scatter of a fixed ball's outlines that is refused: px, of the radius, and of that of their size. Where outlines are
-# found badly, both scatter alike.
-WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
 PLACES = 2  # per radius: places that far apart have paint of their own
 BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen", "shown")  # of `Disks`
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
@@ -124,9 +129,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         found: list[Found] = []
         row: list[Crop | None] = []
         for k, shot in enumerate(locate.screened_frames(stream, scene.background)):
-            one: Found = (outline if shot.usable else None, shot.reason)
-            if shot.usable and outline is None:
-                one = find_ball(shot.picture, scene.background, scene.diameter_px, locating)
+            one = (outline if shot.usable else None, shot.reason) if outline else _outline(scene, locating, shot)
             found.append(one)
             ball = one[0]
             row.append(None if ball is None else cut_crop(shot.picture, *ball.circle))
@@ -159,15 +162,10 @@ def _fixed_scene(
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     outline, background = fixed_ball(pictures, locating, empty, stream.shown)
     scene = CameraScene(background=background, diameter_px=2 * outline.radius_px, response=stream.response)
-    each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
-    seen = torch.tensor([one.circle for one in each if one is not None], dtype=torch.float64)
-    if len(seen) >= OUTLINES_MIN:
-        middle = seen.median(0).values
-        u, v, size = (1.4826 * (seen - middle).abs().median(0).values).tolist()
-        wander = math.hypot(u, v)
-        if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
-            got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: false`, and the diameter"
-            raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
+    wander = wander_px(pictures, scene, locating)
+    if wander:
+        got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: sways`"
+        raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
     return outline, scene
 
 
@@ -183,22 +181,22 @@ def held_place(
             outline, scene = _fixed_scene(recording, stream, settings, locating)
             seen = sightings_of([(outline, Reason.OK)])
         else:
-            (scene,) = locate.find_scenes(recording, stream, 4 * settings.background_frames, locating).values()
+            (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
             shots, count = locate.screened_frames(stream, scene.background), len(recording.timeline)
-            seen = smoothed(
-                sightings_of(
-                    find_ball(shot.picture, scene.background, scene.diameter_px, locating)
-                    if shot.usable
-                    else (None, shot.reason)
-                    for shot in counted(f"{stream.name}: ball", shots, count, progress)
-                )
-            )
+            found = side_by_side(partial(_outline, scene, locating), shots)
+            seen = smoothed(sightings_of(counted(f"{stream.name}: ball", found, count, progress)))
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = seen
     cameras, none = {view.name: view.camera for view in views}, torch.zeros(0, len(views), dtype=torch.bool)
     X = find_positions(sightings, cameras, experiment.diameter_mm).position_lab_mm
-    empty = {"views": views, "crops": [[] for _ in views], "seen": none}
-    return Crops(**empty, position_lab_mm=X, radius_mm=experiment.radius_mm, fixed=experiment.fixed)
+    radius_mm, fixed = experiment.radius_mm, experiment.fixed
+    return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=none, radius_mm=radius_mm, fixed=fixed)
+
+
+def _outline(scene: CameraScene, locating: LocateSettings, shot: Frame) -> Found:
+    if not shot.usable:
+        return None, shot.reason
+    return find_ball(shot.picture, scene.background, scene.diameter_px, locating)
 
 
 def evenly_spread(rows: Tensor, count: int) -> Tensor:
@@ -228,7 +226,7 @@ def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor |
 
 def _whole_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
     """Cut out as `cut_crop`, black beyond the picture, so that all are of one size."""
-    reach, (height, width) = int(np.ceil(REACH * radius_px)) + 3, picture.shape
+    reach = int(np.ceil(REACH * radius_px)) + 3
     top, left = round(v_px) - reach, round(u_px) - reach
     grey = np.zeros((2 * reach + 1, 2 * reach + 1), picture.dtype)
     there = np.s_[max(0, top) : max(0, top + 2 * reach + 1), max(0, left) : max(0, left + 2 * reach + 1)]

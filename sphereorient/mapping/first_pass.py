@@ -41,7 +41,6 @@ LEAST_SCORE = 0.3  # of a picture that the map explains
 USUAL_OF = 200  # frames that tell the usual score
 SURE_SHARE = 0.7  # of it, where the ball is searched for over all orientations: the best of many wrong ones is less
 OUTLINE_ERROR, ADJUSTED_ERROR = 0.01, 5e-4  # of the place, radii in pictures: by an outline, by all pictures
-SWAY_ERROR = 0.005  # of the places of a ball that sways about each other
 HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
 WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried where it is none of these
@@ -364,7 +363,7 @@ class KeptFrames:
             got = f"{math.degrees(self.turned_rad):.2g} degrees in all frames together"
             do = "use a movie in which the ball turns"
             raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
-        return adjusted(*self.crops(), progress, scatter=0.0 if self._place.fixed else SWAY_ERROR)
+        return adjusted(*self.crops(), progress)
 
     def crops(self, most: int = 2 * MAPPED) -> tuple[Crops, Tensor]:
         """Return the frames, evenly spread if there are more, and their orientations (N, 3, 3)."""
@@ -406,9 +405,7 @@ def followed_by(adjustment: Adjustment, recording: Recording, place: Crops, prog
     return _swept(recording, *after, len(recording.timeline), progress)[0]
 
 
-def _after(
-    adjustment: Adjustment, coarse: CoarserPictures, recording: Recording
-) -> tuple[CoarserPictures, FirstPass]:
+def _after(adjustment: Adjustment, coarse: CoarserPictures, recording: Recording) -> tuple[CoarserPictures, FirstPass]:
     """Return the pictures with the place that was found, and a pass with the map."""
     follower = FirstPass(adjustment.crops, ADJUSTED_ERROR).shown(adjustment.crops, adjustment.R_lab_body)
     follower.begin(float(recording.timeline.time_s[0]), adjustment.R_lab_body[0])

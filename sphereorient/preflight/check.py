@@ -80,7 +80,7 @@ def preflight(
         for stream in recording.streams:
             empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
             size_px = sizes[stream.name]
-            sampling.append(pool.submit(sample_movie, stream, size_px, settings.locate, empty, experiment.fixed))
+            sampling.append(pool.submit(sample_movie, stream, size_px, settings.locate, empty, experiment.sphere))
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
         samples = tuple(one.result() for one in sampling)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +21,14 @@ from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import DraftKey
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import fixed_ball, still_ball
+from sphereorient.locate.scene import CameraScene, fixed_ball, still_ball, swaying_ball, wander_px
 from sphereorient.movies import Movie, movie_files, open_movie
 from sphereorient.preflight.sample import sample_movie
 
 WIDE_DEG = 30.0  # field of view that is the example
-STAYS = 0.15  # of the radius: a ball whose outlines scatter by less stays in its place
-SEEN = 0.4  # share of the frames in which a ball that moves is found at least
-PICTURES = 40  # all over the movie, for a ball that stays
+STAYS, NEAR = 0.15, 1.0  # of the radius: a ball whose outlines scatter, or lie apart, by less stays in its place
+SEEN, ALWAYS = 0.4, 0.9  # share of the frames in which a ball is found at least, that moves, or that sinks slowly
+PICTURES, SLOW_PICTURES = 40, 100  # all over the movie, for a ball that stays, or sways
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
 FLOW = {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3}
 
@@ -41,6 +42,7 @@ class FirstLook:
     rate_hz: float | None  # by exact time stamps; None: the file has none
     diameter_px: float | None  # None: no ball was found
     stays: bool | None  # whether the ball stays in its place; None: not known
+    sways: bool = False  # whether it does not stay exactly there
     found: int  # frames with a ball, of `looked`
     looked: int
     frame: int  # one in which the ball was found, where there is one
@@ -76,18 +78,25 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
     k, looked = with_ball[len(with_ball) // 2] if with_ball else readable[0], len(readable)
     picture, outline = sample.picture[k], sample.found[k][0]
     assert picture is not None
-    seen, stays = len(outlines) >= SEEN * looked, None
+    seen, near, sways, stays = len(outlines) >= SEEN * looked, True, False, None
     if seen:
         places = np.array([(one.u_px, one.v_px) for one in outlines])
         radius_px = float(np.median([one.radius_px for one in outlines]))
-        stays = bool(np.median(np.hypot(*(places - np.median(places, axis=0)).T)) < STAYS * radius_px)
+        away = np.hypot(*(places - np.median(places, axis=0)).T) / radius_px
+        stays, near = bool(np.median(away) < STAYS), bool(away.max() < NEAR)
     if stays or not seen:
         try:
-            outline, _ = find(stream.spread(PICTURES), settings, shown=shown)
-            seen, stays = True, True
-            radius_px = outline.radius_px
+            outline, background = find(pictures := stream.spread(PICTURES), settings, shown=shown)
+            seen, stays, radius_px = True, True, outline.radius_px
+            scene = CameraScene(background=background, diameter_px=2 * radius_px)
+            sways = not stream.photograph and wander_px(pictures, scene, settings) > 0
         except (ExperimentError, MovieError):
             stays = None
+    if not (stays or stream.photograph) and near and (not seen or len(outlines) > ALWAYS * looked):
+        with suppress(ExperimentError, MovieError):
+            # Of a ball that sinks: in a few frames it nearly stays.
+            outline, _ = swaying_ball(stream.spread(SLOW_PICTURES), settings, shown=shown)
+            seen, stays, sways, radius_px = True, True, True, outline.radius_px
     rate_hz = None if movie.times_s is None or len(movie) < 2 else 1 / float(np.median(np.diff(movie.times_s)))
     return FirstLook(
         name=name,
@@ -95,6 +104,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
         rate_hz=rate_hz,
         diameter_px=2 * radius_px if seen else None,
         stays=stays,
+        sways=sways,
         found=looked if stays else len(outlines),
         looked=looked,
         frame=int(sample.row[k]),
@@ -156,12 +166,14 @@ def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
 
 
 def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
-    stays = all(one.stays for one in looks)
+    stays: bool | str = all(one.stays for one in looks)
     sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
     photograph = len(looks) == 1 and looks[0].photograph
     unknown = "; null where it is not known: lengths are then in radii" if len(looks) == 1 and stays else ""
     size = f"mm{unknown} ({sizes or 'no ball was found'})"
     fixed = f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies"
+    if stays and any(one.sways for one in looks):
+        stays, fixed = "sways", "true, false, or sways: it turns in its place, but sways or sinks there in these movies"
     if looks[0].photograph:
         stays, fixed = False, "whether the ball only turns, in its place: no matter, in one picture"
     return [

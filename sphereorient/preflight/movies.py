@@ -106,7 +106,7 @@ def background(sample: MovieSample, experiment: Experiment) -> Finding:
     if sample.name in experiment.background_paths:
         return judged(title, f"given: {experiment.background_paths[sample.name].name}")
     advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
-    if experiment.fixed:
+    if experiment.sphere.in_place:
         return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
     if sample.stream.photograph:
         return judged(title, "of one picture: guessed from the surroundings of the ball")

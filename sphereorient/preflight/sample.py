@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
 from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
+from sphereorient.experiment import Sphere
 from sphereorient.experiment.recording import CameraStream, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
@@ -26,7 +27,7 @@ from sphereorient.locate import (
 )
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import SMALLEST_PX, measured_size_px, still_ball
+from sphereorient.locate.scene import SMALLEST_PX, measured_size_px, still_ball, swaying_ball
 
 SPREAD = 25  # frames all over the movie: enough for a background
 EVERY = 3  # of these, each third one is read with the next frame, for motion and repeated frames
@@ -97,7 +98,7 @@ def sample_movie(
     diameter_px: float | None,
     settings: LocateSettings,
     empty: Grey | None = None,
-    fixed: bool = False,
+    sphere: Sphere | None = None,
 ) -> MovieSample:
     """Sample one camera's frames, background and ball; measure its diameter if None; `empty`: a picture without it.
     Raises MovieError: no sampled frame can be decoded.
@@ -111,12 +112,15 @@ def sample_movie(
         raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
 
+    in_place = sphere is not None and sphere.in_place
+
     def at_size(size_px: float) -> MovieSample:
-        if empty is None and (fixed or stream.photograph):
+        if empty is None and (in_place or stream.photograph):
             background = replace(_surroundings(some), shown=stream.shown)
-            if stream.photograph:
+            find = still_ball if stream.photograph else None if sphere and sphere.fixed else swaying_ball
+            if find is not None:
                 with suppress(ExperimentError):  # no ball is reported by the checks
-                    background = still_ball(some, settings, shown=stream.shown)[1]
+                    background = find(some, settings, shown=stream.shown)[1]
         else:
             background = learn_background(some, size_px, settings, empty, stream.shown)
         look: dict[str, Any] = {"stream": stream, "frame": frame, "picture": picture, "background": background}

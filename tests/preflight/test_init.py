@@ -257,7 +257,7 @@ def test_fictrac_is_taken_over(clean, tmp_path):
     init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
     experiment = load_experiment(tmp_path / "experiment.yaml")
     camera = experiment.cameras["cam1"]
-    assert experiment.fixed
+    assert experiment.sphere.sways  # half a radius to and fro in this movie
     assert experiment.diameter_mm is None
     assert experiment.frame_rate_hz == 600.0  # of the file: FicTrac's own is -1
     assert float(camera.f_px) == pytest.approx(120.0 / math.tan(math.radians(22.5)))
