@@ -1,6 +1,7 @@
 """Synthetic movies with exact truth: `sphereorient synth`, `score`, and `bench`, the robustness benchmark."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -373,7 +374,7 @@ def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
             " ".join(drift),
             " ".join(f"{one['over_sigma']:.2f}" for one in (first, refined) if one),
             f"{row['cpu_ms']:.1f}",
-            *(f"{median:.3f} ({most:.3f})" for median, most, _ in (scene.fictrac, scene.spintrack)),
+            *("" if math.isnan(at) else f"{at:.3f} ({most:.3f})" for at, most, _ in (scene.fictrac, scene.spintrack)),
         )
     print_table(table)
 
