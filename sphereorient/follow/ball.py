@@ -129,10 +129,6 @@ class BallTracker:
         place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
         return replace(pose, position_lab_mm=place, place_spread=spread)
 
-    def _stated(self, poses: Poses) -> Poses:
-        """Return poses with the errors of a fixed centre."""
-        return poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
-
     def follow(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
@@ -158,8 +154,7 @@ class BallTracker:
             )
         ]
         poses = [
-            self._stated(poses_of(fit, slice(n, n + 1), found.use[n], reasons[n])) if found.good[n] else None
-            for n in range(asked)
+            poses_of(fit, slice(n, n + 1), found.use[n], reasons[n]) if found.good[n] else None for n in range(asked)
         ]
         for n in torch.nonzero(there.beyond[:asked])[:, 0].tolist():
             (poses[n],) = self._wider(float(there.disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
@@ -354,9 +349,6 @@ class BallTracker:
 
     def searched(self, shots: Sequence[Frame]) -> Poses:
         """Find the poses of a frame without history, with those cameras whose pictures support them."""
-        return self._stated(self._searched(shots))
-
-    def _searched(self, shots: Sequence[Frame]) -> Poses:
         poses = self.search.poses(shots)
         if not len(poses):
             return poses

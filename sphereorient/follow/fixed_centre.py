@@ -43,12 +43,9 @@ class FixedCentre:
         inverse: Tensor = torch.linalg.inv(self.spread_mm2)
         return inverse
 
-    def with_error(self, covariance: Tensor) -> Tensor:
-        """Add the centre's own error to covariances (..., 6, 6) of delta (rad) and position (mm) of poses held here."""
-        return covariance + self._error
-
     @cached_property
-    def _error(self) -> Tensor:
+    def lasting(self) -> Tensor:
+        """Covariance (6, 6) of what its error does to delta (rad) and position (mm) of all poses held here."""
         follows = torch.cat([self.follows_rad_mm, torch.eye(3, dtype=self.follows_rad_mm.dtype)])
         whole: Tensor = follows @ self.covariance_mm2 @ follows.mT
         return whole

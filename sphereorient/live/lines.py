@@ -117,11 +117,12 @@ class JsonLines:
             before = now
         step_s, turn = now.time_s - before.time_s, now.R_lab_body @ before.R_lab_body.T
         rotvec = np.asarray(cv2.Rodrigues(turn)[0][:, 0], np.float64)
-        omega = self._turning.measured(step_s, rotvec, now.covariance[:3, :3], turn)
+        varies = now.poses.covariance[0].numpy()
+        omega = self._turning.measured(step_s, rotvec, varies[:3, :3], turn)
         if self._moving is None:
             return omega, UNKNOWN
         moved = now.position_lab_mm - before.position_lab_mm
-        return omega, self._moving.measured(step_s, moved, now.covariance[3:, 3:])
+        return omega, self._moving.measured(step_s, moved, varies[3:, 3:])
 
 
 def _states_errors(now: Measured) -> bool:

@@ -82,7 +82,7 @@ class Measured:
     time_s: float
     position_lab_mm: Floats  # (3,)
     R_lab_body: Floats  # (3, 3)
-    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm)
+    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm), with what all frames share
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
     poses: Poses  # all that the fit says
     map_number: int  # of the map that it was measured with
@@ -138,13 +138,13 @@ def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: Camer
 
 
 def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: LiveTracker) -> Measured:
-    there = supported(poses)
+    there, lasting = supported(poses), tracker.appearance.lasting.of_use(poses.use)
     return Measured(
         number=arrival.number,
         time_s=arrival.time_s,
         position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
         R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
-        covariance=poses.covariance[0].numpy() if there else np.full((6, 6), np.nan),
+        covariance=(poses.covariance[0] + lasting).numpy() if there else np.full((6, 6), np.nan),
         reason=poses.reason,
         poses=poses,
         map_number=tracker.number,

@@ -35,9 +35,8 @@ BORDER = 0.03  # of the shorter side: the border of a photograph shows what is a
 LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
 
 OUTLINES_MIN = 8  # that can show a scatter
-# Scatter of a ball's outlines that is none of a fixed one: px, of the radius, and of that of their size. Where outlines
-# are found badly, both scatter alike.
-WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
+# Scatter of a ball's outlines that is none of a fixed one: px, of the radius, and of what their edges make likely.
+WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 2.0
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
 
@@ -222,16 +221,17 @@ def fixed_ball(
 
 def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettings) -> float:
     """Return by how much the outlines in frames (n, H, W) of a ball taken as fixed scatter, robust sigma; 0 where that
-    is little, or not far more than their sizes do.
+    is little, or not far more than their edges do.
     """
     one = partial(_found, scene.background, scene.diameter_px, locating)
-    seen = np.array([ball.circle for ball, _ in side_by_side(one, pictures) if ball is not None])
+    seen = [ball for ball, _ in side_by_side(one, pictures) if ball is not None]
     if len(seen) < OUTLINES_MIN:
         return 0.0
-    middle = np.median(seen, axis=0)
-    u, v, size = 1.4826 * np.median(np.abs(seen - middle), axis=0)
-    wander = float(np.hypot(u, v))
-    return wander if wander > max(WANDER_PX, WANDER_SHARE * middle[2], WANDER_SURE * size) else 0.0
+    circles = np.array([ball.circle for ball in seen])
+    away = np.abs(circles - np.median(circles, axis=0))[:, :2]
+    wander = 1.4826 * float(np.hypot(*np.median(away, axis=0)))
+    likely = np.median([ball.rms_px * (ball.spread[0][0] + ball.spread[1][1]) ** 0.5 for ball in seen])
+    return wander if wander > max(WANDER_PX, WANDER_SHARE * scene.diameter_px / 2, WANDER_SURE * likely) else 0.0
 
 
 def swaying_ball(

@@ -1,6 +1,7 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion; for K balls."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -40,7 +41,15 @@ def learn(job: Job, progress: Progress) -> Follower:
         appearances |= dict.fromkeys(paint.names, one)
     progress("appearance", 1, 1)
     searches = {name: paint.search for paint in paints for name in paint.names}
-    return follower(job, {name: appearances[name] for name in recording.experiment.names}, searches)
+    found = follower(job, {name: appearances[name] for name in recording.experiment.names}, searches)
+    return replace(found, appearances={name: _of_place(found, name) for name in found.appearances})
+
+
+def _of_place(found: Follower, name: str) -> Appearance:
+    """Return the appearance of a ball with the error of its fixed centre, if it has one, in all frames."""
+    one, ball = found.appearances[name], found.tracker.balls.get(name)
+    centre = None if ball is None else ball.centre
+    return one if centre is None else replace(one, lasting=one.lasting.with_place(centre.lasting))
 
 
 def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:

@@ -2,7 +2,7 @@
 The fit's covariance holds what differs from frame to frame. A path through all frames averages that away; these stay.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,6 +47,14 @@ class Lasting:
         """Return those of some cameras."""
         own, alone = self.own_rad2[list(cameras)], self.alone[list(cameras)]
         return Lasting(covariance=alone[0] if len(cameras) == 1 else self.covariance, own_rad2=own, alone=alone)
+
+    def with_place(self, covariance: Tensor) -> "Lasting":
+        """Add what the error (6, 6) of a place at which all poses are held does to them."""
+        return replace(self, covariance=self.covariance + covariance, alone=self.alone + covariance)
+
+    def of_use(self, use: Tensor) -> Tensor:
+        """Return the covariance (6, 6) of a pose by the cameras in use, (C,) bool."""
+        return self.alone[use][0] if int(use.sum()) == 1 else self.covariance
 
     def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
         """Return errors that hold the mean difference of B poses by two models, `use` (B, C), that explain as much."""
