@@ -83,7 +83,7 @@ class JsonLines:
 
     def line(self, now: Measured) -> str:
         """Return the line of the next frame."""
-        sigma = np.sqrt(np.diag(now.covariance))
+        sigma = np.sqrt(np.diag(now.covariance + now.lasting))
         omega, velocity = self._rates(now)
         content = {
             "frame": now.number,
@@ -117,12 +117,11 @@ class JsonLines:
             before = now
         step_s, turn = now.time_s - before.time_s, now.R_lab_body @ before.R_lab_body.T
         rotvec = np.asarray(cv2.Rodrigues(turn)[0][:, 0], np.float64)
-        varies = now.poses.covariance[0].numpy()
-        omega = self._turning.measured(step_s, rotvec, varies[:3, :3], turn)
+        omega = self._turning.measured(step_s, rotvec, now.covariance[:3, :3], turn)
         if self._moving is None:
             return omega, UNKNOWN
         moved = now.position_lab_mm - before.position_lab_mm
-        return omega, self._moving.measured(step_s, moved, varies[3:, 3:])
+        return omega, self._moving.measured(step_s, moved, now.covariance[3:, 3:])
 
 
 def _states_errors(now: Measured) -> bool:

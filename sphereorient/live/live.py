@@ -82,7 +82,8 @@ class Measured:
     time_s: float
     position_lab_mm: Floats  # (3,)
     R_lab_body: Floats  # (3, 3)
-    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm), with what all frames share
+    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm): what differs from frame to frame
+    lasting: Floats  # (6, 6), likewise: what all frames share
     reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
     poses: Poses  # all that the fit says
     map_number: int  # of the map that it was measured with
@@ -99,7 +100,7 @@ class Measured:
     @property
     def error_rad(self) -> float:
         """Stated error of the orientation, root of the summed variances, rad."""
-        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+        return float(np.sqrt(np.trace((self.covariance + self.lasting)[:3, :3])))
 
 
 class LiveTracker(Protocol):
@@ -138,13 +139,14 @@ def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: Camer
 
 
 def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: LiveTracker) -> Measured:
-    there, lasting = supported(poses), tracker.appearance.lasting.of_use(poses.use)
+    there = supported(poses)
     return Measured(
         number=arrival.number,
         time_s=arrival.time_s,
         position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
         R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
-        covariance=(poses.covariance[0] + lasting).numpy() if there else np.full((6, 6), np.nan),
+        covariance=poses.covariance[0].numpy() if there else np.full((6, 6), np.nan),
+        lasting=tracker.appearance.lasting.of_use(poses.use).numpy(),
         reason=poses.reason,
         poses=poses,
         map_number=tracker.number,

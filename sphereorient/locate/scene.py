@@ -30,6 +30,7 @@ RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
 TOGETHER = 8  # frames in a row, of those that are spread, in which a ball that sways is taken as fixed
 INPAINT_PX = 3.0  # about a pixel, whose surroundings it goes on from
 LOOKED_AT = 32  # of these, in which it is then looked for
+ALIKE = 0.4  # of the largest area that changes: another one
 RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
 BORDER = 0.03  # of the shorter side: the border of a photograph shows what is around the sphere
 LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
@@ -214,7 +215,7 @@ def fixed_ball(
     blob = Blob(u_px=float(centres[largest][0]), v_px=float(centres[largest][1]), merit=1.0)
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
-        raise _none_fixed("no circle about what changes")
+        raise _none_fixed(_what_changes(stats[1:]))
     scene = _around(middle, scatter, outline, full_scale)
     return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
 
@@ -353,6 +354,18 @@ def _around(
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
+def _what_changes(stats: NDArray[np.int32]) -> str:
+    """Return what the largest connected regions that change are, for people."""
+    left, top, width, height, area = stats[stats[:, cv2.CC_STAT_AREA].argsort()[::-1]].T
+    alike = int((area > ALIKE * area[0]).sum())
+    each = [
+        f"{w} x {h} px about ({x + w // 2}, {y + h // 2})" for x, y, w, h in zip(left, top, width, height, strict=True)
+    ]
+    if alike == 1:
+        return f"no circle about what changes, {each[0]}"
+    return f"{alike} regions that change, the largest {each[0]} and {each[1]}"
+
+
 def _none_fixed(got: str) -> ExperimentError:
-    do = "check sphere.fixed: is the ball in one place, and does it turn? Or set locate.diameter_px"
+    do = "check sphere.fixed: is one ball in its place, mostly in view, and does it turn? Or set locate.diameter_px"
     return ExperimentError(refusal("movies", expected="a ball that turns in its place", got=got, do=do))

@@ -20,6 +20,9 @@ FAR_MOVED = 100.0  # sigmas; after a larger move of the reference the estimate i
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
 POLES = (0.02, 6.0)  # per frame, between which the prior's band is looked for; at 6 each frame has a rate of its own
 UNSURE = 0.5  # standard deviation of the logarithm of the scale beforehand: rates that change at will do not tell it
+# Pole per frame beyond which frames hardly predict each other, as of a ball that an animal turns: what such a track has of
+# rough motion counts as error otherwise, and is smoothed away. The stated errors then hold as they are.
+FORGOTTEN = 1.5
 SPREADS = (1e-3, 1e5)  # of the rate per frame, in sigmas of a measurement
 FREE = 6  # unknowns without a prior: the start of the segment and its constant rate
 FIRST_TRIES = (0.15, 0.45, 1.2)  # poles per frame from the best of which the search starts
@@ -169,11 +172,15 @@ def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
     """Find the most probable prior and factor (within `scales`) on the measurements' sigmas.
-    Paths have at least five measurements each. `band`, cycles per frame, fixes the prior; `before` is a start.
+    Paths have at least five measurements each. Of a rate that is forgotten from frame to frame the factor is 1.
+    `band`, cycles per frame, fixes the prior; `before` is a start.
     Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form.
     """
     sigma = float(np.median([path.sigma for path in paths]))
     prior = _likeliest(paths, scales, sigma, before) if band is None else prior_of_band(band, sigma)
+    if band is None and prior.pole > FORGOTTEN:
+        scales = 1.0, 1.0
+        prior = _likeliest(paths, scales, sigma, None)
     scale = _cost(paths, prior, scales)[1]
     return ProcessPrior(prior=Prior(pole=prior.pole, deviation=prior.deviation * scale), scale=scale)
 

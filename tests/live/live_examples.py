@@ -40,6 +40,7 @@ def rows(track: Trajectory) -> Iterator[Measured]:
             R_lab_body=R,
             covariance=np.zeros((6, 6)) + 1e-6 * np.eye(6) if known else np.full((6, 6), np.nan),
             reason=(Reason.OK if known else Reason.NOT_FOUND,),
+            lasting=np.zeros((6, 6)),
             poses=no_pose(1, (Reason.NOT_FOUND,)),
             flags=0,
             found=k == 0,

@@ -12,6 +12,8 @@ import torch
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from sphereorient import so3
+from sphereorient.bench.ball import walked
 from sphereorient.errors import ShapeError
 from sphereorient.motion import MeasuredPoses, SmoothSettings, smooth_motion
 from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
@@ -208,6 +210,26 @@ def test_smoothing_keeps_the_gain():
     assert some is not None
     assert np.isnan(some.value).all()
     assert behaviour_of(track_of(R), Reference(R_lab_body=true)).gain_smooth is None
+
+
+def test_smoothing_keeps_the_gain_of_a_ball_that_an_animal_turns():
+    rng = np.random.default_rng(1)
+    true, sigma = turned(walked(1200, rng)), 1e-4
+    R = moved(errors(1200, rng, 0.0, sigma), true)
+    unit = torch.eye(3, dtype=torch.float64).expand(1200, 3, 3)
+    poses = MeasuredPoses(
+        time_s=torch.arange(1200, dtype=torch.float64) / 100.0,
+        position_lab_mm=torch.zeros(1200, 3, dtype=torch.float64),
+        position_cov_mm2=1e-4 * unit,
+        R_lab_body=torch.from_numpy(R),
+        orientation_cov_rad2=sigma**2 * unit,
+        segment=torch.zeros(1200, dtype=torch.int64),
+    )
+    found = smooth_motion(poses, SmoothSettings())
+    # Its rate is forgotten at once: the stated errors stay as they are, but for the share that lasts.
+    assert found.orientation_scale == pytest.approx(1 / (1 - SmoothSettings().slow_share) ** 0.5)
+    off = so3.geodesic_distance(found.R_lab_body, torch.from_numpy(true))
+    assert float(off.median()) < 2.5 * sigma
 
 
 def test_a_smoother_that_loses_motion_shows_it_whatever_the_noise_of_the_reference():
