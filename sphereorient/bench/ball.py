@@ -314,7 +314,7 @@ class _Film:
         )
 
     def frame(self, k: int, count: int, X: Tensor, R: Tensor, turns: tuple[Tensor, Tensor]) -> NDArray[np.uint8]:
-        """Return the picture of frame k, at X, and R in the middle of the exposure; `turns` (3,): to it, to the next."""
+        """Return the picture of frame k, X and R in the middle of the exposure; `turns` (3,): to it, to the next."""
         self._put(X)
         scene, share = self.scene, np.zeros(1)
         if scene.exposure:

@@ -354,7 +354,7 @@ def _around(
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
-def _what_changes(stats: NDArray[np.int32]) -> str:
+def _what_changes(stats: NDArray[Any]) -> str:
     """Return what the largest connected regions that change are, for people."""
     left, top, width, height, area = stats[stats[:, cv2.CC_STAT_AREA].argsort()[::-1]].T
     alike = int((area > ALIKE * area[0]).sum())

@@ -295,7 +295,7 @@ def _moved(step: Tensor, at: Adjustment) -> float:
 
 def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, float]:
     """Return one Gauss-Newton step of places (P, 3), radii, lab, and of turns (N, 3), rad, in the body; and what is
-    left. P: 1, or N of a ball that sways; `expected` (P, 3), radii, and `spread` (P, P), radii^2: what is known of them.
+    left. P: 1, or N of a ball that sways. `expected` (P, 3), radii, `spread` (P, P), radii^2: what is known of them.
 
     A turn by t moves what is seen in direction n by t x n; a place that moves by d moves it by d less the part of d
     along the line of sight w that leaves the sphere: d - w (n.d) / (n.w).

@@ -20,8 +20,8 @@ FAR_MOVED = 100.0  # sigmas; after a larger move of the reference the estimate i
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
 POLES = (0.02, 6.0)  # per frame, between which the prior's band is looked for; at 6 each frame has a rate of its own
 UNSURE = 0.5  # standard deviation of the logarithm of the scale beforehand: rates that change at will do not tell it
-# Pole per frame beyond which frames hardly predict each other, as of a ball that an animal turns: what such a track has of
-# rough motion counts as error otherwise, and is smoothed away. The stated errors then hold as they are.
+# Pole per frame beyond which frames hardly predict each other, as of a ball that an animal turns: its motion counts as
+# error otherwise, and is smoothed away. The stated errors then hold as they are.
 FORGOTTEN = 1.5
 SPREADS = (1e-3, 1e5)  # of the rate per frame, in sigmas of a measurement
 FREE = 6  # unknowns without a prior: the start of the segment and its constant rate
