@@ -472,7 +472,7 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
         poses = followed_by(adjustment, recording, place, progress)
         cpu_s = (time.process_time() - decoded) - (decoded - begun)
         time_s = recording.timeline.time_s
-        radius_px = float(place.views[0].radius_px(place.position_lab_mm[0], place.radius_mm))
+        radius_px = float(place.views[0].radius_px(place.usual, place.radius_mm))
     none = torch.full((3, 3), torch.nan, dtype=torch.float64)
     R = torch.stack([one.R_lab_body[0] if supported(one) else none for one in poses]).numpy()
     covariance = torch.stack([one.covariance[0, :3, :3] if supported(one) else none for one in poses]).numpy()

@@ -82,7 +82,7 @@ def track(given: _TrackOptions) -> None:
 
 
 def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path | Experiment":
-    """Return an experiment with a map; of a ball that stays in its place and has none, one is learnt and written."""
+    """Return an experiment with a map; of an only ball that has none, one is learnt and written."""
     from sphereorient.experiment import load_experiment
 
     experiment = load_experiment(path)

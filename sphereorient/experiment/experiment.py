@@ -118,8 +118,8 @@ class Experiment:
 
     @property
     def mapless(self) -> bool:
-        """Whether its only sphere stays in its place and has no texture map: one is learnt from the movies."""
-        return self.alone and self.sphere.in_place and (self.texture_path is None or not self.texture_path.exists())
+        """Whether its only sphere has no texture map: one is learnt from the movies."""
+        return self.alone and (self.texture_path is None or not self.texture_path.exists())
 
     def new_map_path(self) -> Path:
         """Return where the map that is learnt is written: as named, or beside the experiment.

@@ -69,8 +69,8 @@ def _learning(
     from sphereorient.mapping.disks import held_place
     from sphereorient.report.texture_map import write_map
 
-    if experiment.sphere.sways:
-        got, do = "one that sways, and no map", "learn the map from a movie with `sphereorient track`"
+    if not experiment.fixed:
+        got, do = "one that moves, and no map", "learn the map from a movie with `sphereorient track`"
         raise ExperimentError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         tracker = LearningTracker(held_place(recording, settings.paint, settings.locate))

@@ -16,11 +16,9 @@ from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline, 
 from sphereorient.locate.settings import LocateSettings
 
 DEGREE = 3  # of the spline
-FEWEST, BESIDE, OUTLYING = (
-    8,
-    7,
-    5.0,
-)  # places of a ball that sways: least number; frames of a median; deviations from it
+FEWEST, BESIDE, OUTLYING = 12, 7, 5.0  # places that are smoothed: least number; frames of a median; deviations from it
+HELD_EVERY = 5  # of these places are held out
+STIFFNESSES = [10.0**k for k in range(-3, 7)]  # weights of the path's bend that are tried, frames^3
 Found = tuple[Outline | None, Reason]
 
 
@@ -159,21 +157,31 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
     return replace(places, outline_rms_px=rms, covariance_px2=covariance, flags=flags, reason=reason)
 
 
-def smoothed(sightings: Sightings) -> Sightings:
-    """Return a place in every frame, of a ball that is nearly at rest: a smoothing spline through what was found, whose
-    smoothness is learnt from it (generalised cross-validation), without outliers; all flags and reasons stay.
+def smoothed(sightings: Sightings, settings: LocateSettings) -> Sightings:
+    """Return the outlines without outliers, smoothed, and short gaps filled, without flags. How smooth the path is, is
+    learnt from it, for each column: as what predicts every fifth place best from the others.
     """
     track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
     known = np.flatnonzero(np.isfinite(track[:, 2]))
     if len(known) < FEWEST:
         return sightings
     away = np.abs(track[known] - median_filter(track[known], (BESIDE, 1), mode="nearest"))
-    usual = 1.4826 * np.median(away, axis=0)
-    known = known[(away <= OUTLYING * usual + 1e-9).all(1)]
-    frames = np.arange(len(track)).clip(known[0], known[-1]).astype(float)
-    smooth = np.column_stack([make_smoothing_spline(known.astype(float), one)(frames) for one in track[known].T])
+    good = known[(away <= OUTLYING * 1.4826 * np.median(away, axis=0) + 1e-9).all(1)]
+    near = np.concatenate(known_stretches(np.isin(np.arange(len(track)), good), settings.gap_frames_max))
+    smooth = np.full(track.shape, np.nan)
+    smooth[near] = np.column_stack([_smoothing(good, one)(near) for one in track[good].T])
     centre_px, radius_px = (torch.from_numpy(part.copy()) for part in (smooth[:, :2], smooth[:, 2]))
     return replace(sightings, centre_px=centre_px, radius_px=radius_px)
+
+
+def _smoothing(frame: NDArray[np.int64], value: NDArray[np.float64]):  # type: ignore[no-untyped-def]
+    x, held = frame.astype(float), np.arange(len(frame)) % HELD_EVERY == HELD_EVERY // 2
+
+    def off(stiffness: float) -> float:
+        others = make_smoothing_spline(x[~held], value[~held], lam=stiffness)
+        return float(np.square(others(x[held]) - value[held]).sum())
+
+    return make_smoothing_spline(x, value, lam=min(STIFFNESSES, key=off))
 
 
 def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:

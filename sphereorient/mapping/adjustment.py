@@ -149,7 +149,7 @@ def _with_focal(crops: Crops, ratio: float) -> Crops:
 
 def cells_of(place: Crops, pixels: float = 1.0) -> PaintCells:
     """Return an empty map of a ball at its first position, with `pixels` in a disk's middle along a cell."""
-    radius_px = max(float(view.radius_px(place.position_lab_mm[0], place.radius_mm)) for view in place.views)
+    radius_px = max(float(view.radius_px(place.usual, place.radius_mm)) for view in place.views)
     side = 16 * math.ceil(math.sqrt(4 * math.pi) * radius_px / pixels / 16)
     return PaintCells(min(side, MOST_CELLS), FIRST_BLUR_PX / radius_px)
 
@@ -196,7 +196,7 @@ def _blurred(grey: Picture, blur_px: float) -> Picture:
 
 
 def _radius_px(crops: Crops, camera: int) -> float:
-    return float(crops.views[camera].radius_px(crops.position_lab_mm[0], crops.radius_mm))
+    return float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
 
 
 def _within(crops: Crops, camera: int, frame: int = 0) -> NDArray[np.bool_]:
@@ -282,7 +282,7 @@ def place_metric(place: Crops) -> Tensor:
     """Return the metric (3, 3) of moves of a ball's place, by what they move in pictures, 1/radii^2 of each camera:
     along a line of sight a ball but grows.
     """
-    sight = sights(place).mean(1)
+    sight = sights(place).nanmean(1)
     square = sight.square().sum(1)[:, None, None]
     ahead = sight[:, :, None] * sight[:, None] / square
     return (torch.eye(3) - ahead + ahead / square).sum(0)

@@ -42,6 +42,7 @@ from sphereorient.sphere.view import perspective_view
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
+FOLLOWED = 3000  # frames of a movie, from its first: by then the ball has shown its sides
 PLACES = 2  # per radius: places that far apart have paint of their own
 BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen", "shown")  # of `Disks`
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
@@ -91,6 +92,12 @@ class Crops:
         """
         X = self.position_lab_mm[:1].expand(len(rows), 3) if position_lab_mm is None else position_lab_mm
         return replace(self, crops=list(zip(*rows, strict=True)), position_lab_mm=X, seen=use)
+
+    @property
+    def usual(self) -> Tensor:
+        """The median of the positions, (3,)."""
+        X: Tensor = self.position_lab_mm.nanmedian(0).values
+        return X
 
     def place(self, frame: int) -> Tensor:
         """Return the position (3,) in a frame, of all that are fixed the first."""
@@ -170,10 +177,14 @@ def _fixed_scene(
 
 
 def held_place(
-    recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress = silent
+    recording: Recording,
+    settings: MapSettings,
+    locating: LocateSettings,
+    progress: Progress = silent,
+    frames_max: int = FOLLOWED,
 ) -> Crops:
-    """Return an empty record with the views and the positions of a ball in its holder: one (1, 3) of a fixed ball,
-    those of all frames (N, 3) of one that sways; raise as `take_crops`.
+    """Return an empty record with the views and the positions of a ball: one (1, 3) of a fixed ball, else those of the
+    first frames (N, 3), at most `frames_max`, with the cameras that see it, (N, C). Raise as `take_crops`.
     """
     experiment, views, sightings = recording.experiment, [], {}
     for stream in recording.streams:
@@ -182,15 +193,17 @@ def held_place(
             seen = sightings_of([(outline, Reason.OK)])
         else:
             (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
-            shots, count = locate.screened_frames(stream, scene.background), len(recording.timeline)
+            count = min(frames_max, len(recording.timeline))
+            shots = locate.screened_frames(stream, scene.background, 0, count)
             found = side_by_side(partial(_outline, scene, locating), shots)
-            seen = smoothed(sightings_of(counted(f"{stream.name}: ball", found, count, progress)))
+            seen = smoothed(sightings_of(counted(f"{stream.name}: ball", found, count, progress)), locating)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = seen
-    cameras, none = {view.name: view.camera for view in views}, torch.zeros(0, len(views), dtype=torch.bool)
+    locate.check_seen(sightings)
+    cameras, use = {view.name: view.camera for view in views}, torch.stack([one.placed for one in sightings.values()], 1)
     X = find_positions(sightings, cameras, experiment.diameter_mm).position_lab_mm
     radius_mm, fixed = experiment.radius_mm, experiment.fixed
-    return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=none, radius_mm=radius_mm, fixed=fixed)
+    return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=use, radius_mm=radius_mm, fixed=fixed)
 
 
 def _outline(scene: CameraScene, locating: LocateSettings, shot: Frame) -> Found:
@@ -214,7 +227,7 @@ def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Cr
 
 def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor | None = None) -> list[Crop]:
     """Cut a ball in its place, or at a position (3,) near it, out of a picture of each camera: parts of one size."""
-    usual, found = place.position_lab_mm.median(0).values, []
+    usual, found = place.usual, []
     X = usual if position_lab_mm is None else position_lab_mm
     for view, picture in zip(place.views, pictures, strict=True):
         u, v = view.camera.project(X).tolist()

@@ -20,7 +20,7 @@ from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
 from sphereorient.mapping.adjustment import Adjustment, adjusted, cells_of, place_metric, within_limb
-from sphereorient.mapping.disks import Crop, Crops, cut_out, evenly_spread
+from sphereorient.mapping.disks import FOLLOWED, Crop, Crops, cut_out, evenly_spread
 from sphereorient.mapping.paint_cells import BallView
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, Optics
 from sphereorient.pose.fit import NEAR_RAD
@@ -45,7 +45,6 @@ HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
 STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
 WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried where it is none of these
 TURNED_RAD = math.radians(20.0)  # the ball turns by more
-MOST_FRAMES = 3000  # of a movie that are followed: by then the ball has shown its sides
 BEGIN = 300  # of these, by which place and map are adjusted first
 MAPPED = 80  # of them that place and map are adjusted by, twice as many at most
 APART_RAD = 0.025  # turn from one of these to the next, at least
@@ -64,7 +63,7 @@ class CoarserPictures:
     @classmethod
     def of(cls, place: Crops) -> "CoarserPictures":
         """Return those of a ball at a place."""
-        X = place.position_lab_mm.median(0).values
+        X = place.usual
         radius_px = min(float(view.radius_px(X, place.radius_mm)) for view in place.views)
         factor = max(1, int(radius_px / LEAST_RADIUS_PX))
         coarse = replace(place, views=[_coarser_view(view, factor) for view in place.views])
@@ -152,8 +151,9 @@ class FirstPass:
         """
         radius_mm = place.radius_mm
         self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
-        self._place, self._seen = place, _Seen(place, place.position_lab_mm[0])
-        sizes = [view.radius_px(place.position_lab_mm, radius_mm).max() for view in place.views]
+        self._place, self._seen = place, _Seen(place, place.usual)
+        known = place.position_lab_mm[torch.isfinite(place.position_lab_mm).all(1)]
+        sizes = [view.radius_px(known, radius_mm).max() for view in place.views]
         diameter_px = 2 * max(map(float, sizes))
         self.cells = cells_of(place, CELL_PX)
         noise = torch.tensor([[NOISE**2, 0.0, 0.0, 0.0]] * len(place.views))
@@ -173,16 +173,21 @@ class FirstPass:
         self._lost = 0  # frames that are not explained, in a row
         self._usual, self._count = 0.0, 1  # score of frames that are, and their number
 
-    def next(self, time_s: float, shots: Sequence[Frame], position_lab_mm: Tensor | None = None) -> tuple[Poses, bool]:
+    def next(
+        self, time_s: float, shots: Sequence[Frame], there: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Poses, bool]:
         """Return the pose of the frame of a time, none where the map does not explain it, and whether it was searched
-        for; the map grows by it. `position_lab_mm` (3,): of a ball that sways.
+        for; the map grows by it. `there`: the position (3,) of a ball that moves, and the cameras (C,) that see it.
         """
-        if position_lab_mm is not None:
-            self._seen = _Seen(self._place, position_lab_mm)
         use = torch.tensor([shot.usable for shot in shots])
         reason = [shot.reason for shot in shots]
+        if there is not None:
+            reason = [why if sees else Reason.NOT_FOUND for why, sees in zip(reason, there[1].tolist(), strict=True)]
+            use = use & there[1]
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
+        if there is not None:
+            self._seen = _Seen(self._place, there[0])
         even = [light(shot.picture) for light, shot in zip(self._seen.even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
@@ -384,7 +389,7 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
     at the first frame that shows it. A few of them tell place and map; by these, more are followed and tell them again.
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
     """
-    coarse, count = CoarserPictures.of(place), min(MOST_FRAMES, len(recording.timeline))
+    coarse, count = CoarserPictures.of(place), min(FOLLOWED, len(recording.timeline))
     found, kept = _swept(recording, coarse, FirstPass(coarse.place), min(count, BEGIN), progress)
     if kept.turned_rad < TURNED_RAD and count > BEGIN:  # it rests at first
         found, kept = _swept(recording, coarse, FirstPass(coarse.place), count, progress)
@@ -392,9 +397,9 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
     if count > len(found):
         found, kept = _swept(recording, *_after(adjustment, coarse, recording), count, progress)
         adjustment = kept.adjusted(progress)
-    seen = sum(map(supported, found))
-    if seen < LEAST_FOUND * len(found):
-        got, do = f"{seen} of {len(found)} frames that a growing map explains", "learn the map with `sphereorient map`"
+    seen, shown = sum(map(supported, found)), count if place.fixed else int(place.seen.any(1).sum())
+    if seen < LEAST_FOUND * shown:
+        got, do = f"{seen} of {shown} frames that a growing map explains", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
     return adjustment
 
@@ -421,8 +426,8 @@ def _swept(
     kept, found = KeptFrames(coarse.place), list[Poses]()
     for k, row in enumerate(counted("first pass", shots, count, progress)):
         frames = coarse.frames(row)
-        X = None if coarse.place.fixed else coarse.place.position_lab_mm[k]
-        poses, _ = follower.next(float(recording.timeline.time_s[k]), frames, X)
+        there = None if coarse.place.fixed else (coarse.place.position_lab_mm[k], coarse.place.seen[k])
+        poses, _ = follower.next(float(recording.timeline.time_s[k]), frames, there)
         found.append(poses)
         if supported(poses):
             kept.add(frames, poses)

@@ -98,15 +98,18 @@ def learn_map(
 def first_map_of(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, progress: Progress
 ) -> tuple[TextureMap, list[str]]:
-    """Return the map of a ball in its place, of which there is none, and what the pictures contradict; see
-    `first_adjustment`, and raise as that does.
+    """Return the map of a ball of which there is none, and what the pictures contradict; see `first_adjustment`, and
+    raise as that does.
     """
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
+        if recording.photograph:
+            got, do = "a photograph and no map", "learn the map from several with `sphereorient map --photographs`"
+            raise ExperimentError(refusal("movies", expected="a movie, or a map", got=got, do=do))
         progress("place", 0, 1)
-        place = held_place(recording, settings.paint, settings.locate)
+        place = held_place(recording, settings.paint, settings.locate, progress)
         found, remarks = first_adjustment(recording, place, progress), list[str]()
         (name, camera), *others = recording.cameras.items()
-        if isinstance(camera, PinholeCamera) and not others:
+        if isinstance(camera, PinholeCamera) and not others and place.fixed:
             ratio, height = focal_ratio(found), camera.image_size[1]
             given, seen = (field_of_focal(height, float(camera.f_px) * one) for one in (1.0, ratio))
             if ratio != 1.0:

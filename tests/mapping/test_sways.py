@@ -118,7 +118,7 @@ def test_a_path_without_outliers_is_smoothed_as_much_as_it_asks_for():
         (None if n in (60, 61, 199) else Outline(u_px=u, v_px=v, radius_px=r, rms_px=0.2, coverage=1.0), "ok")
         for n, (u, v, r) in enumerate(noisy.tolist())
     ]
-    path = smoothed(sightings_of(found))
+    path = smoothed(sightings_of(found), LocateSettings())
     off = np.column_stack([path.centre_px, path.radius_px]) - true
     assert (off.std(0) < 0.15).all()
     assert np.abs(off[[30, 31, 60, 61, 120]]).max() < 0.4
