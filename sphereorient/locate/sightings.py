@@ -1,6 +1,6 @@
 """The sphere in a frame, and along time: outliers are replaced by a spline, short gaps interpolated."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -159,7 +159,7 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
 
 def smoothed(sightings: Sightings, settings: LocateSettings) -> Sightings:
     """Return the outlines without outliers, smoothed, and short gaps filled, without flags. How smooth the path is, is
-    learnt from it, for each column: as what predicts every fifth place best from the others.
+    learnt from it, as what predicts every fifth place best from the others.
     """
     track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
     known = np.flatnonzero(np.isfinite(track[:, 2]))
@@ -167,21 +167,24 @@ def smoothed(sightings: Sightings, settings: LocateSettings) -> Sightings:
         return sightings
     away = np.abs(track[known] - median_filter(track[known], (BESIDE, 1), mode="nearest"))
     good = known[(away <= OUTLYING * 1.4826 * np.median(away, axis=0) + 1e-9).all(1)]
-    near = np.concatenate(known_stretches(np.isin(np.arange(len(track)), good), settings.gap_frames_max))
+    near = np.concatenate(known_stretches(np.isfinite(track[:, 2]), settings.gap_frames_max))
     smooth = np.full(track.shape, np.nan)
-    smooth[near] = np.column_stack([_smoothing(good, one)(near) for one in track[good].T])
+    smooth[near] = _likely_path(good, track[good])(near)
     centre_px, radius_px = (torch.from_numpy(part.copy()) for part in (smooth[:, :2], smooth[:, 2]))
     return replace(sightings, centre_px=centre_px, radius_px=radius_px)
 
 
-def _smoothing(frame: NDArray[np.int64], value: NDArray[np.float64]):  # type: ignore[no-untyped-def]
-    x, held = frame.astype(float), np.arange(len(frame)) % HELD_EVERY == HELD_EVERY // 2
+def _likely_path(frame: NDArray[np.int64], value: NDArray[np.float64]) -> Callable[..., NDArray[np.float64]]:
+    """Return the smoothing spline of values (n, D) at frames (n,) that predicts what is held out best."""
+    x = frame.astype(float)
 
-    def off(stiffness: float) -> float:
-        others = make_smoothing_spline(x[~held], value[~held], lam=stiffness)
-        return float(np.square(others(x[held]) - value[held]).sum())
+    def through(some: NDArray[np.bool_], stiffness: float) -> Callable[..., NDArray[np.float64]]:
+        each = [make_smoothing_spline(x[some], one[some], lam=stiffness) for one in value.T]
+        return lambda at: np.column_stack([one(at) for one in each])
 
-    return make_smoothing_spline(x, value, lam=min(STIFFNESSES, key=off))
+    held = np.arange(len(frame)) % HELD_EVERY == HELD_EVERY // 2
+    off = [float(np.abs(through(~held, one)(x[held]) - value[held]).sum()) for one in STIFFNESSES]
+    return through(np.ones(len(frame), bool), STIFFNESSES[int(np.argmin(off))])
 
 
 def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:

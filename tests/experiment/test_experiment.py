@@ -135,7 +135,7 @@ FAULTS = {
     ),
     "no movies": (SHORT.replace("{cam1: cam1.npy}", "{}"), "movies: .*at least 1"),
     "movies as a list": (SHORT.replace("{cam1: cam1.npy}", "[cam1.npy]"), "movies: expected a valid dictionary"),
-    "fixed as a word": (SHORT.replace("true", "maybe"), r"sphere\.fixed: expected true, false or 'sways', got 'maybe'"),
+    "fixed as a word": (SHORT.replace("true", "maybe"), r"sphere\.fixed: expected true, False or 'sways', got 'maybe'"),
     "times beside a rate": (SHORT + "times: times.csv\n", "expected either frame_rate or times, got both"),
     "neither": (SHORT.replace("frame_rate: 30", "name: none"), "expected either frame_rate or times, got neither"),
     "a flip that there is not": (SHORT + "flip: {cam1: upside}\n", "flip.cam1"),

@@ -173,8 +173,8 @@ def test_unknown_cameras_and_settings_are_refused(copy, tmp_path, monkeypatch, c
     assert "write 'rounds'" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
 
 
-def test_track_without_a_map_says_how_to_get_one(copy, tmp_path, monkeypatch, capsys):
-    assert "sphereorient map" in refused(monkeypatch, capsys, "track", copy, "--out", tmp_path / "t.h5")
+def test_track_without_a_map_does_not_write_over_a_file_of_its_name(copy, tmp_path, monkeypatch, capsys):
+    assert "no map there yet" in refused(monkeypatch, capsys, "track", copy, "--out", tmp_path / "t.h5")
 
 
 def test_a_recording_without_map_has_none_and_one_with_a_map_is_not_looked_at(copy):
