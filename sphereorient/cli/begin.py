@@ -113,7 +113,7 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
     echo_lines(_found(look) for look in looks)
     if len({len(look.movie) for look in looks}) > 1:
         typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
-    _end(target, missing, _next(target, cameras, looks), [cameras] if alone else [])
+    _end(target, missing, _next(target, cameras), [cameras] if alone else [])
 
 
 def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
@@ -144,7 +144,7 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
     _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab, model))
     if not quiet:
         typer.echo(_found(look))
-        _end(target, missing, _next(target, cameras, [look]), made)
+        _end(target, missing, _next(target, cameras), made)
 
 
 def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:
@@ -232,16 +232,14 @@ def _found(look: "FirstLook") -> str:
     return f"{told}; ball of {look.diameter_px:.0f} px, {where}"
 
 
-def _next(target: Path, cameras: Path, looks: "Sequence[FirstLook]") -> list[str]:
+def _next(target: Path, cameras: Path) -> list[str]:
     """Return the commands that come next."""
     calibrate = [
         "sphereorient init --plate FOLDER  # pictures of a calibration plate",
         f"sphereorient calibrate calibration.yaml --out {cameras}",
     ]
-    photographs = all(look.photograph for look in looks)  # no map is learnt from one picture
     return [
         *([] if cameras.exists() else calibrate),
-        *([] if photographs else [f"sphereorient map {target} --out {target.parent / 'texture.png'}"]),
         f"sphereorient check {target}",
         f"sphereorient track {target} --out {target.parent / 'track.h5'}",
         f"sphereorient report {target.parent / 'track.h5'} --experiment {target} --out {target.parent / 'report'}",

@@ -133,7 +133,8 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     if seen.measures is None or seen.similar is None:
         path = seen.experiment.texture_path
         measured = "no texture map is given" if path is None else f"no texture map yet: {path.name} is not there"
-        do = f"learn it: sphereorient map {seen.experiment.path} --out {path or seen.experiment.folder / 'texture.png'}"
+        target = path or seen.experiment.folder / "texture.png"
+        do = f"track learns one; a finer one: sphereorient map {seen.experiment.path} --out {target}"
         yield warning("paint", measured, do if path else f"{do}; then write it under sphere: as texture:")
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]

@@ -178,7 +178,7 @@ def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
         stays, fixed = False, "whether the ball only turns, in its place: no matter, in one picture"
     return [
         DraftKey(name="sphere.diameter", value=None if photograph else ..., comment=size, example=18.0, asked=True),
-        DraftKey(name="sphere.texture", value="texture.png", comment="`sphereorient map` learns it from the movies"),
+        DraftKey(name="sphere.texture", value="texture.png", comment="`sphereorient track` learns it from the movies"),
         DraftKey(name="sphere.fixed", value=stays, comment=fixed),
     ]
 

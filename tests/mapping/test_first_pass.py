@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -18,6 +21,7 @@ from sphereorient import so3
 from sphereorient.bench.ball import SCENES, write_ball_scene
 from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
 from sphereorient.experiment import load_experiment
+from sphereorient.files.whole_file import writing
 from sphereorient.locate import Frame
 from sphereorient.mapping import paint_cells
 from sphereorient.mapping.adjustment import focal_ratio
@@ -25,11 +29,18 @@ from sphereorient.mapping.first_pass import CoarserPictures, FirstPass, KeptFram
 from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.methods.map import first_map_of
 from sphereorient.methods.settings import Settings
+from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.pose import CameraView
 from sphereorient.pose.poses import Poses, supported
+from sphereorient.report.texture_map import write_map
+from sphereorient.run import MemoryStore, Request
+from sphereorient.run.stages import run_tracks
+from sphereorient.sphere import load_texture
+from sphereorient.sphere.compare import compare_maps
 from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.trajectory import Reason
 
+EXCERPT = Path(__file__).parents[2] / "synthetic_data" / "excerpt"
 X, RADIUS_MM = torch.tensor([12.0, -9.0, 20.0], dtype=torch.float64), 30.0
 
 
@@ -225,3 +236,47 @@ def test_a_ball_far_away_does_not_tell_the_field_of_view(ball):
     )
     place = replace(place, views=[CameraView.of("cam1", pinhole_like, place.views[0].scene)])
     assert focal_ratio(kept(ball, place).adjusted()) == 1.0
+
+
+def test_a_ball_that_flies_has_a_map_from_nothing():
+    experiment = load_experiment(EXCERPT / "experiment.yaml")
+    found, remarks = first_map_of(experiment.with_sphere(texture_path=None), Settings(), None, lambda *_: None)
+    assert remarks == []
+    assert found.unseen is not None
+    assert 0.05 < float(found.unseen.float().mean()) < 0.3
+    seen = torch.where(found.unseen, torch.nan, found.grey)
+    compared = compare_maps(seen, load_texture(EXCERPT / "texture.png"))
+    assert compared.correlation > 0.8
+    assert math.degrees(float(compared.moved_rad.norm(dim=1).nanmedian())) < 0.5
+
+
+@pytest.mark.slow
+def test_a_ball_that_comes_late_and_leaves_is_tracked_without_a_map(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("cam1", "cam2"):
+        empty = cv2.imread(str(EXCERPT / f"empty_{name}.png"), cv2.IMREAD_GRAYSCALE).astype(float)
+        with open_movie(EXCERPT / f"{name}.mkv") as movie:
+            pictures = list(movie.sample(range(len(movie))))
+        nothing = [(empty + rng.normal(0, 2, empty.shape)).round().clip(0, 255).astype(np.uint8) for _ in range(30)]
+        with writing(force=True):
+            write_ffv1(tmp_path / f"{name}.mkv", iter([*nothing[:18], *pictures, *nothing[18:]]), 600.0)
+    (tmp_path / "cameras.yaml").write_bytes((EXCERPT / "cameras.yaml").read_bytes())
+    content = yaml.safe_load((EXCERPT / "experiment.yaml").read_text())
+    for key in ("backgrounds", "frames", "start"):
+        content.pop(key, None)
+    del content["sphere"]["texture"]
+    (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(content))
+    experiment, texture = load_experiment(tmp_path / "experiment.yaml"), tmp_path / "learnt.png"
+    with writing(force=False):
+        write_map(first_map_of(experiment, Settings(), None, lambda *_: None)[0], texture)
+    (track,) = run_tracks(Request(experiment=experiment.with_sphere(texture_path=texture)), MemoryStore()).values()
+    shows = np.arange(len(track)) - 18
+    shows = (shows >= 0) & (shows < len(pictures))
+    assert not track.valid[~shows].any()
+    assert track.valid[shows].mean() > 0.95
+    with h5py.File(EXCERPT / "truth.h5") as file:
+        true = torch.from_numpy(file["orientation"][()])
+    ok = track.valid[shows]
+    R, true = torch.from_numpy(track.orientation[shows][ok]), true[: len(pictures)][ok]
+    body = so3.nearest_rotation((R.mT @ true).mean(0))
+    assert float(error_deg(R @ body, true).median()) < 0.5
