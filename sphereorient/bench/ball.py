@@ -463,7 +463,8 @@ def measured(path: Path, settings: Settings, refine: bool, progress: Progress = 
     with h5py.File(path.with_name("truth.h5")) as file:
         R_true = file["orientation"][()]
     with open_recording(path, None, textured=False) as recording, one_thread():
-        place = held_place(recording, settings.paint, settings.locate)
+        count = len(recording.timeline)  # all frames are followed
+        place = held_place(recording, settings.paint, settings.locate, progress, count)
         adjustment = first_adjustment(recording, place, progress)
         begun = time.process_time()
         for _ in recording.streams[0].pictures():

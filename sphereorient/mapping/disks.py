@@ -200,10 +200,8 @@ def held_place(
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = seen
     locate.check_seen(sightings)
-    cameras, use = (
-        {view.name: view.camera for view in views},
-        torch.stack([one.placed for one in sightings.values()], 1),
-    )
+    use = torch.stack([one.placed for one in sightings.values()], 1)
+    cameras = {view.name: view.camera for view in views}
     X = find_positions(sightings, cameras, experiment.diameter_mm).position_lab_mm
     radius_mm, fixed = experiment.radius_mm, experiment.fixed
     return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=use, radius_mm=radius_mm, fixed=fixed)
