@@ -28,6 +28,7 @@ from sphereorient.trajectory.walk import FICTRAC
 BEGIN_S = 120.0  # until the tracker's first line
 QUIET_S = 2.0  # without a line: the end
 FIRST = 50  # lines that do not count: caches fill
+RIGHT_DEG = 1.0  # of a rotation that is right
 EVERY = 1000  # lines from one look at the memory to the next
 # Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
 NEIGHBOUR = """
@@ -80,6 +81,12 @@ class Delays:
         shares = (0.5, 0.99, 0.999)
         return [f"{1e3 * np.quantile(self.delay_s, share):.1f}" if len(self.delay_s) else "nan" for share in shares]
 
+    @property
+    def right_share(self) -> float:
+        """Share of the frames that were written whose rotation is right to a degree; NaN: no truth."""
+        known = np.isfinite(self.error_deg).any()
+        return float((self.error_deg < RIGHT_DEG).sum()) / max(self.written, 1) if known else float("nan")
+
     def row(self) -> list[str]:
         """Return what `COLUMNS` names."""
         counts = [self.written, self.written - len(self.delay_s), self.lost]
@@ -99,6 +106,7 @@ class Delays:
             worst = float(np.nanmax(self.error_deg))
             said = f"{first:.3f}° in the first tenth (median), {last:.3f}° in the last, {worst:.3f}° at most"
             words.append(f"error of the rotation since the first frame: {said}")
+            words.append(f"right to {RIGHT_DEG:g}°: {100 * self.right_share:.1f} % of the frames that were written")
         if len(self.memory_mb):
             first, last = self.memory_mb[0], self.memory_mb[-1]
             words.append(f"memory of the tracker: {first:.0f} MB at first, {last:.0f} MB at the end")

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 LONG_STEP = 3.0  # times the step before: over a longer one the motion changes, or the shorter one tells no rate
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
+FARTHEST_TURN = 1.5  # rad, that is extrapolated over a long step
 LEAST_CHANGE = 0.5  # share of a change of the turn that goes on, however much the poses scatter
 
 
@@ -97,6 +98,10 @@ class Chunk:
                     move, spread = (1 + more) * move - b * (X0 - places[0]), further
             X = X1 + move
             moved = open_share * np.concatenate([turn, move])
+        elif (
+            math.isfinite(on) and on * np.linalg.norm(known) < FARTHEST_TURN
+        ):  # the rate goes on, as far as it is known
+            turn, X = on * known, X + on * (X - places[-2])
         return Expected(
             position_lab_mm=X,
             R_before=last.R_lab_body[0].numpy(),

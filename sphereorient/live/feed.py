@@ -14,6 +14,7 @@ from sphereorient.experiment.recording import CameraStream
 
 Picture = NDArray[np.generic]
 Tell = Callable[[str], object]  # gets what is wrong, in one line
+LATE, GROWS = 4, 3  # frames that may wait; times the step before, of the next one
 STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
 
 
@@ -46,9 +47,9 @@ class FrameBytes:
 
 class Feed:
     """Reads a source in a thread. `most` frames wait at most: then the oldest is dropped, or with `wait` the source
-    waits. While more than half as many wait, every other frame is dropped: even steps keep the motion known. Iterating
-    yields what is there, in order, and raises what the source raised. `tell` gets a line where no
-    frame comes for ten times the usual interval, a second at least, and one where they come again.
+    waits. While more than `LATE` wait, frames are passed over, in steps that grow from one to the next: so the motion
+    stays known. Iterating yields what is there, in order, and raises what the source raised. `tell` gets a line where
+    no frame comes for ten times the usual interval, a second at least, and one where they come again.
     """
 
     def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, tell: Tell = lambda line: None) -> None:
@@ -60,6 +61,7 @@ class Feed:
         self._changed = Condition()
         self._ended = self._closed = False
         self._fault: Exception | None = None
+        self._step = 0  # from the frame before to the last one; 0: none
         self._thread = Thread(target=self._read, name="feed", daemon=True)
         self._thread.start()
 
@@ -88,6 +90,10 @@ class Feed:
                 self._ended = True
                 self._changed.notify_all()
 
+    def restart(self) -> None:
+        """Begin with small steps: of the motion from here nothing is known."""
+        self._step = 0
+
     def close(self) -> None:
         """Read no further frame."""
         with self._changed:
@@ -101,9 +107,12 @@ class Feed:
                 if not self._waiting:
                     break
                 arrival = self._waiting.popleft()
-                if not self._wait and len(self._waiting) > self._most / 2:
-                    arrival = self._waiting.popleft()
-                    self.dropped += 1
+                most = min(len(self._waiting) + 1 - LATE, GROWS * self._step)
+                if not self._wait and most > 1:
+                    self.dropped += most - 1
+                    for _ in range(most - 1):
+                        arrival = self._waiting.popleft()
+                self._step = max(most, 1)
                 self._changed.notify_all()
             yield arrival
         if self._fault is not None:

@@ -109,6 +109,8 @@ def run_live(
                 told = Told(now, table, json_lines)
                 for output, form in outputs:
                     output.send(getattr(told, form))
+                if now.found:
+                    feed.restart()
                 monitor.saw(now, None if page is None else told.columns)
     finally:
         feed.close()

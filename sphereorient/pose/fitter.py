@@ -34,6 +34,7 @@ CPU = torch.device("cpu")
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
 AGAIN = 3  # times that a fit whose last step is long goes on
+HOPELESS = 0.2  # score of one that does not: far away from any pose
 
 Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
 
@@ -206,7 +207,8 @@ class Fitter:
         """
         fit = self._settled(frames, begin, disks_px)
         for _ in range(AGAIN):
-            rows = np.flatnonzero(np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) > NEAR_RAD).tolist()
+            hopeful = ((fit.score > HOPELESS) & begin.use).any(1).numpy()
+            rows = np.flatnonzero((np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) > NEAR_RAD) & hopeful).tolist()
             if not rows:
                 break
             on = begin.after(fit).of(torch.tensor(rows))
