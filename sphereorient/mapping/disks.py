@@ -96,7 +96,10 @@ class Crops:
     @property
     def usual(self) -> Tensor:
         """The median of the positions, (3,)."""
-        X: Tensor = self.position_lab_mm.nanmedian(0).values
+        X: Tensor = self.position_lab_mm[0]
+        if self.fixed:
+            return X
+        X = self.position_lab_mm.contiguous().nanmedian(0).values  # of expanded rows torch returns anything
         return X
 
     def place(self, frame: int) -> Tensor:

@@ -107,7 +107,9 @@ def background(sample: MovieSample, experiment: Experiment) -> Finding:
         return judged(title, f"given: {experiment.background_paths[sample.name].name}")
     advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
     if experiment.sphere.in_place:
-        return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
+        return warning(
+            title, "none given: the background of a ball in its place is guessed from its surroundings", advice
+        )
     if sample.stream.photograph:
         return judged(title, "of one picture: guessed from the surroundings of the ball")
     balls = [outline.circle for _, outline in sample.balls]

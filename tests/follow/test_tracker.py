@@ -94,13 +94,22 @@ def test_the_shutter_sees_its_share_of_the_motion():
 
 
 def test_without_a_known_motion_the_ball_is_near_where_it_was():
-    after_a_pause = [0.0, 1.0, 2.0, 9.0]
-    for one in (lane([2], 0.0), lane([0, 2], 0.0), lane([0, 1, 2], 0.0, after_a_pause)):
+    for one in (lane([2], 0.0), lane([0, 2], 0.0)):
         expected = one.expected(3, RADIUS_MM)
         assert expected.rough
         assert_close(f64(expected.R_before), one.past[-1][1].R_lab_body[0])
         assert not expected.turn.any()
         assert_close(f64(expected.place_spread).diagonal().sqrt(), f64([2.7] * 3), 1e-6)
+
+
+def test_after_a_pause_the_rate_goes_on_roughly():
+    one = lane([0, 1, 2], 0.0, [0.0, 1.0, 2.0, 9.0])
+    expected = one.expected(3, RADIUS_MM)
+    assert expected.rough
+    assert_close(f64(expected.turn), 7.0 * f64(one.turns[-1]), 1e-9)
+    assert_close(f64(expected.place_spread).diagonal().sqrt(), f64([2.7] * 3), 1e-6)
+    far = lane([0, 1, 2], 0.0, [0.0, 1.0, 2.0, 900.0]).expected(3, RADIUS_MM)
+    assert not far.turn.any()
 
 
 @pytest.mark.parametrize("late", [0, 1])
