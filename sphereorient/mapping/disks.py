@@ -96,10 +96,8 @@ class Crops:
     @property
     def usual(self) -> Tensor:
         """The median of the positions, (3,)."""
-        X: Tensor = self.position_lab_mm[0]
-        if self.fixed:
-            return X
-        X = self.position_lab_mm.contiguous().nanmedian(0).values  # of expanded rows torch returns anything
+        # Of expanded rows torch returns anything.
+        X: Tensor = self.place(0) if self.fixed else self.position_lab_mm.contiguous().nanmedian(0).values
         return X
 
     def place(self, frame: int) -> Tensor:
