@@ -27,7 +27,7 @@ from sphereorient.preflight.sample import sample_movie
 
 WIDE_DEG = 30.0  # field of view that is the example
 STAYS, NEAR = 0.15, 1.0  # of the radius: a ball whose outlines scatter, or lie apart, by less stays in its place
-SEEN, ALWAYS = 0.4, 0.9  # share of the frames in which a ball is found at least, that moves, or that sinks slowly
+SEEN, ALWAYS = 0.4, 0.99  # share of the frames in which a ball is found at least, that moves, or that sinks slowly
 PICTURES, SLOW_PICTURES = 40, 100  # all over the movie, for a ball that stays, or sways
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
 FLOW = {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3}
