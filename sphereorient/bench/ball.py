@@ -263,6 +263,7 @@ class _Film:
         self.scene, self._camera, self._paint, self._rng = scene, camera, paint, rng
         (u, v), (width, height) = camera.project(X).tolist(), scene.size
         self.radius_px, self.middle = float(camera.f_px) * math.tan(math.radians(scene.half_deg)), (u, v)
+        self._X = torch.full_like(X, torch.nan)  # nowhere yet
         self._put(X)
         rows, columns = np.mgrid[:height, :width]
         away = (columns - width / 2) ** 2 + (rows - height / 2) ** 2
@@ -277,7 +278,7 @@ class _Film:
 
     def _put(self, X: Tensor) -> None:
         """Put the ball at a place (3,), mm, lab."""
-        if (placed := getattr(self, "_X", None)) is not None and torch.equal(placed, X):
+        if torch.equal(self._X, X):
             return
         scene, camera, self._X = self.scene, self._camera, X
         (u, v), (width, height) = camera.project(X).tolist(), scene.size

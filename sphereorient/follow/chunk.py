@@ -98,9 +98,7 @@ class Chunk:
                     move, spread = (1 + more) * move - b * (X0 - places[0]), further
             X = X1 + move
             moved = open_share * np.concatenate([turn, move])
-        elif (
-            math.isfinite(on) and on * np.linalg.norm(known) < FARTHEST_TURN
-        ):  # the rate goes on, as far as it is known
+        elif math.isfinite(on) and on * np.linalg.norm(known) < FARTHEST_TURN:  # the rate goes on
             turn, X = on * known, X + on * (X - places[-2])
         return Expected(
             position_lab_mm=X,

@@ -19,7 +19,7 @@ from sphereorient.locate.background import FREE, LOUD, Background, even_scene, f
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.locate.sightings import Found, find_ball
+from sphereorient.locate.sightings import find_ball
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
@@ -36,7 +36,7 @@ BORDER = 0.03  # of the shorter side: the border of a photograph shows what is a
 LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
 
 OUTLINES_MIN = 8  # that can show a scatter
-# Scatter of a ball's outlines that is none of a fixed one: px, of the radius, and of what their edges make likely.
+# A ball is not fixed where its outlines scatter by more than all of these: px, of the radius, and of their own errors.
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 2.0
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
@@ -224,7 +224,7 @@ def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettin
     """Return by how much the outlines in frames (n, H, W) of a ball taken as fixed scatter, robust sigma; 0 where that
     is little, or not far more than their edges do.
     """
-    one = partial(_found, scene.background, scene.diameter_px, locating)
+    one = partial(find_ball, background=scene.background, diameter_px=scene.diameter_px, settings=locating)
     seen = [ball for ball, _ in side_by_side(one, pictures) if ball is not None]
     if len(seen) < OUTLINES_MIN:
         return 0.0
@@ -252,8 +252,8 @@ def swaying_ball(
         groups = np.array_split(np.arange(len(pictures)), max(1, len(pictures) // together))
         tried = {int(group[len(group) // 2]): _turning(pictures[group], locating, empty, shown) for group in groups}
         seen, together = {k: one for k, one in tried.items() if one is not None}, 2 * together
-    some = range(0, len(pictures), max(1, len(pictures) // LOOKED_AT))
-    each = [seen[min(seen, key=lambda middle, k=k: abs(middle - k))] for k in some]  # type: ignore[misc]
+    some, middles = range(0, len(pictures), max(1, len(pictures) // LOOKED_AT)), np.array(list(seen))
+    each = [seen[int(middles[np.abs(middles - k).argmin()])] for k in some]  # by the nearest few
     pictures, size_px = pictures[some], 2 * float(np.median([one.radius_px for one in seen.values()]))
     first, found = replace(measure_background(pictures, empty), shown=shown), 0
     for _ in range(ROUNDS):
@@ -261,16 +261,17 @@ def swaying_ball(
         for mask, disk in zip(covered, each, strict=True):
             cover(mask, disk, RIM_FIXED, True)
         background = first if empty is not None else _where_always(without_ball(first, pictures, covered), covered)
-        now = [one for one, _ in side_by_side(partial(_found, background, size_px, locating), pictures)]
+        now = [
+            one
+            for one, _ in side_by_side(
+                partial(find_ball, background=background, diameter_px=size_px, settings=locating), pictures
+            )
+        ]
         if (count := sum(one is not None for one in now)) <= found:
             break
         each, found = [new or old for new, old in zip(now, each, strict=True)], count
     u, v, radius_px = np.median([disk.circle for disk in each], axis=0).tolist()
     return replace(each[0], u_px=u, v_px=v, radius_px=radius_px), background
-
-
-def _found(background: Background, diameter_px: float, locating: LocateSettings, picture: NDArray[Any]) -> Found:
-    return find_ball(picture, background, diameter_px, locating)
 
 
 def _turning(

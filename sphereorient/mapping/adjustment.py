@@ -36,7 +36,7 @@ LIGHT_RADII = 0.08  # half side of the neighbourhood over which light is average
 LIGHT_ROUNDS, LIGHT_FRAMES = 2, 64  # in each of which it follows from the paint, and of which frames
 BLACKEST = 1e-3  # of the brightest light: the least
 ROBUST = 4.0  # deviations from the paint from which a picture counts less: what hides the ball, glare
-PRIOR, SCATTER = 0.05, 0.02  # of the radius: error of all places at the start, and of those of a ball that sways
+PRIOR, SCATTER = 0.05, 0.02  # of the radius: error of all places at the start, and of those of a ball that moves
 HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
 FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and how many to either side
 FOCAL_FRAMES, FOCAL_BETTER = 60, 0.9  # and share of what is left with the given one
@@ -72,14 +72,11 @@ class Adjustment:
 
 
 def adjusted(
-    crops: Crops,
-    R_lab_body: Tensor,
-    progress: Progress = silent,
-    levels: Sequence[float] = LEVELS,
+    crops: Crops, R_lab_body: Tensor, progress: Progress = silent, levels: Sequence[float] = LEVELS
 ) -> Adjustment:
-    """Return what all crops of a ball that stays in its place have in common, from near turns (N, 3, 3) and a near
-    place: coarse to fine, `levels` as `LEVELS`. Of a ball that sways each crop has its own place; by how much those
-    given scatter about the right ones is learnt.
+    """Return what all crops of a ball have in common, from near turns (N, 3, 3) and a near place: coarse to fine,
+    `levels` as `LEVELS`. Of a ball that moves each crop has its own place; by how much those given scatter about the
+    right ones is learnt.
     """
     places = 1 if crops.fixed else len(R_lab_body)
     expected = crops.position_lab_mm[:places] / crops.radius_mm
@@ -148,7 +145,7 @@ def _with_focal(crops: Crops, ratio: float) -> Crops:
 
 
 def cells_of(place: Crops, pixels: float = 1.0) -> PaintCells:
-    """Return an empty map of a ball at its first position, with `pixels` in a disk's middle along a cell."""
+    """Return an empty map of a ball at its usual position, with `pixels` in a disk's middle along a cell."""
     radius_px = max(float(view.radius_px(place.usual, place.radius_mm)) for view in place.views)
     side = 16 * math.ceil(math.sqrt(4 * math.pi) * radius_px / pixels / 16)
     return PaintCells(min(side, MOST_CELLS), FIRST_BLUR_PX / radius_px)
@@ -295,7 +292,7 @@ def _moved(step: Tensor, at: Adjustment) -> float:
 
 def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, float]:
     """Return one Gauss-Newton step of places (P, 3), radii, lab, and of turns (N, 3), rad, in the body; and what is
-    left. P: 1, or N of a ball that sways. `expected` (P, 3), radii, `spread` (P, P), radii^2: what is known of them.
+    left. P: 1, or N of a ball that moves. `expected` (P, 3), radii, `spread` (P, P), radii^2: what is known of them.
 
     A turn by t moves what is seen in direction n by t x n; a place that moves by d moves it by d less the part of d
     along the line of sight w that leaves the sphere: d - w (n.d) / (n.w).

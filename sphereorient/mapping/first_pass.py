@@ -133,13 +133,12 @@ class EvenLight:
         return whole
 
 
-class _Seen:
-    """A ball in its place, as all cameras see it."""
+class _Place:
+    """Where a frame shows the ball: its position, and the parts of all cameras' pictures, made even."""
 
-    def __init__(self, place: Crops, position_lab_mm: Tensor) -> None:
+    def __init__(self, ball: Crops, position_lab_mm: Tensor) -> None:
         self.X = position_lab_mm  # (3,)
-        self.even = [EvenLight(view, self.X, place.radius_mm) for view in place.views]
-        self.views = [BallView.of(view.camera, self.X, place.radius_mm) for view in place.views]
+        self.even = [EvenLight(view, self.X, ball.radius_mm) for view in ball.views]
 
 
 class FirstPass:
@@ -147,11 +146,12 @@ class FirstPass:
 
     def __init__(self, place: Crops, error: float = OUTLINE_ERROR) -> None:
         """`place`: a record of crops with the place as first position; `error`: of it, radii in pictures. The place of
-        a ball that sways is given with each frame, and found anew within this error.
+        a ball that moves is given with each frame, and found anew within this error unless outlines alone tell it.
         """
         radius_mm = place.radius_mm
         self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
-        self._place, self._seen = place, _Seen(place, place.usual)
+        self._ball, self._here = place, _Place(place, place.usual)
+        self._views = self._views_at(place.usual)  # of a fixed ball
         known = place.position_lab_mm[torch.isfinite(place.position_lab_mm).all(1)]
         sizes = [view.radius_px(known, radius_mm).max() for view in place.views]
         diameter_px = 2 * max(map(float, sizes))
@@ -187,11 +187,11 @@ class FirstPass:
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
         if there is not None:
-            self._seen = _Seen(self._place, there[0])
-        even = [light(shot.picture) for light, shot in zip(self._seen.even, shots, strict=True)]
+            self._here = _Place(self._ball, there[0])
+        even = [light(shot.picture) for light, shot in zip(self._here.even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
-            self._grow(even, use, R, self._seen.X)  # the map is this frame
+            self._grow(even, use, R, self._here.X)  # the map is this frame
             self._before = time_s, R
             return self._told(self._settled([even], R[None], use), use, reason), True
         step_s, before = time_s - self._before[0], self._before[1]
@@ -213,7 +213,7 @@ class FirstPass:
 
     def _told(self, fit: FittedPoses, use: Tensor, reason: Sequence[Reason]) -> Poses:
         poses = poses_of(fit, slice(0, 1), use, reason)
-        if self._place.fixed:
+        if self._ball.fixed:
             poses.covariance[:, 3:, 3:] = self._place_covariance
         return poses
 
@@ -222,8 +222,8 @@ class FirstPass:
         for k, use in enumerate(crops.seen):
             pictures, X = crops.pictures(torch.tensor([k]))[0], crops.place(k)
             if not crops.fixed:
-                self._seen = _Seen(self._place, X)
-            even = [light(one) for light, one in zip(self._seen.even, pictures, strict=True)]
+                self._here = _Place(self._ball, X)
+            even = [light(one) for light, one in zip(self._here.even, pictures, strict=True)]
             self._grow(even, use, R_lab_body[k], X)
         return self
 
@@ -239,12 +239,13 @@ class FirstPass:
         self._usual, self._count = before._usual, before._count
 
     def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor, X: Tensor) -> None:
-        views = self._seen.views
-        if not self._place.fixed:
-            views = [BallView.of(view.camera, X, self._place.radius_mm) for view in self._place.views]
-        for view, light, one, seen in zip(views, self._seen.even, even, use.tolist(), strict=True):
+        views = self._views if self._ball.fixed else self._views_at(X)
+        for view, light, one, seen in zip(views, self._here.even, even, use.tolist(), strict=True):
             if seen:
                 self.cells.add(view, torch.from_numpy(one), light.counts, (light.left, light.top), R_lab_body)
+
+    def _views_at(self, X: Tensor) -> list[BallView]:
+        return [BallView.of(view.camera, X, self._ball.radius_mm) for view in self._ball.views]
 
     def _fitted(
         self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], use: Tensor
@@ -267,7 +268,7 @@ class FirstPass:
         """Return the best fit near any of many orientations (M, 3, 3)."""
         frames, begin = self._start([even], R, use)
         level = self._fitter.optics.fine
-        one = self._fitter.pixels(frames, self._seen.X[None], level).thinned(TRIED_EVERY)
+        one = self._fitter.pixels(frames, self._here.X[None], level).thinned(TRIED_EVERY)
         tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(len(R))), begin, level, TRIED_STEPS)
         best = _mean_score(tried, use).topk(TRIED_BEST).indices
         fit = self._settled([even] * TRIED_BEST, tried.R_lab_body[best], use)
@@ -278,9 +279,9 @@ class FirstPass:
     ) -> tuple[list[list[NDArray[np.float32]]], PoseStart]:
         """Return whole pictures, and the start of fits at orientations (B, 3, 3)."""
         shapes = [view.camera.image_size[::-1] for view in self._fitter.views]
-        lights = list(zip(self._seen.even, shapes, strict=True))
+        lights = list(zip(self._here.even, shapes, strict=True))
         frames = [[light.framed(one, shape) for (light, shape), one in zip(lights, row, strict=True)] for row in even]
-        many = self._seen.X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
+        many = self._here.X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
         return frames, PoseStart(*many, held=True)
 
     def _settled(self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor) -> FittedPoses:

@@ -112,17 +112,15 @@ def sample_movie(
         raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
 
-    in_place = sphere is not None and sphere.in_place
+    in_place = stream.photograph or (sphere is not None and sphere.in_place)
+    guessed = None if empty is not None or not in_place else replace(_surroundings(some), shown=stream.shown)
+    if guessed is not None and not (sphere is not None and sphere.fixed and not stream.photograph):
+        find = still_ball if stream.photograph else swaying_ball
+        with suppress(ExperimentError):  # no ball is reported by the checks
+            guessed = find(some, settings, shown=stream.shown)[1]
 
     def at_size(size_px: float) -> MovieSample:
-        if empty is None and (in_place or stream.photograph):
-            background = replace(_surroundings(some), shown=stream.shown)
-            find = still_ball if stream.photograph else None if sphere and sphere.fixed else swaying_ball
-            if find is not None:
-                with suppress(ExperimentError):  # no ball is reported by the checks
-                    background = find(some, settings, shown=stream.shown)[1]
-        else:
-            background = learn_background(some, size_px, settings, empty, stream.shown)
+        background = guessed or learn_background(some, size_px, settings, empty, stream.shown)
         look: dict[str, Any] = {"stream": stream, "frame": frame, "picture": picture, "background": background}
         return _searched(MovieSample(**look, diameter_px=size_px, expected_px=diameter_px), settings)
 

@@ -23,6 +23,13 @@ from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
 from sphereorient.live.sources import camera_pictures, device_frames, movie_frames, raw_frames
 
 
+def let(count: int, goes_on: Semaphore) -> Iterator[Arrival]:
+    """Yield frames, each once it is let."""
+    for arrival in arrivals(count):
+        goes_on.acquire()
+        yield arrival
+
+
 def test_a_feed_that_waits_gives_all_frames_in_order():
     feed = Feed(arrivals(50), 3, wait=True)
     assert [one.number for one in feed] == list(range(50))
@@ -31,13 +38,7 @@ def test_a_feed_that_waits_gives_all_frames_in_order():
 
 def test_of_a_camera_that_is_too_fast_frames_are_passed_over_in_steps_that_grow():
     goes_on, numbers = Semaphore(9), []
-
-    def source() -> Iterator[Arrival]:
-        for arrival in arrivals(60):
-            goes_on.acquire()
-            yield arrival
-
-    feed = Feed(source(), 64, wait=False)
+    feed = Feed(let(60, goes_on), 64, wait=False)
     frames = iter(feed)
     for newest in range(8, 58, 2):  # two frames come while one is measured
         until(lambda at=newest: feed.newest_s == pytest.approx(0.1 * at))
@@ -67,13 +68,7 @@ def test_a_feed_of_a_camera_drops_the_oldest_frames_and_counts_them():
 
 def test_after_a_search_steps_begin_anew():
     goes_on = Semaphore(20)
-
-    def source() -> Iterator[Arrival]:
-        for arrival in arrivals(60):
-            goes_on.acquire()
-            yield arrival
-
-    feed = Feed(source(), 64, wait=False)
+    feed = Feed(let(60, goes_on), 64, wait=False)
     frames = iter(feed)
     until(lambda: feed.newest_s == pytest.approx(1.9))
     assert [next(frames).number for _ in range(3)] == [0, 3, 12]
