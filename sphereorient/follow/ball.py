@@ -17,11 +17,11 @@ from sphereorient.errors import Reason
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.chunk import Ahead, Chunk, Expected
 from sphereorient.follow.fixed_centre import FixedCentre
-from sphereorient.follow.initialise import Initialiser, by_decreasing_size, explaining_first
+from sphereorient.follow.initialise import LOOSE, Initialiser, by_decreasing_size, explaining_first
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
-from sphereorient.pose.fitter import DisksPx, Fitter, Steps
+from sphereorient.pose.fitter import HOPELESS, DisksPx, Fitter, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 
@@ -159,6 +159,43 @@ class BallTracker:
         for n in torch.nonzero(there.beyond[:asked])[:, 0].tolist():
             (poses[n],) = self._wider(float(there.disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
         return poses
+
+    def followed(self, expected: Expected, shots: Sequence[Frame]) -> Poses | None:
+        """Fit the predicted pose of one frame, as `follow`; at once None where no picture shows anything like it."""
+        there = self._predicted([expected], [shots])
+        use = there.known & there.readable
+        if bool(use.all()) and bool(there.sees.all()) and not bool((there.beyond | there.contradicted).any()):
+            fit = self._fitted(there, there.position_lab_mm, there.R_lab_body, use, there.disks_px)
+            if bool((fit.score < HOPELESS).all()):
+                return None
+            if bool(self._supported(fit, use, there.visible)) and not bool(self._poor(fit, use)):
+                return poses_of(fit, slice(1), use[0], [Reason.OK] * len(use[0]))
+        (poses,) = self.follow([expected], [shots])
+        return poses
+
+    def spotted(self, shots: Sequence[Frame]) -> Poses:
+        """Find the pose of a frame without history by the ball's blob, in a quarter of the time of `searched`, which
+        finds it also where others are beside the ball or before it.
+        """
+        there = self.search.glanced(shots, None if self.centre is None else self.centre.position_lab_mm)
+        if not bool(there.use.any()) or not len(there):
+            return there
+        spread = (LOOSE * self.fitter.radius_mm) ** 2 * torch.eye(3).double()
+        begin = Expected(
+            position_lab_mm=there.position_lab_mm[0].numpy(),
+            R_before=there.R_lab_body[0].numpy(),
+            turn=np.zeros(3),
+            use=there.use,
+            reason=there.reason,
+            place_spread=(spread if self.centre is None else self.centre.spread_mm2).numpy(),
+            rough=False,
+            moved=np.zeros(6),
+            open_share=0.0,
+        )
+        poses = self.followed(begin, shots)
+        if poses is not None:
+            return poses
+        return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in there.reason])
 
     def _predicted(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> _Predicted:
         """Return where the ball is expected; a rough prediction is brought near first."""

@@ -36,7 +36,7 @@ GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance
 STEP, REACH = 0.2, 2  # of `relocalise`: step, radii, and steps to each side of the blob
 RIVAL_BLOB, RIVAL_SCORE = 0.3, 0.8  # of the best blob's merit, of the best score: could be the sphere as well
 FAINT = 0.3  # of the merit of the faintest blob that is proven to be the sphere: fainter ones are not looked at
-LOOSE = 0.15  # of the radius: error of a position from `relocalise`
+LOOSE = 0.15  # of the radius: error of a position without an outline
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,6 +119,60 @@ class Initialiser:
         """Return whether the lines of sight meet; that of one camera does."""
         return not float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm
 
+    def glanced(self, shots: Sequence[Frame], place: Tensor | None = None) -> Poses:
+        """Return the likeliest pose by blobs of the usual size alone, or with the ball at a `place` (3,), lab, mm: right
+        to some degrees and pixels, in a sixth of the time of `poses`; or that there is none.
+        """
+        fitter, views = self.fitter, self.fitter.views
+        if place is None:
+            found = self._found(shots, self._glimpse)
+        else:
+            found = [
+                (_usual_disk(view.camera.project(place).tolist(), float(view.radius_px(place, fitter.radius_mm))), why)
+                if (why := shot.reason) is Reason.OK
+                else (None, why)
+                for view, shot in zip(views, shots, strict=True)
+            ]
+        reason = [why for _, why in found]
+        use = torch.tensor([disk is not None for disk, _ in found])
+        if not bool(use.any()):
+            return no_pose(len(views), reason)
+        glimpses = [
+            self._glimpsed(view, shot.picture, disk)
+            for view, shot, (disk, _) in zip(views, shots, found, strict=True)
+            if disk is not None
+        ]
+        R, X_k, precisions = (torch.cat(parts) for parts in zip(*glimpses, strict=True))
+        precision = precisions.sum(0)
+        X = torch.linalg.solve(precision, (precisions @ X_k[..., None]).sum(0)).mT if place is None else place[None]
+        level, count = fitter.optics.coarse, len(R)
+        pixels = fitter.pixels([[shot.picture for shot in shots]], X, level).thinned(2)
+        begin = PoseStart(X.expand(count, 3), R, use.expand(count, -1), precision.expand(count, 3, 3))
+        fit = fitter.fit(pixels.where(torch.arange(len(pixels)).repeat(count)), begin, level, 4)
+        chosen = distinct_indices(fit.R_lab_body, explaining_first(fit, use), 1)
+        return poses_of(fit, chosen, use, reason)
+
+    def _glimpse(self, picture: Picture, view: CameraView) -> Found:
+        """Return a disk of usual radius about the best blob."""
+        blobs = self._blobs(picture, view)
+        if not blobs:
+            return None, Reason.NOT_FOUND
+        return _usual_disk((blobs[0].u_px, blobs[0].v_px), view.diameter_px / 2), Reason.OK
+
+    def _glimpsed(self, view: CameraView, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rotations (M, 3, 3), lab, in which a disk may show the ball, right to some degrees; and where the ball
+        is by its size (1, 3), mm, with the precision of that (1, 3, 3), 1/mm^2.
+        """
+        proposer, camera, radius_mm = self.proposers[view.name], view.camera, self.fitter.radius_mm
+        near = proposer.rough(torch.from_numpy(crop_disk(picture, *disk.circle, proposer.size_px))[None]).R_view_body
+        parts = view.sight.about(np.array([disk.circle[:2]]))
+        ray, origin, pitch_rad, _ = (torch.from_numpy(part) for part in parts)
+        distance = radius_mm / (disk.radius_px * pitch_rad)
+        along = ray.mT @ ray
+        precision = (torch.eye(3).double() - along) / (LOOSE * radius_mm) ** 2 + along / (DEPTH_SHARE * distance) ** 2
+        R_lab_view = camera.R_cam_lab.mT @ R_cam_view(camera.R_cam_lab @ ray[0])
+        return R_lab_view @ near, origin + distance * ray, precision[None]
+
     def outline(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of the sphere in a camera's picture, or None and the reason; see `find_ball`."""
         key = ("outline", view.name, view.diameter_px, self.locating)
@@ -159,7 +213,7 @@ class Initialiser:
             disks = [torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places]
             places = [places[int(proposer.likeness(torch.stack(disks)).argmax())]]
         ((u, v),) = places
-        disk = Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0)
+        disk = _usual_disk((u, v), radius)
         R, _ = self._proposed(self.fitter.views.index(view), picture, disk)
         return (disk, Reason.OK) if len(R) else (None, Reason.LOW_SCORE)
 
@@ -224,12 +278,15 @@ class Initialiser:
         }
         rows = []
         for k, _, disk in disks:
-            view = self.fitter.views[k]
-            own = next(found[id(self.proposers[view.name])])
-            ray = view.camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
-            R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
-            rows.append((R_lab_view @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
+            own = next(found[id(self.proposers[self.fitter.views[k].name])])
+            rows.append((self._in_lab(k, disk) @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
         return rows
+
+    def _in_lab(self, k: int, disk: Outline) -> Tensor:
+        """Return R_lab_view (3, 3) of a disk of camera `k`."""
+        camera = self.fitter.views[k].camera
+        ray = camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
+        return camera.R_cam_lab.mT @ R_cam_view(camera.R_cam_lab @ ray)
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
@@ -244,23 +301,27 @@ class Initialiser:
 
     def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
-        fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
+        views, reason = self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():
             return no_pose(len(views), reason)
         if not len(R):
             return no_pose(len(views), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
+        return self._narrow(pictures, *self._begin(found), R, frame)
+
+    def _begin(self, found: Sequence[Found]) -> tuple[Tensor, Tensor]:
+        """Return the position (1, 3), mm, that outlines tell, and its precision (3, 3), 1/mm^2."""
         placed = self._placed(found)
         slack = torch.nan_to_num(placed.covariance_mm2[0])
-        slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
-        if int(use.sum()) == 1:
+        slack = slack + (PLACE_SHARE * self.fitter.radius_mm) ** 2 * torch.eye(3).double()
+        seeing = [view for view, (outline, _) in zip(self.fitter.views, found, strict=True) if outline is not None]
+        if len(seeing) == 1:
             # Arcs of a partly dark rim fit a smaller circle as well, with no greater residual.
-            (seeing,) = (view for view, used in zip(views, use.tolist(), strict=True) if used)
-            sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
+            sight = seeing[0].camera.rays(seeing[0].camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
             slack = slack + DEPTH_SHARE**2 * along[:, None] * along
-        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
-        return self._narrow(pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, frame)
+        return placed.position_lab_mm, torch.linalg.inv(slack)
 
     def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
         """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""
@@ -294,6 +355,12 @@ class Initialiser:
             return poses_of(fit, chosen, use, frame.reason)
         reason = [Reason.UNSEEN if unknown else why for unknown, why in zip(hidden, frame.reason, strict=True)]
         return poses_of(fit, chosen, shown, reason)
+
+
+def _usual_disk(centre_px: Sequence[float], radius_px: float) -> Outline:
+    """Return a disk about a place that no outline proves."""
+    u, v = centre_px
+    return Outline(u_px=u, v_px=v, radius_px=radius_px, rms_px=LOOSE * radius_px, coverage=0.0)
 
 
 def _distinct_places(places: Sequence[Place], radius_px: float) -> list[Place]:

@@ -27,6 +27,7 @@ from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+SEARCH_S = 1.0  # from one long search to the next: the frames between must not wait for it
 MOST_MISSING = 100_000  # frames between two that are written as missing
 REMARK = "measured frame by frame by `sphereorient live`: no smoother ran, so no smooth poses and no velocities"
 
@@ -45,6 +46,7 @@ class OnlineTracker:
         self._chunk = Chunk(0, self._time_s)
         self._number = 0
         self._last: Poses | None = None  # of the last frame, before it is remembered
+        self._searched_s = math.nan  # time of the last long search
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
         """Return the poses of the frame of a time, and whether they were searched for: the frames before say nothing of
@@ -56,13 +58,15 @@ class OnlineTracker:
         self._time_s[self._number] = time_s
         ahead = self._tracker.ahead(self._chunk, self._number)
         if ahead is not None:
-            (self._last,) = self._tracker.follow([ahead], [shots])
+            self._last = self._tracker.followed(ahead, shots)
         if self._last is not None:
             return self._last, False
-        poses = self._tracker.searched(shots)
         self._chunk.forget()  # what was before says nothing of the motion from here
-        self._last = poses
-        return poses, True
+        self._last = self._tracker.spotted(shots)
+        if not supported(self._last) and not abs(time_s - self._searched_s) < SEARCH_S:
+            self._searched_s = time_s
+            self._last = self._tracker.searched(shots)
+        return self._last, True
 
     def between(self) -> None:
         """Remember the last frame: what can wait until it was told."""

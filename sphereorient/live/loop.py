@@ -12,7 +12,7 @@ import torch
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording
-from sphereorient.files.threads import silent
+from sphereorient.files.threads import limited_cores, silent
 from sphereorient.files.whole_file import writing
 from sphereorient.live.feed import Feed, Tell
 from sphereorient.live.lines import FicTracLines, JsonLines, Told
@@ -104,7 +104,8 @@ def run_live(
         page.views, page.radius_mm, page.save_map = views, recording.experiment.radius_mm, opened.save_map
         page.monitor = monitor  # last: now it has begun
     try:
-        with suppress(KeyboardInterrupt):
+        # In one thread: a second one may wait for a core that another program has.
+        with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):
                 told = Told(now, table, json_lines)
                 for output, form in outputs:

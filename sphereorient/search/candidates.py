@@ -123,6 +123,9 @@ class Proposer(Protocol):
         place of `score_min` of templates.
         """
 
+    def rough(self, disks: Tensor) -> Candidates:
+        """Return the starts from which `propose` climbs: right to the step of its grid, in a quarter of the time."""
+
     def likeness(self, disks: Tensor) -> Tensor:
         """Return how much disks (F, S, S) look like the ball in its best orientation, (F,); cheaper than `propose`."""
 
@@ -142,6 +145,10 @@ class DiskSearch(nn.Module, ABC):
     @abstractmethod
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
+
+    def rough(self, disks: Tensor) -> Candidates:
+        """Return the proposals: this one does not climb."""
+        return self.propose(disks)
 
     def likeness(self, disks: Tensor) -> Tensor:
         """Return how much disks (F, S, S) look like the ball in its best orientation, (F,)."""
@@ -177,6 +184,10 @@ class FallbackProposer:
             for f, other in zip(doubt, more.each(), strict=True):
                 found[f] = interleaved(other, found[f])
         return Candidates.joined(found)
+
+    def rough(self, disks: Tensor) -> Candidates:
+        """Return what the first proposer says."""
+        return self._first.rough(disks)
 
     def likeness(self, disks: Tensor) -> Tensor:
         """Return what the first proposer says."""

@@ -89,6 +89,15 @@ class GreySearch(DiskSearch):
         rows = (self._refined(disk, self.templates[at[peak][:most]], least) for disk, at, peak in each)
         return Candidates.joined(list(rows))
 
+    def rough(self, disks: Tensor) -> Candidates:
+        """Return the bank's peaks (F disks), best first; the score is 0: none is worked out."""
+        check_disks(disks, self.size_px, self.size_px)
+        scores = torch._int_mm(to_int8(self._normalise(disks)), self.bank.T)
+        R = self.templates[best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)]
+        peak = distinct(R, math.radians(self._settings.peak_deg))
+        rows = (own[there][: self._settings.peaks].double() for own, there in zip(R, peak, strict=True))
+        return Candidates.joined([Candidates.of_disk(own, own.new_zeros(len(own))) for own in rows])
+
     def likeness(self, disks: Tensor) -> Tensor:
         """Return the correlation of disks (F, S, S) with the template most like each, (F,)."""
         return self.score(disks).amax(-1)
