@@ -162,16 +162,31 @@ class BallTracker:
 
     def followed(self, expected: Expected, shots: Sequence[Frame]) -> Poses | None:
         """Fit the predicted pose of one frame, as `follow`; at once None where no picture shows anything like it."""
-        there = self._predicted([expected], [shots])
-        use = there.known & there.readable
-        if bool(use.all()) and bool(there.sees.all()) and not bool((there.beyond | there.contradicted).any()):
-            fit = self._fitted(there, there.position_lab_mm, there.R_lab_body, use, there.disks_px)
-            if bool((fit.score < HOPELESS).all()):
-                return None
-            if bool(self._supported(fit, use, there.visible)) and not bool(self._poor(fit, use)):
-                return poses_of(fit, slice(1), use[0], [Reason.OK] * len(use[0]))
+        frames = [[shot.shown for shot in shots]]
+        contradicted = Reason.CONTRADICTS in expected.reason
+        if not contradicted and bool(expected.use.all()) and all(shot.readable for shot in shots):
+            start, use = self._start_of(expected, frames), expected.use[None]
+            disks_px = self._disks_px(start.position_lab_mm)
+            if float(disks_px.largest_px) <= self.fitter.widest_px:
+                fit = self.fitter.settled(frames, start, disks_px)
+                if bool((fit.score < HOPELESS).all()):
+                    return None
+                if bool(self._supported(fit, use)) and not bool(self._poor(fit, use)):
+                    return poses_of(fit, slice(1), expected.use, [Reason.OK] * len(shots))
         (poses,) = self.follow([expected], [shots])
         return poses
+
+    def _start_of(self, one: Expected, frames: Sequence[Sequence[Shown]]) -> PoseStart:
+        """Return where the fit of one frame begins; a rough prediction is brought near first."""
+        X, turn, R, moved = (
+            torch.from_numpy(part)[None] for part in (one.position_lab_mm, one.turn, one.R_before, one.moved)
+        )
+        R, precision, use = so3.exp(turn) @ R, torch.from_numpy(np.linalg.inv(one.place_spread))[None], one.use[None]
+        if one.rough:
+            was, every = (X, R), torch.ones(1, dtype=torch.bool)
+            X, R = self._approached(frames, (X, R), use, precision, every, None)
+            moved = moved + one.open_share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
+        return PoseStart(X, R, use, precision, moved, held=self.centre is not None)
 
     def spotted(self, shots: Sequence[Frame]) -> Poses:
         """Find the pose of a frame without history by the ball's blob, in a quarter of the time of `searched`, which

@@ -120,8 +120,8 @@ class Initialiser:
         return not float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm
 
     def glanced(self, shots: Sequence[Frame], place: Tensor | None = None) -> Poses:
-        """Return the likeliest pose by blobs of the usual size alone, or with the ball at a `place` (3,), lab, mm: right
-        to some degrees and pixels, in a sixth of the time of `poses`; or that there is none.
+        """Return the likeliest pose by blobs of the usual size alone, or with the ball at a `place` (3,), lab, mm; or
+        that there is none. It is right to some degrees and pixels, in a quarter of the time of `poses`.
         """
         fitter, views = self.fitter, self.fitter.views
         if place is None:

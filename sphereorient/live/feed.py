@@ -14,7 +14,7 @@ from sphereorient.experiment.recording import CameraStream
 
 Picture = NDArray[np.generic]
 Tell = Callable[[str], object]  # gets what is wrong, in one line
-LATE, GROWS = 4, 3  # frames that may wait; times the step before, of the next one
+LATE, GROWS = 2, 3  # frames that may wait; times the step before, of the next one
 STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
 
 
