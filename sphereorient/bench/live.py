@@ -1,6 +1,7 @@
 """Delay and error of live tracking: from a picture in memory to the line on a socket, through two programs."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -30,6 +31,7 @@ QUIET_S = 2.0  # without a line: the end
 FIRST = 50  # lines that do not count: caches fill
 RIGHT_DEG = 1.0  # of a rotation that is right
 EVERY = 1000  # lines from one look at the memory to the next
+DARK_EVERY_S, DARK_S, STALL_S = 5.0, 0.5, 1.0  # of faults: pictures without light, and the tracker stopped once
 # Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
 NEIGHBOUR = """
 import os, sys, cv2, numpy
@@ -53,11 +55,16 @@ class LiveTiming:
     options: Sequence[str] = ()
     cameras: Sequence[str] | None = None
     loop: bool = False  # the movie is shown from its begin again: it has no seam; else there and back again
+    faults: bool = False  # every 5 s half a second without light, and in the middle the tracker is stopped for a second
 
     @property
     def frames(self) -> int:
         """Number of frames that count."""
         return round(self.seconds * self.rate_hz)
+
+    def dark(self, number: int) -> bool:
+        """Return whether a picture is black."""
+        return self.faults and number / self.rate_hz % DARK_EVERY_S >= DARK_EVERY_S - DARK_S
 
     def command(self, ring: Path, port: int) -> list[str]:
         """Return the command that tracks the pictures of a ring and sends lines to a port."""
@@ -75,6 +82,8 @@ class Delays:
     lost: int  # of these, lines without a pose
     error_deg: Floats  # (n,), of the rotation since the stretch began; NaN without pose or truth
     memory_mb: Floats  # of the tracker, every so often; empty where the system does not tell
+    back_s: Floats  # (m,), from the end of each fault to the first pose that is right; inf: none came
+    wrong: int  # poses that are not right
 
     def delays_ms(self) -> list[str]:
         """Return the delays that half of the lines keep, 99 and 99.9 % of them, ms, in words."""
@@ -107,6 +116,10 @@ class Delays:
             said = f"{first:.3f}° in the first tenth (median), {last:.3f}° in the last, {worst:.3f}° at most"
             words.append(f"error of the rotation since the first frame: {said}")
             words.append(f"right to {RIGHT_DEG:g}°: {100 * self.right_share:.1f} % of the frames that were written")
+            words.append(f"wrong: {self.wrong} poses")
+        if len(self.back_s):
+            back = f"{1e3 * np.median(self.back_s):.0f} ms (median), {1e3 * self.back_s.max():.0f} ms at most"
+            words.append(f"right again after {len(self.back_s)} faults: {back}")
         if len(self.memory_mb):
             first, last = self.memory_mb[0], self.memory_mb[-1]
             words.append(f"memory of the tracker: {first:.0f} MB at first, {last:.0f} MB at the end")
@@ -136,17 +149,19 @@ class _Writer(Thread):
         super().__init__(daemon=True)
         self.written_s: list[float] = []  # by the clock of time.perf_counter
         self.begun, self.ended = Event(), Event()
-        self._ring, self._pictures, self._rate_hz = ring, pictures, timing.rate_hz
-        self._count = FIRST + timing.frames
+        self._ring, self._pictures, self._timing = ring, pictures, timing
+        self._black = [np.zeros_like(picture) for picture in pictures[0]]
 
     def run(self) -> None:
-        first_s, number, left = time.perf_counter(), 0, self._count
+        rate_hz, pictures = self._timing.rate_hz, self._pictures
+        first_s, number, left = time.perf_counter(), 0, FIRST + self._timing.frames
         while left > 0 and not self.ended.is_set():
             self.written_s.append(time.perf_counter())
+            shown = self._black if self._timing.dark(number) else pictures[number % len(pictures)]
             # The time as a camera's clock tells it; this program may be late.
-            self._ring.write(first_s + number / self._rate_hz, self._pictures[number % len(self._pictures)])
+            self._ring.write(first_s + number / rate_hz, shown)
             number, left = number + 1, left - self.begun.is_set()
-            time.sleep(max(0.0, first_s + number / self._rate_hz - time.perf_counter()))
+            time.sleep(max(0.0, first_s + number / rate_hz - time.perf_counter()))
 
 
 def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
@@ -161,6 +176,7 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
         R_cam_lab = recording.streams[0].camera.R_cam_lab.numpy()
     order = [*range(len(pictures)), *(() if timing.loop else range(len(pictures) - 2, 0, -1))]
     memory_mb: list[float] = []
+    ends_s: list[float] = []  # of faults
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lines:
         lines.bind((HOST, 0))
         lines.settimeout(QUIET_S)
@@ -175,6 +191,8 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
                 writer.begun.set()
                 if count % EVERY == 0:
                     memory_mb.extend(_memory_mb(tracker.pid))
+                if timing.faults and count == timing.frames // 2:
+                    Thread(target=_stall, args=(tracker, ends_s), daemon=True).start()
                 progress("live", count, timing.frames)
 
             try:
@@ -188,13 +206,27 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
             raise SphereOrientError(refusal("live", expected="a line a frame", got=got, do="correct that"))
     error_deg = _errors_deg(table, order, R_cam_lab, timing.experiment.parent / "truth.h5")[FIRST:]
     number, came_s, *_ = table = table[FIRST:].T
+    at, written_s = number.astype(int) - 1, np.array(writer.written_s)
+    shown = [k for k in range(at[0], at[-1] + 1) if not timing.dark(k)] if len(at) else []
+    ends_s += [written_s[k] for k in shown if timing.dark(k - 1)]
+    right_s = came_s[error_deg < RIGHT_DEG]
     return Delays(
-        written=int(number[-1] - number[0]) + 1 if len(number) else 0,
-        delay_s=came_s - np.array(writer.written_s)[number.astype(int) - 1],
-        lost=int(np.isnan(table[2]).sum()),
+        written=len(shown),
+        delay_s=came_s - written_s[at],
+        lost=int(np.isnan(table[2]).sum()) - sum(timing.dark(k) for k in at.tolist()),
         error_deg=error_deg,
         memory_mb=np.array(memory_mb),
+        back_s=np.array([min((s - end_s for s in right_s if s > end_s), default=np.inf) for end_s in ends_s]),
+        wrong=int((error_deg >= RIGHT_DEG).sum()),
     )
+
+
+def _stall(tracker: "subprocess.Popen[str]", ends_s: list[float]) -> None:
+    """Stop a process for a while, as a machine that does other things, and note the end."""
+    tracker.send_signal(signal.SIGSTOP)
+    time.sleep(STALL_S)
+    ends_s.append(time.perf_counter())
+    tracker.send_signal(signal.SIGCONT)
 
 
 def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Callable[[int], None]) -> Floats:

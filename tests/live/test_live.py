@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from sphereorient import so3
 from sphereorient.cli import app
+from sphereorient.follow.ball import BallTracker
 from sphereorient.live.live import measured
 from sphereorient.live.loop import open_live
 from sphereorient.live.sources import movie_frames
@@ -58,6 +59,34 @@ def test_a_jump_is_found_and_told(tmp_path):
     assert [n for n, now in enumerate(found) if now.found] == [0, 12]
     for now, k in zip(found, order, strict=True):
         assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+
+
+def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch):
+    """The ball turns by some tens of degrees at once; later something grey without any paint is before it."""
+    asked: list[int] = []
+    long_search = BallTracker.searched
+    monkeypatch.setattr(BallTracker, "searched", lambda self, shots: asked.append(1) or long_search(self, shots))
+    truth = torch.from_numpy(true_track().orientation)
+    order, hidden = [*range(8), *range(39, 30, -1)], range(12, 15)
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+        frames = list(movie_frames(opened.recording, paced=False))
+        views = opened.tracker.appearance.fitter.views
+        flat = [[np.full_like(picture, 90) for picture in one.pictures] for one in frames]
+        for n in hidden:  # noise: no picture is like the one before
+            flat[n] = [
+                picture + np.random.default_rng(n).integers(0, 9, picture.shape, np.uint8) for picture in flat[n]
+            ]
+        shown = [
+            replace(frames[k], number=n, time_s=0.4 * n, pictures=flat[n] if n in hidden else frames[k].pictures)
+            for n, k in enumerate(order)
+        ]
+        found = list(measured(opened.tracker, views, shown))
+    assert [now.valid for now in found] == [n not in hidden for n in range(len(order))]
+    assert [n for n, now in enumerate(found) if now.found] == [0, 8, 15]
+    for n, k in enumerate(order):
+        if n not in hidden:
+            assert float(so3.geodesic_distance(torch.from_numpy(found[n].R_lab_body), truth[k])) < math.radians(0.2)
+    assert len(asked) == 1  # 0.8 s are hidden
 
 
 def test_times_that_stand_or_go_back_begin_anew():

@@ -237,6 +237,17 @@ def test_of_each_attitude_a_peak_of_the_bank_lies_within_the_covering_angle(kind
     assert peak[:, 0].all()
 
 
+def test_rough_starts_are_the_peaks_of_the_bank():
+    search = grey_search_of(KINDS[0])
+    disks = camera_disks(KINDS[0], attitudes(3))
+    rough = search.rough(disks)
+    for found, disk in zip(rough.each(), disks, strict=True):
+        (place,), (peak,) = search.search(disk[None])
+        peaks = search.templates[place[peak]].double()
+        assert torch.equal(found.R_view_body, peaks[: len(found.score)])
+        assert len(found.score) == min(len(peaks), GreySearchSettings().peaks)
+
+
 def test_a_normalised_picture_has_length_1_and_no_mean():
     normalise = grey_search_of("blobs")._normalise
     even = normalise(camera_disks("blobs", attitudes(4), light_from(-0.8, -0.3, -0.52)))
