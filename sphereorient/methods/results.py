@@ -328,17 +328,18 @@ def fit_flags(
     use, score and excess (N, C) of each picture; frames without a picture in use have none.
     Where as many other cameras should see the sphere and do not (`missed`, a number), half of the poses are wrong.
     """
-    count = use.sum(-1).numpy()
-    best = torch.where(use, score, -torch.inf).amax(-1).numpy()
+    seen = use.numpy()
+    count = seen.sum(-1)
+    best = np.where(seen, score.numpy(), -np.inf).max(-1)
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
-    least = torch.where(use, excess, torch.inf).amin(-1).numpy()
+    least = np.where(seen, excess.numpy(), np.inf).min(-1)
     outvoted = (missed > 0) & (missed >= count)
     one = (count == 1) & (use.shape[-1] > 1)
     # No other camera stands by what one alone says, perhaps by a part of a disk: that must fit as right poses do.
     poor = best < np.where(one, learnt.usual_score, learnt.poor_score)
     doubtful = poor | (least > EXCESS) | learnt.in_doubt | outvoted
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: np.full(len(use), learnt.second_ball)}
-    flags: NDArray[np.uint32] = np.sum(
-        [where * np.uint32(flag) for flag, where in bits.items()], axis=0, dtype=np.uint32
-    )
-    return flags * (count > 0).astype(np.uint32)
+    flags = np.zeros(len(use), np.uint32)
+    for flag, where in bits.items():
+        flags |= (where & (count > 0)) * np.uint32(flag)
+    return flags

@@ -85,10 +85,11 @@ def fictrac_rows(
     """
     # FicTrac's absolute rotations are those since its first frame, in the lab with the camera's pose put before.
     R_cam = R_cam_lab @ R_from_first @ R_cam_lab.T
+    in_cam, in_lab = np.split(rotation_vectors(np.concatenate([R_cam, R_cam_lab.T @ R_cam])), 2)
     own |= {
         "turn_cam": np.asarray(own["turn_lab"]) @ R_cam_lab.T,
-        "rotation_cam": rotation_vectors(R_cam),
-        "rotation_lab": rotation_vectors(R_cam_lab.T @ R_cam),
+        "rotation_cam": in_cam,
+        "rotation_lab": in_lab,
         "direction": np.mod(np.arctan2(right, ahead), 2 * np.pi),
         "speed": np.hypot(ahead, right),
         "clock_ms": own["time_ms"],
