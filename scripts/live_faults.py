@@ -44,7 +44,7 @@ def main() -> None:
     for name in ("black-out", "hand", "turn", "lamp"):
         with open_live(arguments.experiment, Settings(), arguments.cameras, arguments.learnt) as opened:
             frames = list(movie_frames(opened.recording, paced=False))
-            views = opened.tracker.appearance.fitter.views
+            views = opened.tracker.appearances[""].fitter.views
             middle = measured(opened.tracker, views, [replace(frames[0], time_s=-1.0)])
             X = torch.from_numpy(next(iter(middle)).position_lab_mm)
             disks = [(*view.camera.project(X).tolist(), view.diameter_px / 2) for view in views]

@@ -64,7 +64,7 @@ class Tracker:
         for k in range(max(batch)):
             now = [n for n, length in enumerate(batch) if k < length]
             frames = [[movie[firsts[n] + k] for movie in shots] for n in now]
-            here = self._step({name: [of_ball[n] for n in now] for name, of_ball in chunks.items()}, k, frames)
+            here = self.step({name: [of_ball[n] for n in now] for name, of_ball in chunks.items()}, k, frames)
             for name, tracker in self.balls.items():
                 own = [chunks[name][n] for n in now]
                 poses = [row[name] for row in here]
@@ -129,7 +129,7 @@ class Tracker:
                 for chunk, number, one, turn in zip(own, numbers, here, tracker.turns(own, here), strict=True):
                     chunk.saw(-number, one, turn)
 
-    def _step(
+    def step(
         self, chunks: Mapping[str, Sequence[Chunk]], k: int, frames: Sequence[Sequence[Frame]]
     ) -> list[dict[str, Poses]]:
         """Measure one frame of each chunk."""

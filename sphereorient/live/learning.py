@@ -2,7 +2,7 @@
 
 import multiprocessing
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -40,17 +40,17 @@ class LearningTracker:
         self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
         self._aside.submit(_ready)
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
-        self.appearance = _unknown(place, self._pass)
+        self.appearances: Mapping[str, Appearance] = {"": _unknown(place, self._pass)}
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
         self._adjusting: tuple[KeptFrames, Future[tuple[Array, ...]]] | None = None
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
+    def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
         """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
         frames = self._coarse.frames(shots)
         poses, searched = self._pass.next(time_s, frames)
         self._now = (frames, poses) if supported(poses) else None
-        return poses, searched
+        return {"": (poses, searched)}
 
     def between(self) -> None:
         """Keep the frame, and go over to what was adjusted meanwhile."""

@@ -74,10 +74,12 @@ def fictrac_line(columns: Floats) -> str:
 class JsonLines:
     """Frames as JSON, each on a line, null for what is not known; with the angular velocity, and where the ball is not
     held in its place (`fixed`) its velocity, from this frame and those before it. These begin anew where the ball was
-    searched for, and are not known where the orientation is relative: its errors grow, and are not stated.
+    searched for, and are not known where the orientation is relative: its errors grow, and are not stated. A `ball` of
+    several is named.
     """
 
-    def __init__(self, fixed: bool) -> None:
+    def __init__(self, fixed: bool, ball: str = "") -> None:
+        self._ball = {"ball": ball} if ball else {}
         self._turning, self._moving = ForwardRate(), None if fixed else ForwardRate()
         self._before: Measured | None = None
 
@@ -85,7 +87,7 @@ class JsonLines:
         """Return the line of the next frame."""
         sigma = np.sqrt(np.diag(now.covariance + now.lasting))
         omega, velocity = self._rates(now)
-        content = {
+        content = self._ball | {
             "frame": now.number,
             "time_s": now.time_s,
             "valid": now.valid,

@@ -2,13 +2,14 @@
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sphereorient.errors import Flag, Reason
 from sphereorient.experiment import input_files
@@ -16,7 +17,8 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.provenance import provenance
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.ball import BallTracker
-from sphereorient.follow.chunk import Chunk
+from sphereorient.follow.chunk import Ahead, Chunk
+from sphereorient.follow.tracker import Tracker
 from sphereorient.live.feed import Arrival
 from sphereorient.locate import Frame, screened
 from sphereorient.methods.results import fit_flags, measured_track, missed_by, with_errors
@@ -33,55 +35,79 @@ REMARK = "measured frame by frame by `sphereorient live`: no smoother ran, so no
 
 
 class OnlineTracker:
-    """Follows frames one after the other, none ahead: each from those before it, else from a search without history.
-    `tracker` has one chunk at a time (setting `refine.chunks`). Memory does not grow.
+    """Follows balls through frames one after the other, none ahead: each from those before it, else from a search
+    without history. Balls of `tracker` have one chunk at a time (setting `refine.chunks`). Memory does not grow.
     """
 
     number = 1  # of the map in use
 
-    def __init__(self, tracker: BallTracker, appearance: Appearance) -> None:
-        self.appearance = appearance
-        self._tracker = tracker
+    def __init__(self, balls: Mapping[str, BallTracker], appearances: Mapping[str, Appearance]) -> None:
+        self.appearances = appearances
+        self._tracker = Tracker(balls)
+        self._look, self._tracker.start = self._tracker.start, self._searched
         self._time_s: dict[int, float] = {}  # of the last frames
-        self._chunk = Chunk(0, self._time_s)
+        self._chunks = {name: Chunk(0, self._time_s) for name in balls}
         self._number = 0
-        self._last: Poses | None = None  # of the last frame, before it is remembered
+        self._last: dict[str, Poses] = {}  # of the last frame, before it is remembered
+        self._lost: list[str] = []  # balls that the last frame was searched for
         self._searched_s = math.nan  # time of the last long search
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
-        """Return the poses of the frame of a time, and whether they were searched for: the frames before say nothing of
-        it, or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known from before.
+    def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
+        """Return the poses of each ball in the frame of a time, and whether it was searched for: the frames before say
+        nothing of it, or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known
+        from before.
         """
         self.between()
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
-            self._chunk.forget()
-        self._time_s[self._number] = time_s
-        ahead = self._tracker.ahead(self._chunk, self._number)
-        if ahead is not None:
-            self._last = self._tracker.followed(ahead, shots)
-        if self._last is not None:
-            return self._last, False
-        self._chunk.forget()  # what was before says nothing of the motion from here
-        self._last = self._tracker.spotted(shots)
-        if not supported(self._last) and not abs(time_s - self._searched_s) < SEARCH_S:
-            self._searched_s = time_s
-            self._last = self._tracker.searched(shots)
-        return self._last, True
+            for chunk in self._chunks.values():
+                chunk.forget()
+        self._time_s[self._number], self._lost = time_s, []
+        self._last = self._step(shots)
+        for name in self._lost:
+            if supported(self._last[name]):
+                self._chunks[name].forget()  # what was before says nothing of the motion from here
+        return {name: (poses, name in self._lost) for name, poses in self._last.items()}
+
+    def _step(self, shots: Sequence[Frame]) -> dict[str, Poses]:
+        if len(self._chunks) > 1:
+            return self._tracker.step({one: [chunk] for one, chunk in self._chunks.items()}, self._number, [shots])[0]
+        (name,) = self._chunks
+        ball = self._tracker.balls[name]
+        ahead = ball.ahead(self._chunks[name], self._number)
+        poses = None if ahead is None else ball.followed(ahead, shots)
+        return self._searched(shots, [name], {}, {}) if poses is None else {name: poses}
+
+    def _searched(
+        self, shots: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
+    ) -> dict[str, Poses]:
+        """Find balls, as `Tracker.start`: by its blob if there is only one; the long search once in a while."""
+        time_s, self._lost = self._time_s[self._number], list(names)
+        if len(self._tracker.balls) == 1:
+            found = {name: self._tracker.balls[name].spotted(shots) for name in names}
+        else:
+            reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
+            found = {name: no_pose(len(shots), reason) for name in names}
+        if any(supported(poses) for poses in found.values()) or abs(time_s - self._searched_s) < SEARCH_S:
+            return found
+        self._searched_s = time_s
+        return self._look(shots, names, known, past)
 
     def between(self) -> None:
         """Remember the last frame: what can wait until it was told."""
-        if self._last is not None:
-            turn = self._tracker.turns([self._chunk], [self._last])[0]
-            self._chunk.saw(self._number, self._last, turn)
+        for name, poses in self._last.items():
+            chunk = self._chunks[name]
+            chunk.saw(self._number, poses, self._tracker.balls[name].turns([chunk], [poses])[0])
+        if self._last:
             self._number += 1
             self._time_s.pop(self._number - 4, None)
-            self._last = None
+            self._last = {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured:
-    """Pose of one frame as it was measured, without frames that came later; NaN where there is none."""
+    """Pose of one ball in one frame as it was measured, without frames that came later; NaN where there is none."""
 
+    ball: str  # its name; "": the only one
     number: int  # of the source, dropped frames included
     time_s: float
     position_lab_mm: Floats  # (3,)
@@ -108,20 +134,20 @@ class Measured:
 
 
 class LiveTracker(Protocol):
-    """Follows a ball frame by frame."""
+    """Follows balls frame by frame."""
 
     number: int  # of the map in use
-    appearance: Appearance
+    appearances: Mapping[str, Appearance]
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> tuple[Poses, bool]:
-        """Return the poses of the frame of a time, and whether they were searched for."""
+    def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
+        """Return the poses of each ball in the frame of a time, and whether they were searched for."""
 
     def between(self) -> None:
         """Do what can wait until the last frame was told."""
 
 
 def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
-    """Yield the pose of each frame; frames of one source, in order."""
+    """Yield the pose of each ball in each frame; frames of one source, in order."""
     before: Sequence[Frame] | None = None
     number = -1
     for arrival in frames:
@@ -129,8 +155,8 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
             _shot(picture, None if before is None else before[c], view)
             for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
         ]
-        poses, searched = tracker.next(arrival.time_s, shots)
-        yield _told(arrival, poses, searched, arrival.number - number - 1, tracker)
+        for ball, (poses, searched) in tracker.next(arrival.time_s, shots).items():
+            yield _told(arrival, ball, poses, searched, arrival.number - number - 1, tracker)
         tracker.between()
         before, number = shots, arrival.number
 
@@ -142,19 +168,20 @@ def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: Camer
     return screened(picture, None if before is None else before.shown, view.background)
 
 
-def _told(arrival: Arrival, poses: Poses, found: bool, dropped: int, tracker: LiveTracker) -> Measured:
-    there = supported(poses)
+def _told(arrival: Arrival, ball: str, poses: Poses, found: bool, dropped: int, tracker: LiveTracker) -> Measured:
+    there, appearance = supported(poses), tracker.appearances[ball]
     return Measured(
+        ball=ball,
         number=arrival.number,
         time_s=arrival.time_s,
         position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
         R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
         covariance=poses.covariance[0].numpy() if there else np.full((6, 6), np.nan),
-        lasting=tracker.appearance.lasting.of_use(poses.use).numpy(),
+        lasting=appearance.lasting.of_use(poses.use).numpy(),
         reason=poses.reason,
         poses=poses,
         map_number=tracker.number,
-        flags=_flags(poses, tracker.appearance) if there else 0,
+        flags=_flags(poses, appearance) if there else 0,
         found=found and there,
         dropped=dropped,
         latency_s=time.perf_counter() - arrival.arrived_s,
@@ -170,7 +197,7 @@ def _flags(poses: Poses, learnt: Appearance) -> int:
 
 @dataclass(eq=False)
 class TrackBlocks:
-    """Makes a track of each block of frames, in order; frames that were dropped are missing in it."""
+    """Makes a track of each block of frames of an only ball, in order; frames that were dropped are missing in it."""
 
     recording: Recording
     tracker: LiveTracker  # whose appearance is that of the frames
@@ -222,7 +249,7 @@ class TrackBlocks:
         table = pose_table(poses, len(cameras))
         choice = torch.where(table.mask.any(1), 0, -1)
         clock = torch.tensor(time_s, dtype=torch.float64)
-        learnt = self.tracker.appearance
+        (learnt,) = self.tracker.appearances.values()
         track = measured_track(experiment, clock, table, choice, learnt)
         track, _ = with_errors(track, self.recording, learnt.lasting, compared=False)
         segment, flags = np.array(marks, np.int64).T

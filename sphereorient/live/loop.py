@@ -27,7 +27,7 @@ from sphereorient.methods.settings import Settings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LiveSetUp:
-    """An opened experiment and who follows its ball."""
+    """An opened experiment and who follows its balls."""
 
     recording: Recording
     tracker: LiveTracker
@@ -56,8 +56,7 @@ def open_live(
         if not follower.tracker.balls:
             do = "look with `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
-        (ball,) = follower.tracker.balls.values()
-        yield LiveSetUp(recording=recording, tracker=OnlineTracker(ball, follower.appearance))
+        yield LiveSetUp(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
 
 
 @contextmanager
@@ -93,8 +92,10 @@ def run_live(
     takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines.
     """
     recording, tracker = opened.recording, opened.tracker
-    views = tracker.appearance.fitter.views
-    table, json_lines = FicTracLines(views[0].camera.R_cam_lab.numpy()), JsonLines(recording.experiment.fixed)
+    first, *others = tracker.appearances
+    views, several = tracker.appearances[first].fitter.views, bool(others)
+    table = FicTracLines(views[0].camera.R_cam_lab.numpy())
+    json_lines = {name: JsonLines(recording.experiment.of(name).fixed, name) for name in tracker.appearances}
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
     sys.setswitchinterval(0.0002)  # longest that a thread that computes holds up the one that reads
@@ -107,12 +108,13 @@ def run_live(
         # In one thread: a second one may wait for a core that another program has.
         with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):
-                told = Told(now, table, json_lines)
+                told = Told(now, table, json_lines[now.ball])
                 for output, form in outputs:
                     output.send(getattr(told, form))
                 if now.found:
                     feed.restart()
-                monitor.saw(now, None if page is None else told.columns)
+                if now.ball == first:
+                    monitor.saw(now, None if page is None or several else told.columns)
     finally:
         feed.close()
     return monitor

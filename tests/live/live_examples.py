@@ -34,6 +34,7 @@ def rows(track: Trajectory) -> Iterator[Measured]:
     for k, R in enumerate(track.orientation):
         known = np.isfinite(R).all()
         yield Measured(
+            ball="",
             number=k,
             time_s=float(track.time[k]),
             position_lab_mm=np.zeros(3) if known else np.full(3, np.nan),

@@ -19,7 +19,7 @@ def followed(tracker: LearningTracker, ball, numbers, wait: int = -1):
     """Orientations (N, 3, 3) and the numbers of the maps; at frame `wait` until there is another map."""
     R, maps = [], []
     for k in numbers:
-        poses, searched = tracker.next(k / RATE_HZ, [ball.shots[k]])
+        ((poses, searched),) = tracker.next(k / RATE_HZ, [ball.shots[k]]).values()
         assert searched == (k == 0), k
         assert supported(poses)
         R.append(poses.R_lab_body[0])

@@ -34,7 +34,7 @@ def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told():
             replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in hidden else one
             for k, one in enumerate(movie_frames(opened.recording, paced=False))
         ]
-        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
+        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
     truth = torch.from_numpy(true_track().orientation)
     for k, now in enumerate(found):
         assert now.number == k
@@ -55,7 +55,7 @@ def test_a_jump_is_found_and_told(tmp_path):
         frames = list(movie_frames(opened.recording, paced=False))
         times = opened.recording.timeline.time_s
         shown = [replace(frames[k], number=n, time_s=float(times[n])) for n, k in enumerate(order)]
-        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, shown))
+        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, shown))
     assert [n for n, now in enumerate(found) if now.found] == [0, 12]
     for now, k in zip(found, order, strict=True):
         assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
@@ -70,7 +70,7 @@ def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch)
     order, hidden = [*range(8), *range(39, 30, -1)], range(12, 15)
     with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
         frames = list(movie_frames(opened.recording, paced=False))
-        views = opened.tracker.appearance.fitter.views
+        views = opened.tracker.appearances[""].fitter.views
         flat = [[np.full_like(picture, 90) for picture in one.pictures] for one in frames]
         for n in hidden:  # noise: no picture is like the one before
             flat[n] = [
@@ -95,7 +95,7 @@ def test_times_that_stand_or_go_back_begin_anew():
         frames = list(movie_frames(opened.recording, paced=False))[:12]
         times = [0.01 * k for k in (0, 1, 2, 3, 3, 4, 5, 6, 1, 2, 3, 4)]
         shown = [replace(frame, time_s=time_s) for frame, time_s in zip(frames, times, strict=True)]
-        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, shown))
+        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, shown))
     assert [n for n, now in enumerate(found) if now.found] == [0, 4, 8]
     for k, now in enumerate(found):
         assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)

@@ -42,7 +42,7 @@ def run(tmp_path_factory):
             for k, one in enumerate(movie_frames(opened.recording, paced=False))
             if k not in DROPPED
         ]
-        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
+        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
         yield opened.recording, opened.tracker, found
 
 
@@ -55,7 +55,7 @@ def test_a_frame_that_one_camera_measured_is_flagged_at_once_and_doubtful_if_the
             replace(one, pictures=[one.pictures[0], seen(k, one.pictures[1])])
             for k, one in zip(range(9), movie_frames(opened.recording, paced=False), strict=False)
         ]
-        found = list(measured(opened.tracker, opened.tracker.appearance.fitter.views, frames))
+        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
     expected = [0, 0, 0, 0, 0, Flag.ONE_CAMERA, 0, Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT, 0]
     assert [now.flags for now in found] == expected
     assert [json.loads(JsonLines(fixed=False).line(now))["flags"] for now in found] == expected

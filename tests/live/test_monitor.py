@@ -104,7 +104,7 @@ def test_the_likely_cause_is_told(reason, found, cause):
 def test_the_map_of_another_ball_is_told(tmp_path):
     folder = Path(shutil.copytree(EXCERPT, tmp_path / "excerpt"))
     with open_live(EXCERPT / "experiment.yaml", Settings(), ["cam1"], None) as opened:
-        save_learnt({"": Learnt.of(opened.tracker.appearance)}, tmp_path / "learnt.h5")
+        save_learnt({"": Learnt.of(opened.tracker.appearances[""])}, tmp_path / "learnt.h5")
     (folder / "texture.png").unlink()
     write_texture(blobs(256, torch.Generator().manual_seed(5)), folder / "texture.png")
     said: list[str] = []
@@ -112,7 +112,7 @@ def test_the_map_of_another_ball_is_told(tmp_path):
         frames = list(movie_frames(opened.recording, paced=False))[:8]
         slow = (replace(frame, time_s=0.1 * frame.number) for frame in frames)
         monitor = Monitor(Feed(slow, 1, wait=True), said.append)
-        for now in measured(opened.tracker, opened.tracker.appearance.fitter.views, monitor):
+        for now in measured(opened.tracker, opened.tracker.appearances[""].fitter.views, monitor):
             assert not now.valid
             monitor.saw(now, None)
     assert len(said) == 1
