@@ -1,4 +1,4 @@
-"""The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
+"""The application of the command line, the helpers of its commands, `settings`, and the end of errors."""
 
 import inspect
 import math
@@ -31,7 +31,7 @@ class InOrder(TyperGroup):
         *("init", "mark", "track", "live", "report", "overlay", "export"),
         *("check", "movie", "convert", "calibrate", "check-cameras", "convert-cameras"),
         *("map", "compare-maps", "spin", "synth", "texture"),
-        *("score", "bench", "train", "evaluate", "settings", "info"),
+        *("score", "bench", "train", "evaluate", "settings", "doctor"),
     )
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -239,24 +239,6 @@ def settings(
         return
     check_writable(out)
     write_text(out, text)
-
-
-@app.command()
-def info() -> None:
-    """Print versions, threads and device."""
-    import torch
-
-    from sphereorient.files.cache import cache_folder
-    from sphereorient.files.provenance import versions
-    from sphereorient.pose.compiled import library
-
-    for package, number in versions().items():
-        typer.echo(f"{package:24} {number}")
-    typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
-    typer.echo(f"{'fit':24} {'compiled' if library() else 'torch (no compiled code for this machine: slower)'}")
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
-    typer.echo(f"{'device':24} {device}")
-    typer.echo(f"{'cache':24} {cache_folder() or 'none'}")
 
 
 def main() -> None:
