@@ -12,6 +12,7 @@ from sphereorient.errors import refusal
 
 WITHOUT = "SPHEREORIENT_NO_COMPILED"  # an environment variable: where it is set, nothing compiled is used
 
+PACKAGE = Path(__file__).parents[1]
 NUMBERS = {"int64_t": ctypes.c_int64, "float": ctypes.c_float, "double": ctypes.c_double}
 
 
@@ -43,12 +44,12 @@ def _kinds() -> list[str]:
     return list(dict.fromkeys((torch.backends.cpu.get_cpu_capability().lower(), "default")))
 
 
-def compiled_parts() -> tuple[dict[str, str], list[str]]:
-    """Return by C source for which instructions the code in use is built (or that torch does its work), and which code
-    does not load, a line each.
+def compiled_parts(folder: Path = PACKAGE) -> tuple[dict[str, str], list[str]]:
+    """Return by C source in a folder for which instructions the code in use is built, or that torch does its work; and
+    which code does not load, a line each.
     """
     used, faults = {}, []
-    for path in sorted(Path(__file__).parents[1].rglob("*.c")):
+    for path in sorted(folder.rglob("*.c")):
         source, text = path.with_suffix(""), path.read_text(encoding="utf-8")
         (name,) = re.findall(r"_record\(void\) { return \(int64_t\)sizeof\((\w+)\)", text)
         there = [kind for kind in _kinds() if _file(source, kind).exists()]

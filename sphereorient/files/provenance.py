@@ -38,9 +38,16 @@ def _version(package: str) -> str:
         return "not installed"
 
 
+def _own(name: str) -> list[str]:
+    try:
+        return metadata("sphereorient").get_all(name) or []
+    except PackageNotFoundError:  # a folder that nothing installed
+        return []
+
+
 def _poor(extra: str = "") -> list[Requirement]:
     """Return which packages are missing or too old that are always required, or by an extra."""
-    required = map(Requirement, metadata("sphereorient").get_all("Requires-Dist") or ())
+    required = map(Requirement, _own("Requires-Dist"))
     wanted = [one for one in required if (one.marker.evaluate({"extra": extra}) if one.marker else not extra)]
     found = {one: _version(one.name) for one in wanted}
     return [one for one, got in found.items() if got[0].isalpha() or not one.specifier.contains(got, prereleases=True)]
@@ -48,7 +55,7 @@ def _poor(extra: str = "") -> list[Requirement]:
 
 def lacking() -> dict[str, str]:
     """Return the packages of each extra that are missing or too old, and what for, in words."""
-    poor = {extra: _poor(extra) for extra in metadata("sphereorient").get_all("Provides-Extra") or () if extra != "dev"}
+    poor = {extra: _poor(extra) for extra in _own("Provides-Extra") if extra != "dev"}
     return {
         extra: f"{', '.join(one.name for one in some)} (for {OF_EXTRA.get(extra, extra)})"
         for extra, some in poor.items()

@@ -15,8 +15,7 @@ from pathlib import Path
 def _opencv() -> Iterator[str]:
     import cv2
 
-    listed = [path.name.removeprefix("video") for path in Path("/dev").glob("video*")]
-    for number in sorted(map(int, filter(str.isdigit, listed))) if sys.platform == "linux" else range(4):
+    for number in range(8):  # of each camera Linux lists two
         capture = cv2.VideoCapture(number)
         if capture.isOpened():
             width, height = (round(capture.get(one)) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
