@@ -13,7 +13,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.bench.score import orientations_at
-from sphereorient.errors import refusal
+from sphereorient.errors import SphereOrientError, error_words, refusal
 from sphereorient.experiment.recording import open_recording
 from sphereorient.files.cache import cache_folder
 from sphereorient.files.compiled import WITHOUT, compiled_parts
@@ -44,12 +44,17 @@ def machine() -> tuple[dict[str, Any], list[str]]:
     """Return what is here and what it can do, by name, ready for JSON; and what is broken, a line each."""
     free_cores = cores() * (1 - psutil.cpu_percent(0.5) / 100)
     parts, faults = compiled_parts()
-    fits = [fit_speed(diameter_px) for diameter_px in LIMITS_DEG]
-    for (px, limit_deg), fit in zip(LIMITS_DEG.items(), fits, strict=True):
-        if not fit["error_deg"] < limit_deg:
-            name, do = f"fit of a ball of {px:g} px", f"run it with {WITHOUT}=1: if that is right, compile anew"
-            expected, got = f"poses right to {limit_deg:g} degrees", f"{fit['error_deg']:.2f}"
-            faults.append(refusal(name, expected=expected, got=got, do=do))
+    fits = []
+    for px, limit_deg in LIMITS_DEG.items():
+        name, expected = f"fit of a ball of {px:g} px", f"poses right to {limit_deg:g} degrees"
+        do = f"run it with {WITHOUT}=1: if that is right, compile anew"
+        try:
+            fits.append(fit_speed(px))
+        except (SphereOrientError, RuntimeError, OSError) as error:
+            faults.append(refusal(name, expected=expected, got=error_words(error), do=do))
+            continue
+        if not fits[-1]["error_deg"] < limit_deg:
+            faults.append(refusal(name, expected=expected, got=f"{fits[-1]['error_deg']:.2f}", do=do))
     if not _torch_is_right():
         do = "run `pip install --force-reinstall torch`"
         faults.append(refusal("torch", expected="numpy's solution and a right gradient", got="others", do=do))

@@ -87,6 +87,20 @@ def test_a_frame_without_a_pose_is_broken(monkeypatch, command):
     assert found["broken"][0].startswith("fit of a ball of 40 px: ")
 
 
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("no kernel")], ids=str)
+def test_a_fit_that_cannot_be_tried_is_broken_and_the_rest_is_told(monkeypatch, command, error):
+    def fails(px: float) -> dict[str, float]:
+        raise error
+
+    monkeypatch.setattr("sphereorient.bench.doctor.fit_speed", fails)
+    code, said, errors = command("doctor")
+    assert code == 1
+    assert "camera:0 (640 x 480 px)" in said
+    (line,) = errors
+    assert line.startswith("broken: fit of a ball of 40 px: ")
+    assert str(error.args[-1]) in line
+
+
 def test_a_torch_that_computes_wrongly_is_broken(no_fit, monkeypatch):
     assert machine()[1] == []
     monkeypatch.setattr("torch.linalg.inv", lambda A: A)
