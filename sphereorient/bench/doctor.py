@@ -21,9 +21,9 @@ from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.threads import cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.live.devices import cameras_here
 from sphereorient.live.live import measured
 from sphereorient.live.loop import open_live
+from sphereorient.live.seen import cameras_here
 from sphereorient.live.sources import movie_frames
 from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.method import Learnt, save_learnt

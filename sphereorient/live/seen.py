@@ -47,7 +47,7 @@ def _vimba() -> Iterator[str]:
 
     with VmbSystem.get_instance() as system:
         for one in system.get_all_cameras():
-            yield f"vimba:{one.get_serial()} ({one.get_model()})"
+            yield f"vimba:{one.get_id()} ({one.get_model()})"
 
 
 # By kind: its package, and who asks it.

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from sphereorient.live.devices import cameras_here
+from sphereorient.live.seen import cameras_here
 
 CV2 = """
 CAP_PROP_FRAME_WIDTH, CAP_PROP_FRAME_HEIGHT = 3, 4
