@@ -7,13 +7,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
 from sphereorient.bench.score import orientations_at
@@ -75,7 +74,7 @@ class Delays:
     delay_s: Floats  # (n,), of the lines that came, in order
     lost: int  # of these, lines without a pose
     error_deg: Floats  # (n,), of the rotation since the stretch began; NaN without pose or truth
-    memory_mb: Floats  # of the tracker, every so often; empty of a short run
+    memory_mb: Floats  # of the tracker, every so often; empty where the system does not tell
 
     def delays_ms(self) -> list[str]:
         """Return the delays that half of the lines keep, 99 and 99.9 % of them, ms, in words."""
@@ -228,7 +227,9 @@ def _errors_deg(table: Floats, order: Sequence[int], R_cam_lab: Floats, truth: P
 
 
 def _memory_mb(process: int) -> list[float]:
-    """Return the memory of a process while it runs."""
-    with suppress(psutil.NoSuchProcess):
-        return [psutil.Process(process).memory_info().rss / 2**20]
-    return []
+    """Return the memory of a process, as Linux tells it."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return []
+    return [float(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")]

@@ -24,6 +24,22 @@ class Harvester:
     def add_file(self, path): assert path.endswith("maker.cti")
     def update(self): self.device_info_list = [SimpleNamespace(serial_number=s, model="M") for s in ("11", "12")]
 """
+PYLON = """
+from types import SimpleNamespace
+here = SimpleNamespace(GetSerialNumber=lambda: "21", GetModelName=lambda: "a2A")
+factory = SimpleNamespace(EnumerateDevices=lambda: [here])
+pylon = SimpleNamespace(TlFactory=SimpleNamespace(GetInstance=lambda: factory))
+"""
+VIMBA = """
+class VmbSystem:
+    get_instance = classmethod(lambda cls: cls())
+    opened = False
+    def __enter__(self): self.opened = True; return self
+    def __exit__(self, *fault): pass
+    def get_all_cameras(self): assert self.opened; return [self]
+    def get_id(self): return "DEV_1"
+    def get_model(self): return "Alvium"
+"""
 HANGS = "import time\ntime.sleep(60)"
 ENDS = "import os\nos.abort()"
 FAILS = "raise RuntimeError('no transport layer')"
@@ -46,9 +62,10 @@ def drivers(tmp_path, monkeypatch):
 def test_cameras_are_told_as_sources_name_them(drivers, tmp_path, monkeypatch):
     (tmp_path / "maker.cti").touch()
     monkeypatch.setenv("GENICAM_GENTL64_PATH", os.pathsep.join(["", str(tmp_path)]))
-    drivers(harvesters=HARVESTERS)
+    drivers(harvesters=HARVESTERS, pypylon=PYLON, vmbpy=VIMBA)
     producer = tmp_path / "maker.cti"
     found = cameras_here()
+    assert (found["pylon"], found["vimba"]) == (["pylon:21 (a2A)"], ["vimba:DEV_1 (Alvium)"])
     assert found["opencv"] == ["camera:0 (640 x 480 px)", "camera:2 (640 x 480 px)"]
     assert found["genicam"] == [f"genicam:{producer}#11 (M)", f"genicam:{producer}#12 (M)"]
 
