@@ -1,6 +1,7 @@
-"""The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
+"""The application of the command line, the helpers of its commands, `settings`, `doctor`, and the end of errors."""
 
 import inspect
+import json
 import math
 import os
 import re
@@ -31,7 +32,7 @@ class InOrder(TyperGroup):
         *("init", "mark", "track", "live", "report", "overlay", "export"),
         *("check", "movie", "convert", "calibrate", "check-cameras", "convert-cameras"),
         *("map", "compare-maps", "spin", "synth", "texture"),
-        *("score", "bench", "train", "evaluate", "settings", "info"),
+        *("score", "bench", "train", "evaluate", "settings", "doctor"),
     )
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -242,21 +243,53 @@ def settings(
 
 
 @app.command()
+def doctor(as_json: Annotated[bool, Option("--json", help="Print all of it as one JSON object.")] = False) -> None:
+    """Tell what is installed, how fast a fit is here, which rates `live` can hold. Exit code 1: something is broken."""
+    from sphereorient.files.provenance import lacking, package_faults, versions, without_nan
+
+    faults = package_faults()
+    found: dict[str, Any] = {**versions(), "not_installed": lacking()}
+    if not faults:  # else the rest could not be trusted, or not even be imported
+        from sphereorient.bench.doctor import machine
+
+        here, faults = machine()
+        found |= here
+    if as_json:
+        typer.echo(json.dumps(without_nan({**found, "broken": faults}), indent=1))
+    else:
+        _print_findings(found)
+        for line in faults:
+            typer.echo(f"broken: {line}", err=True)
+    if faults:
+        raise typer.Exit(1)
+
+
+@app.command(hidden=True)
 def info() -> None:
-    """Print versions, threads and device."""
-    import torch
+    """Do what `doctor` does, whose name this was."""
+    typer.echo("note: `info` is called `doctor` now; its old name goes with the next version.", err=True)
+    doctor(as_json=False)
 
-    from sphereorient.files.cache import cache_folder
-    from sphereorient.files.provenance import versions
-    from sphereorient.pose.compiled import library
 
-    for package, number in versions().items():
-        typer.echo(f"{package:24} {number}")
-    typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
-    typer.echo(f"{'fit':24} {'compiled' if library() else 'torch (no compiled code for this machine: slower)'}")
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
-    typer.echo(f"{'device':24} {device}")
-    typer.echo(f"{'cache':24} {cache_folder() or 'none'}")
+def _print_findings(found: dict[str, Any]) -> None:
+    """Print what `doctor` found: lines, and a table of fits."""
+    from rich.table import Table
+
+    fits = found.pop("live_one_camera", [])
+    for name, value in found.items():
+        told = [f"{key}: {_words(one)}" for key, one in value.items()] if isinstance(value, dict) else [_words(value)]
+        for words in told or ["none"]:
+            typer.echo(f"{name.replace('_', ' '):24} {words}")
+    if fits:
+        table = Table(*fits[0], title="live, one camera: time of a frame, and the rates that can be held")
+        for fit in fits:
+            table.add_row(*(f"{number:.3g}" for number in fit.values()))
+        print_table(table)
+        typer.echo(f"now: as busy as the machine is, {found['free_cores']} of {found['cores']} cores free.")
+
+
+def _words(value: Any) -> str:
+    return (", ".join(value) if isinstance(value, list) else str(value if value is not None else "")) or "none"
 
 
 def main() -> None:

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import torch
 
+from sphereorient.errors import refusal
+
 WITHOUT = "SPHEREORIENT_NO_COMPILED"  # an environment variable: where it is set, nothing compiled is used
 
+PACKAGE = Path(__file__).parents[1]
 NUMBERS = {"int64_t": ctypes.c_int64, "float": ctypes.c_float, "double": ctypes.c_double}
 
 
@@ -33,14 +36,39 @@ def compiled(source: Path, record: type[ctypes.Structure]) -> ctypes.CDLL | None
     """
     if os.environ.get(WITHOUT):
         return None
-    kinds = dict.fromkeys((torch.backends.cpu.get_cpu_capability().lower(), "default"))
-    return next((code for kind in kinds if (code := built_for(source, record, kind)) is not None), None)
+    return next((code for kind in _kinds() if (code := built_for(source, record, kind)) is not None), None)
+
+
+def _kinds() -> list[str]:
+    """Return the sets of instructions of this processor that code is built for, the best first."""
+    return list(dict.fromkeys((torch.backends.cpu.get_cpu_capability().lower(), "default")))
+
+
+def compiled_parts(folder: Path = PACKAGE) -> tuple[dict[str, str], list[str]]:
+    """Return by C source in a folder for which instructions the code in use is built, or that torch does its work; and
+    which code does not load, a line each.
+    """
+    used, faults = {}, []
+    for path in sorted(folder.rglob("*.c")):
+        source, text = path.with_suffix(""), path.read_text(encoding="utf-8")
+        (name,) = re.findall(r"_record\(void\) { return \(int64_t\)sizeof\((\w+)\)", text)
+        there = [kind for kind in _kinds() if _file(source, kind).exists()]
+        right = [kind for kind in there if built_for(source, record(source, name), kind)]
+        for file in (_file(source, kind) for kind in there if kind not in right):
+            got, do = "that of another version or machine", "run `make setup`, or install sphereorient again"
+            faults.append(refusal(str(file), expected="code that loads", got=got, do=do))
+        used[source.name] = "torch: slower" if os.environ.get(WITHOUT) or not right else right[0]
+    return used, faults
+
+
+def _file(source: Path, kind: str) -> Path:
+    return source.with_name(f"{source.name}.{kind}.compiled")
 
 
 def built_for(source: Path, record: type[ctypes.Structure], kind: str) -> ctypes.CDLL | None:
     """Return the code built for a set of instructions (avx512, avx2, default), as `compiled`."""
     try:
-        code = ctypes.CDLL(str(source.with_name(f"{source.name}.{kind}.compiled")))
+        code = ctypes.CDLL(str(_file(source, kind)))
         size = code[f"{source.name}_record"]
     except (OSError, AttributeError):  # not there, or for another machine
         return None

@@ -5,25 +5,77 @@ import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, metadata, version
 from pathlib import Path
 from typing import Any
 
-from sphereorient.errors import OutputError, SphereOrientError, refusal
+from packaging.requirements import Requirement
+
+from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
 from sphereorient.files.whole_file import relative_path
 
 PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
+IMPORTED_AS = {"opencv-python-headless": "cv2"}
+OF_EXTRA = {  # what it is for, where its name does not say it
+    "table": "export to parquet and netcdf",
+    "nwb": "export to nwb",
+    "live": "live --to zmq:PORT",
+    "genicam": "live --source genicam:PRODUCER.cti",
+    "cluster": "track --cluster",
+    "moon": "scripts/moon.py",
+}
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that results depend on."""
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
+    return {"python": platform.python_version()} | {package: _version(package) for package in PACKAGES}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _own(name: str) -> list[str]:
+    try:
+        return metadata("sphereorient").get_all(name) or []
+    except PackageNotFoundError:  # a folder that nothing installed
+        return []
+
+
+def _poor(extra: str = "") -> list[Requirement]:
+    """Return which packages are missing or too old that are always required, or by an extra."""
+    required = map(Requirement, _own("Requires-Dist"))
+    wanted = [one for one in required if (one.marker.evaluate({"extra": extra}) if one.marker else not extra)]
+    found = {one: _version(one.name) for one in wanted}
+    return [one for one, got in found.items() if got[0].isalpha() or not one.specifier.contains(got, prereleases=True)]
+
+
+def lacking() -> dict[str, str]:
+    """Return the packages of each extra that are missing or too old, and what for, in words."""
+    poor = {extra: _poor(extra) for extra in _own("Provides-Extra") if extra != "dev"}
+    return {
+        extra: f"{', '.join(one.name for one in some)} (for {OF_EXTRA.get(extra, extra)})"
+        for extra, some in poor.items()
+        if some
+    }
+
+
+def package_faults() -> list[str]:
+    """Return which packages that are always required are missing, too old, or cannot be imported, a line each."""
+    faults = []
+    for one in _poor():
+        do = f"run `pip install '{one.name}{one.specifier}'`"
+        faults.append(refusal(one.name, expected=str(one.specifier), got=_version(one.name), do=do))
+    for name in PACKAGES:
         try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            import_module(IMPORTED_AS.get(name, name))
+        except Exception as error:  # what a damaged package raises is its own
+            do = f"run `pip install --force-reinstall {name}`"
+            faults.append(refusal(name, expected="a package that can be imported", got=error_words(error), do=do))
+    return faults
 
 
 def without_nan(value: Any) -> Any:

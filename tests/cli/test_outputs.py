@@ -152,7 +152,7 @@ def test_every_command_that_writes_has_force():
 def test_memory_that_is_not_there_is_one_line(command, monkeypatch, ask):
     """Before: a traceback and exit code 1; so `track` of the excerpt with 1.3 GB (ulimit -v 1300000)."""
     monkeypatch.setattr("sphereorient.files.provenance.versions", lambda: ask() and {})
-    code, said = command("info")
+    code, said = command("doctor")
     assert code == 2
     assert len(said) == 1
     assert said[0].startswith("sphereorient: memory: expected room for the data, got ")
@@ -161,7 +161,7 @@ def test_memory_that_is_not_there_is_one_line(command, monkeypatch, ask):
 
 def test_other_errors_keep_their_traceback(monkeypatch):
     monkeypatch.setattr("sphereorient.files.provenance.versions", lambda: {}["a key"])
-    monkeypatch.setattr(sys, "argv", ["sphereorient", "info"])
+    monkeypatch.setattr(sys, "argv", ["sphereorient", "doctor"])
     with pytest.raises(KeyError, match="a key"):
         main()
 

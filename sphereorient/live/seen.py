@@ -1,0 +1,82 @@
+"""Which cameras this machine sees. Drivers may hang, or end the program that asks them: each kind is asked by a process
+of its own, this file run as a program.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
+
+def _opencv() -> Iterator[str]:
+    import cv2
+
+    for number in range(8):  # of each camera Linux lists two
+        capture = cv2.VideoCapture(number)
+        if capture.isOpened():
+            width, height = (round(capture.get(one)) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            yield f"camera:{number} ({width} x {height} px)"
+        capture.release()
+
+
+def _genicam() -> Iterator[str]:
+    from harvesters.core import Harvester
+
+    for folder in filter(None, os.environ.get("GENICAM_GENTL64_PATH", "").split(os.pathsep)):
+        for producer in sorted(Path(folder).glob("*.cti")):
+            with Harvester() as harvester:
+                harvester.add_file(str(producer))
+                harvester.update()
+                for one in harvester.device_info_list:
+                    yield f"genicam:{producer}#{one.serial_number} ({one.model})"
+
+
+def _pylon() -> Iterator[str]:
+    from pypylon import pylon
+
+    for one in pylon.TlFactory.GetInstance().EnumerateDevices():
+        yield f"pylon:{one.GetSerialNumber()} ({one.GetModelName()})"
+
+
+def _vimba() -> Iterator[str]:
+    from vmbpy import VmbSystem
+
+    with VmbSystem.get_instance() as system:
+        for one in system.get_all_cameras():
+            yield f"vimba:{one.get_id()} ({one.get_model()})"
+
+
+# By kind: its package, and who asks it.
+KINDS: Mapping[str, tuple[str, Callable[[], Iterator[str]]]] = {
+    "opencv": ("cv2", _opencv),
+    "genicam": ("harvesters", _genicam),
+    "pylon": ("pypylon", _pylon),
+    "vimba": ("vmbpy", _vimba),
+}
+
+
+def cameras_here(limit_s: float = 10.0) -> dict[str, list[str] | str]:
+    """Return the cameras of each kind whose package is installed; in place of a list, in words, why there is none."""
+    kinds = [kind for kind, (package, _) in KINDS.items() if find_spec(package) is not None]
+    with ThreadPoolExecutor() as pool:
+        return dict(zip(kinds, pool.map(partial(_asked, limit_s=limit_s), kinds), strict=True))
+
+
+def _asked(kind: str, limit_s: float) -> list[str] | str:
+    command = [sys.executable, "-P", __file__, kind]  # -P: the modules beside this file hide no others
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        return f"no answer within {limit_s:g} s"
+    if told.returncode:
+        return "the driver fails: " + (told.stderr.strip().splitlines() or [f"status {told.returncode}"])[-1][:200]
+    return told.stdout.splitlines()
+
+
+if __name__ == "__main__":
+    for line in KINDS[sys.argv[1]][1]():
+        print(line)  # noqa: T201
