@@ -192,6 +192,7 @@ def live(given: _LiveOptions) -> None:
     The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a
     ball that stays in its place is learnt meanwhile, from the first frame on.
     """
+    from sphereorient.experiment import load_experiment
     from sphereorient.live.live import TrackBlocks
     from sphereorient.live.loop import open_live, run_live
     from sphereorient.live.outputs import open_output
@@ -204,6 +205,9 @@ def live(given: _LiveOptions) -> None:
         outputs = [open_output(name, _tell) for name in given.to or ()]
         for output, _ in outputs:
             opened.callback(output.close)
+        if len(load_experiment(given.experiment).names) > 1 and any(form != "json" for _, form in outputs):
+            got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
+            raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
         if given.page is not None:
             page = LivePage()
             server = opened.enter_context(open_page(page, given.page))

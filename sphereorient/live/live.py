@@ -98,9 +98,10 @@ class OnlineTracker:
             chunk = self._chunks[name]
             chunk.saw(self._number, poses, self._tracker.balls[name].turns([chunk], [poses])[0])
         if self._last:
-            self._number += 1
-            self._time_s.pop(self._number - 4, None)
-            self._last = {}
+            self._number, self._last = self._number + 1, {}
+            known = {number for chunk in self._chunks.values() for number, _ in chunk.past}
+            for number in [k for k in self._time_s if k < self._number - 1 and k not in known]:
+                del self._time_s[number]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
