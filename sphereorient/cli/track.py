@@ -179,8 +179,14 @@ class _LiveOptions(CameraOptions):
     ] = "movie"
     to: Annotated[
         list[str] | None,
-        Option(help="Repeatable. FicTrac: tcp:PORT, udp:PORT, .dat; JSON: zmq:PORT, .jsonl; track: .h5"),
+        Option(
+            help="Repeatable. FicTrac: tcp:PORT, udp:PORT, serial:PORT@BAUD, .dat; JSON: zmq:PORT, .jsonl; numbers: "
+            "lsl:NAME, osc:PORT, serial-short:PORT@BAUD; track: .h5"
+        ),
     ] = None
+    record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, of several cameras each.")] = (
+        None
+    )
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
 
@@ -196,10 +202,10 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.live.loop import open_live, run_live
     from sphereorient.live.outputs import open_output
     from sphereorient.live.page import LivePage, open_page
-    from sphereorient.live.sources import source_of
+    from sphereorient.live.sources import open_recorder, recorded, source_of
 
     chosen = given.chosen("precise")
-    source, page = source_of(given.source, _tell), None
+    source, page, recorder, movies = source_of(given.source, _tell), None, None, _movies_of(given)
     with ExitStack() as opened:
         outputs = [open_output(name, _tell) for name in given.to or ()]
         for output, _ in outputs:
@@ -219,6 +225,9 @@ def live(given: _LiveOptions) -> None:
         )
         for output, _ in outputs:
             output.begin(blocks)
+        if movies:
+            recorder = opened.enter_context(open_recorder(movies, set_up.recording, source, _tell))
+            source = recorded(source, recorder)
         monitor = run_live(set_up, source, outputs, page, _tell)
         if set_up.save_map is not None:
             _tell("the map is finished; this takes some seconds")
@@ -227,7 +236,22 @@ def live(given: _LiveOptions) -> None:
             except PaintError as error:
                 _tell(str(error))
     if not given.quiet:
-        echo_lines(monitor.summary())
+        echo_lines([*monitor.summary(), *([] if recorder is None else [recorder.summary()])])
+
+
+def _movies_of(given: _LiveOptions) -> list[Path]:
+    """Return the movies of --record; raise SphereOrientError where one cannot be a new file."""
+    from sphereorient.experiment import load_experiment
+    from sphereorient.live.sources import recorded_paths
+
+    if given.record is None:
+        return []
+    known = load_experiment(given.experiment).movie_paths
+    paths = recorded_paths(given.record, [name for name in known if given.names is None or name in given.names])
+    if twice := {path.absolute() for path in paths} & {Path(name).absolute() for name in given.to or ()}:
+        do = "name another one"
+        raise OutputError(refusal("--record", expected="a file of its own", got=f"--to {twice.pop()}", do=do))
+    return paths
 
 
 def _tell(line: str) -> None:

@@ -15,7 +15,7 @@ from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import silent
 from sphereorient.files.whole_file import writing
 from sphereorient.live.feed import Feed, Tell
-from sphereorient.live.lines import FicTracLines, JsonLines, Told
+from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
 from sphereorient.live.page import LivePage, Monitor
@@ -94,7 +94,8 @@ def run_live(
     """
     recording, tracker = opened.recording, opened.tracker
     views = tracker.appearance.fitter.views
-    table, json_lines = FicTracLines(views[0].camera.R_cam_lab.numpy()), JsonLines(recording.experiment.fixed)
+    experiment = recording.experiment
+    table, known = FicTracLines(views[0].camera.R_cam_lab.numpy()), Quantities(experiment.fixed, experiment.length_unit)
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
     sys.setswitchinterval(0.0002)  # longest that a thread that computes holds up the one that reads
@@ -106,7 +107,7 @@ def run_live(
     try:
         with suppress(KeyboardInterrupt):
             for now in measured(tracker, views, monitor):
-                told = Told(now, table, json_lines)
+                told = Told(now, table, known)
                 for output, form in outputs:
                     output.send(getattr(told, form))
                 if now.found:

@@ -1,6 +1,6 @@
-"""Where lines and frames go: TCP, UDP, ZeroMQ, files. A slow or dead reader loses lines; it never holds up who writes.
+"""Where lines and frames go: sockets, serial ports, LSL, files. A slow or dead reader loses lines; it holds nobody up.
 
-A new output is a class, and a line of `SOCKETS` or `FILES`.
+A new output is a class, and a line of `SOCKETS`, `NAMED` or `FILES`.
 """
 
 import os
@@ -17,12 +17,14 @@ from sphereorient.errors import OutputError, SettingsError, SphereOrientError, e
 from sphereorient.files.page_server import HOST
 from sphereorient.files.provenance import package
 from sphereorient.live.feed import Tell
+from sphereorient.live.lines import numbers_of
 from sphereorient.live.live import TrackBlocks
 from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
 BLOCK_S = 0.5  # from one write of a track's rows to the next
+LEAST_OF = 256  # frames, of which the least delayed one sets LSL's clock
 
 
 class Output:
@@ -66,12 +68,13 @@ class Spool:
             self._waiting.append(thing)
             self._changed.notify()
 
-    def close(self, limit_s: float = SOON_S) -> None:
-        """Write what waits, within a limit, and end."""
+    def close(self, limit_s: float = SOON_S) -> bool:
+        """Write what waits, within a limit, end, and return whether all was taken."""
         with self._changed:
             self._ends = True
             self._changed.notify()
         self._thread.join(limit_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
@@ -109,14 +112,115 @@ class UdpOutput(Output):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
-    def send(self, line: str) -> None:
+    def send(self, thing: Any) -> None:
         """Send a line; nobody may be there."""
         with suppress(OSError):
-            self._socket.sendto(f"{line}\n".encode(), self._to)
+            self._socket.sendto(self._bytes(thing), self._to)
+
+    def _bytes(self, thing: Any) -> bytes:
+        return f"{thing}\n".encode()
 
     def close(self) -> None:
         """End."""
         self._socket.close()
+
+
+class OscOutput(UdpOutput):
+    """OSC over UDP: a message /sphereorient a frame, of all numbers (`lines.numbers_of`) as int32 or float32, in order.
+    Raise OutputError: the package python-osc is missing, or no such host.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._message = package("pythonosc.osc_message_builder", "live").OscMessageBuilder
+        super().__init__(host, port)
+
+    def _bytes(self, thing: dict[str, float]) -> bytes:
+        message = self._message("/sphereorient")
+        for value in thing.values():
+            message.add_arg(value, "f" if isinstance(value, float) else "i")
+        return bytes(message.build().dgram)
+
+
+class LslOutput(Output):
+    """A stream of LSL: a sample of float64 a frame, of all numbers (`lines.numbers_of`), with their names and units.
+    Times of the source go over to LSL's clock by the least delayed of the last frames. It is announced on this machine
+    alone, unless the variable LSLAPICFG names a configuration of LSL.
+    Raise OutputError: the package pylsl, or its library liblsl, is missing.
+    """
+
+    def __init__(self, name: str, tell: Tell) -> None:
+        self._name = name
+        try:
+            self._lsl = package("pylsl", "live")
+        except RuntimeError as error:
+            do = "install liblsl, or name its file in the variable PYLSL_LIB"
+            raise OutputError(refusal(f"lsl:{name}", expected="liblsl", got=error_words(error), do=do)) from None
+        if "LSLAPICFG" not in os.environ:
+            self._lsl.set_config_content("[multicast]\nResolveScope = machine\n[log]\nlevel = -2\n")
+        self._apart_s: deque[float] = deque(maxlen=LEAST_OF)  # LSL's clock at the arrival, less the frame's time
+        self._outlet: Any = None
+
+    def begin(self, blocks: TrackBlocks) -> None:
+        """Open the stream."""
+        units, lsl = numbers_of(blocks.recording.experiment.length_unit), self._lsl
+        irregular, double = lsl.IRREGULAR_RATE, lsl.cf_double64
+        info = lsl.StreamInfo(self._name, "Pose", len(units), irregular, double, f"sphereorient {self._name}")
+        channels = info.desc().append_child("channels")
+        for label, unit in units.items():
+            channels.append_child("channel").append_child_value("label", label).append_child_value("unit", unit)
+        self._outlet = lsl.StreamOutlet(info)
+
+    def send(self, numbers: dict[str, float]) -> None:
+        """Push a sample; LSL keeps those of six minutes for each reader."""
+        arrived_s = self._lsl.local_clock() - 1e-3 * numbers["latency_ms"]
+        self._apart_s.append(arrived_s - numbers["time_s"])
+        self._outlet.push_sample(list(numbers.values()), numbers["time_s"] + min(self._apart_s))
+
+    def close(self) -> None:
+        """End the stream."""
+        self._outlet = None
+
+
+class SerialOutput(Output):
+    """A serial port, PORT@BAUD. `tell` gets a line where it fails, after which nothing is sent, and where lines come
+    faster than it takes them: then the oldest are lost.
+    Raise OutputError: the package pyserial is missing, not a baud rate, or no such port, or one in use.
+    """
+
+    def __init__(self, address: str, tell: Tell) -> None:
+        port, _, baud = address.rpartition("@")
+        self._name, self._tell, self._told = f"serial:{address}", tell, False
+        if not (port and baud.isdecimal() and int(baud)):
+            do = "name both, such as serial:/dev/ttyUSB0@115200"
+            raise OutputError(refusal(self._name, expected="PORT@BAUD, a port and its baud rate", got=address, do=do))
+        serial = package("serial", "live")
+        try:
+            self._port = serial.Serial(port, int(baud), exclusive=True)
+        except (OSError, ValueError, ArithmeticError) as error:  # the last two of a rate that the port does not have
+            do = "connect it, correct its name or rate, or end the program that has it"
+            raise OutputError(refusal(self._name, expected="a free port", got=error_words(error), do=do)) from None
+        self._spool = Spool(lambda lines: self._port.write(_joined(lines)), self._failed)
+
+    def _failed(self, error: OSError) -> None:
+        do = "connect it and begin again; tracking goes on without it"
+        self._tell(refusal(self._name, expected="a port that takes lines", got=error_words(error), do=do))
+
+    def send(self, line: str) -> None:
+        """Take a line."""
+        self._spool.send(line)
+        if self._spool.lost and not (self._told or self._spool.gone):
+            self._told = True
+            self._tell(
+                f"{self._name}: lines are lost: they come faster than they are taken; a higher baud rate may do."
+            )
+
+    def close(self) -> None:
+        """Write what waits, within a second, and close the port."""
+        if not self._spool.close():
+            self._port.cancel_write()
+            with suppress(Exception):  # each system has errors of its own
+                self._port.reset_output_buffer()  # the system would wait for a reader
+        self._port.close()
 
 
 class ZmqOutput(Output):
@@ -285,6 +389,12 @@ SOCKETS: Mapping[str, tuple[Callable[[str, int], Output], str]] = {
     "tcp": (TcpOutput, "marked"),
     "udp": (UdpOutput, "marked"),
     "zmq": (ZmqOutput, "json"),
+    "osc": (OscOutput, "numbers"),
+}
+NAMED: Mapping[str, tuple[Callable[[str, Tell], Output], str]] = {
+    "serial": (SerialOutput, "marked"),
+    "serial-short": (SerialOutput, "short"),
+    "lsl": (LslOutput, "numbers"),
 }
 FILES: Mapping[str, tuple[Callable[[Path, Tell], Output], str]] = {
     ".dat": (FileOutput, "fictrac"),
@@ -297,12 +407,16 @@ def open_output(name: str, tell: Tell) -> tuple[Output, str]:
     """Open an output by its name, and return what it takes of a frame too; raise SettingsError for an unknown one."""
     kind, _, address = name.partition(":")
     host, between, port = address.rpartition(":")
-    if kind in SOCKETS and port.isdigit() and int(port) < 1 << 16:
+    if kind in SOCKETS and port.isdecimal() and int(port) < 1 << 16:
         to_socket, form = SOCKETS[kind]
         return to_socket(host if between else HOST, int(port)), form
+    if kind in NAMED and address:
+        to_name, form = NAMED[kind]
+        return to_name(address, tell), form
     if (suffix := Path(name).suffix) in FILES:
         to_file, form = FILES[suffix]
         return to_file(Path(name), tell), form
-    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *(f"NAME{suffix}" for suffix in FILES)])
+    others = "serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME"
+    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others, *(f"NAME{suffix}" for suffix in FILES)])
     do = "choose one of these; another machine is tcp:HOST:PORT"
     raise SettingsError(refusal("--to", expected=expected, got=name, do=do))

@@ -6,7 +6,7 @@ A new source is a function here or in a file of its own, and a line of `SOURCES`
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -18,8 +18,12 @@ from sphereorient.errors import MovieError, SettingsError, error_words, refusal
 from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
+from sphereorient.files.whole_file import check_ending
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
+from sphereorient.live.outputs import check_new
 from sphereorient.live.shared import shared_frames
+from sphereorient.movies.record import MovieFile, Recorder
+from sphereorient.movies.write import WRITERS, times_path
 
 AGAIN_S = 1.0  # between attempts to open a camera
 
@@ -188,3 +192,38 @@ def source_of(name: str, tell: Tell) -> Source:
         expected = "movie, movie-fast, -, camera:NUMBER, genicam:PRODUCER.cti or shared:FILE"
         raise SettingsError(refusal("--source", expected=expected, got=name, do="choose one of these"))
     return SOURCES[kind + colon](where, tell)
+
+
+def recorded_paths(path: Path, cameras: Sequence[str]) -> list[Path]:
+    """Return the movies of a recording: NAME.mkv or NAME.h5, of several cameras NAME.CAMERA.mkv.
+    Raise OutputError: another ending, a file that is there, or no folder.
+    """
+    check_ending(path, "--record", WRITERS)
+    several = [path.with_name(f"{path.stem}.{camera}{path.suffix}") for camera in cameras]
+    paths = several if len(cameras) > 1 else [path]
+    for one in paths:
+        check_new(one)
+        if one.suffix.lower() == ".mkv":
+            check_new(times_path(one))
+    return paths
+
+
+def open_recorder(paths: Sequence[Path], recording: Recording, source: Source, tell: Tell) -> Recorder:
+    """Begin a recording of the pictures of each camera; see `Recorder`."""
+    files = [
+        MovieFile(path=path, shape=stream.movie.frame_shape, dtype=stream.movie.dtype)
+        for path, stream in zip(paths, recording.streams, strict=True)
+    ]
+    frame_s = float(np.nan_to_num(recording.timeline.frame_s, nan=0.04))  # of a single frame: for players alone
+    return Recorder(files, frame_s, tell, wait=source.waits)
+
+
+def recorded(source: Source, recorder: Recorder) -> Source:
+    """Return a source whose frames are recorded as they come, those too that are not tracked."""
+
+    def frames(recording: Recording) -> Iterator[Arrival]:
+        for arrival in source.frames(recording):
+            recorder.take(arrival.time_s, arrival.pictures)
+            yield arrival
+
+    return replace(source, frames=frames)

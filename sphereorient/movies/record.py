@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
-from sphereorient.files.whole_file import check_target, unfinished
+from sphereorient.files.whole_file import unfinished
 from sphereorient.movies.movie import Grey
 from sphereorient.movies.write import FAULTS, new_movie, write_times
 
@@ -84,8 +84,12 @@ class Recorder:
         self._process.start()
         stamps.close()
         tells.close()
-        if fault := self._told.recv_bytes():  # empty: it is ready
-            raise OutputError(fault.decode())
+        try:
+            fault = self._told.recv_bytes().decode()  # empty: it is ready
+        except EOFError:
+            fault = self._without_process()
+        if fault:
+            raise OutputError(fault)
         self._thread = Thread(target=self._listen, name="recorder", daemon=True)
         self._thread.start()
 
@@ -111,10 +115,15 @@ class Recorder:
             while True:
                 self._tell(self._told.recv_bytes().decode())
         self._ended = True
+        if fault := self._without_process():
+            self._tell(fault)
+
+    def _without_process(self) -> str:
+        """Wait for the end of the process, and return the words for one that did not end by itself."""
         self._process.join()
-        if self._process.exitcode:
-            got, do = f"its end ({self._process.exitcode})", "begin again; tracking goes on without it"
-            self._tell(refusal(self._name, expected="a process that records", got=got, do=do))
+        got, do = f"its end ({self._process.exitcode})", "begin again; tracking goes on without it"
+        words = refusal(self._name, expected="a process that records", got=got, do=do)
+        return words if self._process.exitcode else ""
 
     def summary(self) -> str:
         """Return what was recorded, in words."""
@@ -140,13 +149,16 @@ def _record(plan: _Plan, stamps: Connection, tells: Connection) -> None:
             if not times_s:
                 aside.unlink()
                 continue
-            check_target(file.path)  # again: hours may have passed
+            if file.path.exists():  # hours may have passed
+                do = "name another one"
+                raise OutputError(refusal(str(file.path), expected="a new file", got="one that is there", do=do))
             aside.replace(file.path)
             if file.path.suffix.lower() == ".mkv":
                 write_times(file.path, times_s)
     except (SphereOrientError, *FAULTS) as error:
-        expected, do = "a file that can be written", "choose a folder that has room; tracking goes on without it"
-        line = refusal(str(plan.files[0].path), expected=expected, got=error_words(error), do=do)
+        name, do = str(plan.files[0].path), "choose a folder that has room; tracking goes on without it"
+        words = refusal(name, expected="a file that can be written", got=error_words(error), do=do)
+        line = str(error) if isinstance(error, SphereOrientError) else words
         if plan.written.value:
             line += f" What was recorded is in {', '.join(str(aside) for aside in asides if aside.exists())}."
         else:
