@@ -1,4 +1,4 @@
-"""A measured pose as a line of text, FicTrac's and JSON, and as numbers with names and units."""
+"""A measured pose as a line of text, FicTrac's and JSON, and as numbers by name."""
 
 import json
 import math
@@ -19,6 +19,7 @@ from sphereorient.trajectory.rotations import rotation_vectors
 from sphereorient.trajectory.walk import arcs, fictrac_rows, turned
 
 Floats = NDArray[np.float64]
+AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
 class FicTracLines:
@@ -73,77 +74,41 @@ def fictrac_line(columns: Floats) -> str:
     return ", ".join(f"{value:.14g}" for value in columns.tolist())
 
 
-def channels(length_unit: str) -> list[tuple[str, str, str]]:
-    """Return the key of each quantity of a frame in JSON, its axes, one letter each, and its unit."""
-    length, position = length_unit, "position_lab_mm" if length_unit == "mm" else f"position_{length_unit}"
-    return [
-        ("frame", "", ""),
-        ("time_s", "", "s"),
-        ("valid", "", ""),
-        (position, "xyz", length),
-        ("quaternion_wxyz", "wxyz", ""),
-        ("omega_rad_s", "xyz", "rad/s"),
-        (f"velocity_{length}_s", "xyz", f"{length}/s"),
-        ("sigma_rad", "xyz", "rad"),
-        (f"sigma_{length}", "xyz", length),
-        ("sigma_omega_rad_s", "xyz", "rad/s"),
-        (f"sigma_velocity_{length}_s", "xyz", f"{length}/s"),
-        ("map", "", ""),
-        ("flags", "", ""),
-        ("found", "", ""),
-        ("dropped", "", ""),
-        ("latency_ms", "", "ms"),
-    ]
-
-
-def numbers_of(length_unit: str) -> dict[str, str]:
-    """Return the unit of each number of a frame, by its name: the key in JSON, with _ and the axis."""
-    return {
-        f"{key}_{axis}" if axis else key: unit for key, axes, unit in channels(length_unit) for axis in axes or [""]
-    }
-
-
 class Quantities:
-    """What is known of each frame, by its key in JSON (`channels`); lengths in mm or radii, as `length_unit` says. With
-    the angular velocity, and where the ball is not held in its place (`fixed`) its velocity, from this frame and those
-    before it. These begin anew where the ball was searched for, and are not known where the orientation is relative:
-    its errors grow, and are not stated.
+    """What is known of each frame by name, with units; lengths are in mm or radii (`length_unit`). With the angular
+    velocity, and where the ball is not held in its place (`fixed`) its velocity, from this frame and those before it.
+    These begin anew where the ball was searched for, and are not known where the orientation is relative: its errors
+    grow, and are not stated.
     """
 
     def __init__(self, fixed: bool, length_unit: str = "mm") -> None:
+        self._unit = length_unit
         self._turning, self._moving = ForwardRate(), None if fixed else ForwardRate()
         self._before: Measured | None = None
-        self._keys = [key for key, _, _ in channels(length_unit)]
-        self._numbers = list(numbers_of(length_unit))
 
     def of(self, now: Measured) -> dict[str, Any]:
-        """Return the quantities of the next frame: a number, or a list of one for each axis."""
+        """Return those of the next frame: numbers, or lists of a number for each axis; NaN where they are not known."""
+        unit = self._unit
         sigma = np.sqrt(np.diag(now.covariance + now.lasting))
         omega, velocity = self._rates(now)
-        values = [
-            now.number,
-            now.time_s,
-            now.valid,
-            now.position_lab_mm.tolist(),
-            quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
-            omega.value.tolist(),
-            velocity.value.tolist(),
-            sigma[:3].tolist(),
-            sigma[3:].tolist(),
-            omega.sigma.tolist(),
-            velocity.sigma.tolist(),
-            now.map_number,
-            now.flags,
-            now.found,
-            now.dropped,
-            1e3 * now.latency_s,
-        ]
-        return dict(zip(self._keys, values, strict=True))
-
-    def numbers(self, quantities: dict[str, Any]) -> dict[str, float]:
-        """Return quantities as numbers by name (`numbers_of`), NaN for what is not known."""
-        values = (part for value in quantities.values() for part in (value if isinstance(value, list) else [value]))
-        return dict(zip(self._numbers, values, strict=True))
+        return {
+            "frame": now.number,
+            "time_s": now.time_s,
+            "valid": now.valid,
+            "position_lab_mm" if unit == "mm" else f"position_{unit}": now.position_lab_mm.tolist(),
+            "quaternion_wxyz": quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
+            "omega_rad_s": omega.value.tolist(),
+            f"velocity_{unit}_s": velocity.value.tolist(),
+            "sigma_rad": sigma[:3].tolist(),
+            f"sigma_{unit}": sigma[3:].tolist(),
+            "sigma_omega_rad_s": omega.sigma.tolist(),
+            f"sigma_velocity_{unit}_s": velocity.sigma.tolist(),
+            "map": now.map_number,
+            "flags": now.flags,
+            "found": now.found,
+            "dropped": now.dropped,
+            "latency_ms": 1e3 * now.latency_s,
+        }
 
     def _rates(self, now: Measured) -> tuple[Rate, Rate]:
         before, self._before = self._before, now if _states_errors(now) else None
@@ -166,12 +131,6 @@ class Quantities:
 def _states_errors(now: Measured) -> bool:
     """Return whether there is a pose with errors."""
     return bool(np.isfinite(now.covariance).all())
-
-
-def json_line(now: Measured, quantities: dict[str, Any]) -> str:
-    """Return a frame as a line of JSON: null for what is not known, flags and reasons by their names."""
-    words = {"flags": [flag.name for flag in Flag(now.flags)], "reason": [str(why) for why in now.reason]}
-    return json.dumps(without_nan(quantities | words), allow_nan=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,15 +164,20 @@ class Told:
 
     @cached_property
     def quantities(self) -> dict[str, Any]:
-        """What is known, by its key in JSON."""
+        """What is known, see `Quantities.of`."""
         return self.known.of(self.now)
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """All numbers, by name."""
-        return self.known.numbers(self.quantities)
+        """The same, each number by its own name, with the axis behind."""
+        found: dict[str, float] = {}
+        for name, value in self.quantities.items():
+            parts = zip(AXES[len(value)], value, strict=True) if isinstance(value, list) else [("", value)]
+            found |= {f"{name.removesuffix('_wxyz')}{axis}": part for axis, part in parts}
+        return found
 
     @cached_property
     def json(self) -> str:
-        """A line of JSON."""
-        return json_line(self.now, self.quantities)
+        """A line of JSON: null for what is not known, flags and reasons by their names."""
+        words = {"flags": [flag.name for flag in Flag(self.now.flags)], "reason": [str(why) for why in self.now.reason]}
+        return json.dumps(without_nan(self.quantities | words), allow_nan=False)

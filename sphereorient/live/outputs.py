@@ -4,6 +4,7 @@ A new output is a class, and a line of `SOCKETS`, `NAMED` or `FILES`.
 """
 
 import os
+import re
 import socket
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -17,14 +18,15 @@ from sphereorient.errors import OutputError, SettingsError, SphereOrientError, e
 from sphereorient.files.page_server import HOST
 from sphereorient.files.provenance import package
 from sphereorient.live.feed import Tell
-from sphereorient.live.lines import numbers_of
 from sphereorient.live.live import TrackBlocks
 from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
+SOON_LINES = 200  # likewise, of a serial port: soon it is told that it is too slow, and lines are never much late
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
 BLOCK_S = 0.5  # from one write of a track's rows to the next
 LEAST_OF = 256  # frames, of which the least delayed one sets LSL's clock
+UNIT = re.compile(r"_((?:rad|mm|radii)_s|rad|mm|radii|ms|s)(?:_[wxyz])?$")  # in the name of a number
 
 
 class Output:
@@ -64,16 +66,18 @@ class Spool:
     def send(self, thing: object) -> None:
         """Take a thing, and return at once."""
         with self._changed:
-            self.lost += len(self._waiting) == self._waiting.maxlen
+            self.lost += len(self._waiting) == self._waiting.maxlen and not self.gone
             self._waiting.append(thing)
             self._changed.notify()
 
     def close(self, limit_s: float = SOON_S) -> bool:
-        """Write what waits, within a limit, end, and return whether all was taken."""
+        """Write what waits, within a limit, drop the rest, and return whether nothing is being written any more."""
         with self._changed:
             self._ends = True
             self._changed.notify()
         self._thread.join(limit_s)
+        with self._changed:
+            self._waiting.clear()
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -126,7 +130,7 @@ class UdpOutput(Output):
 
 
 class OscOutput(UdpOutput):
-    """OSC over UDP: a message /sphereorient a frame, of all numbers (`lines.numbers_of`) as int32 or float32, in order.
+    """OSC over UDP: a message /sphereorient a frame, of all numbers (`Told.numbers`) as int32 or float32, in order.
     Raise OutputError: the package python-osc is missing, or no such host.
     """
 
@@ -142,9 +146,9 @@ class OscOutput(UdpOutput):
 
 
 class LslOutput(Output):
-    """A stream of LSL: a sample of float64 a frame, of all numbers (`lines.numbers_of`), with their names and units.
-    Times of the source go over to LSL's clock by the least delayed of the last frames. It is announced on this machine
-    alone, unless the variable LSLAPICFG names a configuration of LSL.
+    """A stream of LSL: a sample of float64 a frame, of all numbers (`Told.numbers`), with their names and units; the
+    least delayed of the last frames sets LSL's clock. It is announced on this machine alone, unless the variable
+    LSLAPICFG names a configuration of LSL.
     Raise OutputError: the package pylsl, or its library liblsl, is missing.
     """
 
@@ -160,21 +164,22 @@ class LslOutput(Output):
         self._apart_s: deque[float] = deque(maxlen=LEAST_OF)  # LSL's clock at the arrival, less the frame's time
         self._outlet: Any = None
 
-    def begin(self, blocks: TrackBlocks) -> None:
-        """Open the stream."""
-        units, lsl = numbers_of(blocks.recording.experiment.length_unit), self._lsl
-        irregular, double = lsl.IRREGULAR_RATE, lsl.cf_double64
-        info = lsl.StreamInfo(self._name, "Pose", len(units), irregular, double, f"sphereorient {self._name}")
-        channels = info.desc().append_child("channels")
-        for label, unit in units.items():
-            channels.append_child("channel").append_child_value("label", label).append_child_value("unit", unit)
-        self._outlet = lsl.StreamOutlet(info)
-
     def send(self, numbers: dict[str, float]) -> None:
-        """Push a sample; LSL keeps those of six minutes for each reader."""
+        """Push a sample; LSL keeps 36,000 of them for each reader."""
+        self._outlet = self._outlet or self._opened(list(numbers))
         arrived_s = self._lsl.local_clock() - 1e-3 * numbers["latency_ms"]
         self._apart_s.append(arrived_s - numbers["time_s"])
         self._outlet.push_sample(list(numbers.values()), numbers["time_s"] + min(self._apart_s))
+
+    def _opened(self, names: list[str]) -> Any:
+        lsl, identity = self._lsl, f"sphereorient {self._name}"
+        info = lsl.StreamInfo(self._name, "Pose", len(names), lsl.IRREGULAR_RATE, lsl.cf_double64, identity)
+        channels = info.desc().append_child("channels")
+        for name in names:
+            unit = UNIT.search(name)
+            channel = channels.append_child("channel").append_child_value("label", name)
+            channel.append_child_value("unit", unit[1].replace("_s", "/s") if unit else "")
+        return lsl.StreamOutlet(info)
 
     def close(self) -> None:
         """End the stream."""
@@ -184,22 +189,19 @@ class LslOutput(Output):
 class SerialOutput(Output):
     """A serial port, PORT@BAUD. `tell` gets a line where it fails, after which nothing is sent, and where lines come
     faster than it takes them: then the oldest are lost.
-    Raise OutputError: the package pyserial is missing, not a baud rate, or no such port, or one in use.
+    Raise OutputError: the package pyserial is missing, or no such port, one in use, or not a baud rate.
     """
 
     def __init__(self, address: str, tell: Tell) -> None:
-        port, _, baud = address.rpartition("@")
-        self._name, self._tell, self._told = f"serial:{address}", tell, False
-        if not (port and baud.isdecimal() and int(baud)):
-            do = "name both, such as serial:/dev/ttyUSB0@115200"
-            raise OutputError(refusal(self._name, expected="PORT@BAUD, a port and its baud rate", got=address, do=do))
-        serial = package("serial", "live")
+        self._name, self._tell = f"serial:{address}", tell
+        serial, (port, _, baud) = package("serial", "live"), address.rpartition("@")
         try:
-            self._port = serial.Serial(port, int(baud), exclusive=True)
+            self._port = serial.Serial(port, int(baud) or -1, exclusive=True)  # 0 hangs up
         except (OSError, ValueError, ArithmeticError) as error:  # the last two of a rate that the port does not have
-            do = "connect it, correct its name or rate, or end the program that has it"
-            raise OutputError(refusal(self._name, expected="a free port", got=error_words(error), do=do)) from None
-        self._spool = Spool(lambda lines: self._port.write(_joined(lines)), self._failed)
+            do = "correct it, or end the program that has the port"
+            expected = "PORT@BAUD, a free port and its baud rate"
+            raise OutputError(refusal(self._name, expected=expected, got=error_words(error), do=do)) from None
+        self._spool = Spool(lambda lines: self._port.write(_joined(lines)), self._failed, SOON_LINES)
 
     def _failed(self, error: OSError) -> None:
         do = "connect it and begin again; tracking goes on without it"
@@ -207,17 +209,16 @@ class SerialOutput(Output):
 
     def send(self, line: str) -> None:
         """Take a line."""
+        before = self._spool.lost
         self._spool.send(line)
-        if self._spool.lost and not (self._told or self._spool.gone):
-            self._told = True
-            self._tell(
-                f"{self._name}: lines are lost: they come faster than they are taken; a higher baud rate may do."
-            )
+        if self._spool.lost > before == 0:
+            self._tell(f"{self._name}: lines are lost: they come faster than they are taken; try a higher baud rate.")
 
     def close(self) -> None:
         """Write what waits, within a second, and close the port."""
         if not self._spool.close():
             self._port.cancel_write()
+            self._spool.close()
             with suppress(Exception):  # each system has errors of its own
                 self._port.reset_output_buffer()  # the system would wait for a reader
         self._port.close()
@@ -416,7 +417,7 @@ def open_output(name: str, tell: Tell) -> tuple[Output, str]:
     if (suffix := Path(name).suffix) in FILES:
         to_file, form = FILES[suffix]
         return to_file(Path(name), tell), form
-    others = "serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME"
-    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others, *(f"NAME{suffix}" for suffix in FILES)])
+    others = ["serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME", *(f"NAME{suffix}" for suffix in FILES)]
+    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others])
     do = "choose one of these; another machine is tcp:HOST:PORT"
     raise SettingsError(refusal("--to", expected=expected, got=name, do=do))

@@ -18,12 +18,9 @@ from sphereorient.errors import MovieError, SettingsError, error_words, refusal
 from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
-from sphereorient.files.whole_file import check_ending
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
-from sphereorient.live.outputs import check_new
 from sphereorient.live.shared import shared_frames
-from sphereorient.movies.record import MovieFile, Recorder
-from sphereorient.movies.write import WRITERS, times_path
+from sphereorient.movies.record import Recorder
 
 AGAIN_S = 1.0  # between attempts to open a camera
 
@@ -194,36 +191,14 @@ def source_of(name: str, tell: Tell) -> Source:
     return SOURCES[kind + colon](where, tell)
 
 
-def recorded_paths(path: Path, cameras: Sequence[str]) -> list[Path]:
-    """Return the movies of a recording: NAME.mkv or NAME.h5, of several cameras NAME.CAMERA.mkv.
-    Raise OutputError: another ending, a file that is there, or no folder.
-    """
-    check_ending(path, "--record", WRITERS)
-    several = [path.with_name(f"{path.stem}.{camera}{path.suffix}") for camera in cameras]
-    paths = several if len(cameras) > 1 else [path]
-    for one in paths:
-        check_new(one)
-        if one.suffix.lower() == ".mkv":
-            check_new(times_path(one))
-    return paths
-
-
-def open_recorder(paths: Sequence[Path], recording: Recording, source: Source, tell: Tell) -> Recorder:
-    """Begin a recording of the pictures of each camera; see `Recorder`."""
-    files = [
-        MovieFile(path=path, shape=stream.movie.frame_shape, dtype=stream.movie.dtype)
-        for path, stream in zip(paths, recording.streams, strict=True)
-    ]
-    frame_s = float(np.nan_to_num(recording.timeline.frame_s, nan=0.04))  # of a single frame: for players alone
-    return Recorder(files, frame_s, tell, wait=source.waits)
-
-
-def recorded(source: Source, recorder: Recorder) -> Source:
-    """Return a source whose frames are recorded as they come, those too that are not tracked."""
+def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
+    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none."""
 
     def frames(recording: Recording) -> Iterator[Arrival]:
         for arrival in source.frames(recording):
-            recorder.take(arrival.time_s, arrival.pictures)
+            room = all(one.room() for one in recorders)
+            for one, picture in zip(recorders, arrival.pictures, strict=True):
+                one.take(arrival.time_s, picture, room)
             yield arrival
 
     return replace(source, frames=frames)

@@ -1,207 +1,138 @@
-"""Raw recording beside a loop that must not wait: frames go through shared memory to a process that writes movies."""
+"""Raw recording beside a loop that must not wait: frames go through shared memory to a process that writes a movie."""
 
-import math
 import multiprocessing
 import shutil
 import signal
 import struct
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
-from typing import Any, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
-from sphereorient.files.whole_file import unfinished
-from sphereorient.movies.movie import Grey
-from sphereorient.movies.write import FAULTS, new_movie, write_times
+from sphereorient.errors import SphereOrientError, refusal
+from sphereorient.movies.movie import Grey, Movie
+from sphereorient.movies.write import write_movie
 
 RING_BYTES, MOST_WAIT = 128 << 20, 1000  # of the frames that wait for the disk; the smallest pipe holds so many times
 LEFT_BYTES = 200_000_000  # of the disk for others: a recording ends before it is full
 EVERY = 64  # frames from one look at the disk to the next
-ROOM_S = 0.001  # between looks for room in the memory
+BEGIN_S, ROOM_S, SHORTEST_S = 20.0, 0.001, 1e-6  # for the process to begin; between looks for room; of a frame
 
 
-@dataclass(frozen=True, kw_only=True)
-class MovieFile:
-    """The movie of a camera that is to be recorded."""
+class _Ring(NamedTuple):
+    """Memory of both processes."""
 
-    path: Path  # .mkv or .h5, a new file
-    shape: tuple[int, ...]  # (H, W)
+    memory: Any
+    written: Any  # frames that are written
+    shape: tuple[int, ...]
     dtype: "np.dtype[Any]"
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Plan:
-    """What both processes know."""
-
-    files: Sequence[MovieFile]
-    frame_s: float  # usual time from frame to frame
-    left_bytes: int
-    memory: Sequence[Any]  # of each camera, of a ring of frames
-    written: Any  # number of frames, in memory that both see
-
-    def ring(self) -> list[NDArray[Any]]:
-        """Return the memory as frames (K, H, W) of each camera."""
-        pairs = zip(self.memory, self.files, strict=True)
-        return [np.frombuffer(memory, file.dtype).reshape(-1, *file.shape) for memory, file in pairs]
+    def frames(self) -> NDArray[Any]:
+        """Return the memory as frames (K, H, W)."""
+        return np.frombuffer(self.memory, self.dtype).reshape(-1, *self.shape)
 
 
 class Recorder:
-    """Records what cameras show, a movie of each, with times, in a process of its own. A frame that finds no room in
-    memory is lost, or with `wait` waits. `tell` gets a line where frames begin to be lost, and where the disk takes no
-    more: then nothing more is recorded. A movie gets its name once it is whole, also after a kill of this process.
-    Raise OutputError: the files cannot be written.
+    """Records frames, alike those of a movie, and their times in a process of its own. The new movie, .mkv or .h5, gets
+    its name once it is whole, also after a kill of this process. `tell` gets a line where frames begin to be lost, and
+    where the file takes no more: then nothing more is recorded. `wait`: for room, instead of losing frames.
     """
 
     def __init__(
-        self,
-        files: Sequence[MovieFile],
-        frame_s: float,
-        tell: Callable[[str], object],
-        *,
-        wait: bool = False,
-        left_bytes: int = LEFT_BYTES,
+        self, path: Path, like: Movie, frame_s: float, tell: Callable[[str], object], *, wait: bool = False
     ) -> None:
-        spawn = multiprocessing.get_context("spawn")
-        sizes = [file.shape[0] * file.shape[1] * file.dtype.itemsize for file in files]
-        self._most = max(2, min(RING_BYTES // sum(sizes), MOST_WAIT))  # frames in memory
-        memory = [spawn.RawArray("B", self._most * size) for size in sizes]
-        plan = _Plan(files=files, frame_s=frame_s, left_bytes=left_bytes, memory=memory, written=spawn.RawValue("Q"))
-        self._ring, self._written = plan.ring(), plan.written
-        self._tell, self._wait, self._name = tell, wait, ", ".join(str(file.path) for file in files)
+        spawn, (height, width), dtype = multiprocessing.get_context("spawn"), like.frame_shape, like.dtype
+        size = height * width * dtype.itemsize
+        memory = spawn.RawArray("B", max(2, min(RING_BYTES // size, MOST_WAIT)) * size)
+        ring = _Ring(memory, spawn.RawValue("Q"), (height, width), dtype)
+        self._path, self._tell, self._wait = path, tell, wait
+        self._frames, self._written = ring.frames(), ring.written
         self._sent = self._lost = 0
         self._ended = False
         stamps, self._stamps = spawn.Pipe(duplex=False)
         self._told, tells = spawn.Pipe(duplex=False)
-        self._process = spawn.Process(target=_record, args=(plan, stamps, tells), name="recorder")
+        arguments = path, ring, stamps, tells, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN: of a single frame
+        self._process = spawn.Process(target=_record, args=arguments, name="recorder")
         self._process.start()
         stamps.close()
         tells.close()
-        try:
-            fault = self._told.recv_bytes().decode()  # empty: it is ready
-        except EOFError:
-            fault = self._without_process()
-        if fault:
-            raise OutputError(fault)
+        self._told.poll(BEGIN_S)
         self._thread = Thread(target=self._listen, name="recorder", daemon=True)
         self._thread.start()
-
-    def take(self, time_s: float, pictures: Sequence[Grey | None]) -> None:
-        """Take the pictures of an instant, one of each camera, black for None."""
-        while (full := self._sent - self._written.value >= self._most) and self._wait and not self._ended:
-            time.sleep(ROOM_S)
-        if full or self._ended:
-            if not (self._lost or self._ended):
-                self._tell(f"{self._name}: frames are lost: they come faster than they are written.")
-            self._lost += 1
-            return
-        for ring, picture in zip(self._ring, pictures, strict=True):
-            ring[self._sent % self._most] = 0 if picture is None else picture
-        try:
-            self._stamps.send_bytes(struct.pack("d", time_s))
-            self._sent += 1
-        except OSError:
-            self._lost, self._ended = self._lost + 1, True
 
     def _listen(self) -> None:
         with suppress(EOFError, OSError):
             while True:
-                self._tell(self._told.recv_bytes().decode())
+                if line := self._told.recv_bytes().decode():
+                    self._tell(line)
         self._ended = True
-        if fault := self._without_process():
-            self._tell(fault)
-
-    def _without_process(self) -> str:
-        """Wait for the end of the process, and return the words for one that did not end by itself."""
         self._process.join()
-        got, do = f"its end ({self._process.exitcode})", "begin again; tracking goes on without it"
-        words = refusal(self._name, expected="a process that records", got=got, do=do)
-        return words if self._process.exitcode else ""
+        if code := self._process.exitcode:
+            got, do = f"its end ({code})", "begin again; tracking goes on without it"
+            self._tell(refusal(str(self._path), expected="a process that records", got=got, do=do))
+
+    def room(self) -> bool:
+        """Return whether there is room for a frame, or it is not recorded any more."""
+        while self._sent - self._written.value >= len(self._frames) and not self._ended:
+            if not self._wait:
+                return False
+            time.sleep(ROOM_S)
+        return True
+
+    def take(self, time_s: float, picture: Grey | None, room: bool) -> None:
+        """Take a frame, black for None, where there is room, or count it as lost."""
+        if not room:
+            if not self._lost:
+                self._tell(f"{self._path}: frames are lost: they come faster than they are written.")
+            self._lost += 1
+            return
+        self._frames[self._sent % len(self._frames)] = 0 if picture is None else picture
+        self._sent += 1
+        try:
+            self._stamps.send_bytes(struct.pack("d", time_s))
+        except OSError:
+            self._ended = True
 
     def summary(self) -> str:
         """Return what was recorded, in words."""
         written = int(self._written.value)
-        return f"{self._name}: {written} frames recorded, {self._lost + self._sent - written} lost"
+        return f"{self._path}: {written} frames recorded, {self._lost + self._sent - written} lost"
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *fault: object) -> None:
-        """Write what waits, and give the movies their names."""
+    def close(self) -> None:
+        """Write what waits, and give the movie its name."""
         self._stamps.close()
         self._thread.join()
 
 
-def _record(plan: _Plan, stamps: Connection, tells: Connection) -> None:
-    """Write movies of what comes, and tell, in bytes, that it is ready (none), and what goes wrong (a line)."""
+def _record(path: Path, ring: _Ring, stamps: Connection, tells: Connection, frame_s: float, left_bytes: int) -> None:
+    """Write a movie of the frames whose times come, until their sender ends; tell in lines what goes wrong."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
-    asides = [unfinished(file.path) for file in plan.files]
+    times_s, frames = list[float](), ring.frames()
+
+    def taken() -> Iterator[Grey]:
+        shift_s = 0.0
+        with suppress(EOFError):
+            while True:
+                (time_s,) = struct.unpack("d", stamps.recv_bytes())
+                if times_s and time_s + shift_s <= times_s[-1]:  # times of a movie increase
+                    shift_s = times_s[-1] + frame_s - time_s
+                if len(times_s) % EVERY == 0 and (free := shutil.disk_usage(path.parent).free) < left_bytes:
+                    got, do = f"{free / 1e6:.0f} MB left", "make room; the recording ends here, tracking goes on"
+                    tells.send_bytes(refusal(str(path), expected="a disk with room", got=got, do=do).encode())
+                    stamps.close()
+                    return
+                times_s.append(time_s + shift_s)
+                yield frames[ring.written.value % len(frames)]
+                ring.written.value += 1
+
+    tells.send_bytes(b"")  # it has begun
     try:
-        times_s = _written(plan, asides, stamps, tells)
-        for aside, file in zip(asides, plan.files, strict=True):
-            if not times_s:
-                aside.unlink()
-                continue
-            if file.path.exists():  # hours may have passed
-                do = "name another one"
-                raise OutputError(refusal(str(file.path), expected="a new file", got="one that is there", do=do))
-            aside.replace(file.path)
-            if file.path.suffix.lower() == ".mkv":
-                write_times(file.path, times_s)
-    except (SphereOrientError, *FAULTS) as error:
-        name, do = str(plan.files[0].path), "choose a folder that has room; tracking goes on without it"
-        words = refusal(name, expected="a file that can be written", got=error_words(error), do=do)
-        line = str(error) if isinstance(error, SphereOrientError) else words
-        if plan.written.value:
-            line += f" What was recorded is in {', '.join(str(aside) for aside in asides if aside.exists())}."
-        else:
-            for aside in asides:
-                aside.unlink(missing_ok=True)
-        tells.send_bytes(line.encode())
-
-
-def _written(plan: _Plan, asides: Sequence[Path], stamps: Connection, tells: Connection) -> list[float]:
-    """Write frames until no more come, or the disk is nearly full, and return their times, s."""
-    times_s = list[float]()
-    with ExitStack() as opened:
-        adds = [
-            opened.enter_context(new_movie(aside, file.shape, file.dtype, 1 / plan.frame_s))
-            for aside, file in zip(asides, plan.files, strict=True)
-        ]
-        tells.send_bytes(b"")
-        ring = plan.ring()
-        for time_s in _times(stamps, plan.frame_s):
-            number = len(times_s)
-            free = shutil.disk_usage(asides[0].parent).free if number % EVERY == 0 else plan.left_bytes
-            if free < plan.left_bytes:
-                stamps.close()
-                got, do = f"{free / 1e6:.0f} MB left", "make room; the recording ends here, tracking goes on"
-                name = str(plan.files[0].path)
-                tells.send_bytes(refusal(name, expected="a disk with room", got=got, do=do).encode())
-                break
-            for add, frames in zip(adds, ring, strict=True):
-                add(frames[number % len(frames)], time_s)
-            times_s.append(time_s)
-            plan.written.value = len(times_s)
-    return times_s
-
-
-def _times(stamps: Connection, frame_s: float) -> Iterator[float]:
-    """Yield the times that come until their sender ends; where they stand or go back, they go on by a frame, for good:
-    times of a movie increase.
-    """
-    last_s, shift_s = -math.inf, 0.0
-    with suppress(EOFError):
-        while True:
-            (time_s,) = struct.unpack("d", stamps.recv_bytes())
-            if time_s + shift_s <= last_s:
-                shift_s = last_s + frame_s - time_s
-            last_s = time_s + shift_s
-            yield last_s
+        write_movie(path, taken(), times_s, 1 / frame_s)
+    except SphereOrientError as error:
+        tells.send_bytes(str(error).encode() if times_s else b"")  # without frames no movie is expected
