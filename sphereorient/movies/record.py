@@ -93,11 +93,11 @@ class Recorder:
             self._lost += 1
             return
         self._frames[self._sent % len(self._frames)] = 0 if picture is None else picture
-        self._sent += 1
         try:
             self._stamps.send_bytes(struct.pack("d", time_s))
-        except OSError:
-            self._ended = True
+            self._sent += 1
+        except OSError:  # it has ended, or was closed
+            self._ended, self._lost = True, self._lost + (not self._stamps.closed)
 
     def summary(self) -> str:
         """Return what was recorded, in words."""

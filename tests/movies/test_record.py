@@ -72,6 +72,8 @@ def test_times_that_stand_or_go_back_go_on_by_a_frame(tmp_path):
     with recording(tmp_path / "run.h5") as recorder:
         for time_s in (5.0, 5.1, 5.1, 5.2, 0.0, 0.1):
             take(recorder, time_s)
+    take(recorder, 9.0)  # behind the end: not lost
+    assert recorder.summary().endswith("6 frames recorded, 0 lost")
     assert open_movie(tmp_path / "run.h5").times_s == pytest.approx([5.0, 5.1, 5.2, 5.3, 5.4, 5.5])
 
 
