@@ -97,7 +97,7 @@ def fit_speed(diameter_px: float) -> dict[str, float]:
         R_true = orientations_at(path.parent / "truth.h5", np.arange(FRAMES))
         with open_live(path, Settings(), None, learnt) as opened:
             frames = list(movie_frames(opened.recording, paced=False))
-            views, told_s, found = opened.tracker.appearance.fitter.views, [], []
+            views, told_s, found = opened.tracker.appearances[""].fitter.views, [], []
             for now in measured(opened.tracker, views, frames):
                 told_s.append((time.process_time(), time.perf_counter()))
                 found.append(now.R_lab_body)

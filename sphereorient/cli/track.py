@@ -12,6 +12,7 @@ from typer import Argument, Option
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
+from sphereorient.files.whole_file import check_ending
 
 if TYPE_CHECKING:
     from sphereorient.experiment import Experiment
@@ -179,8 +180,9 @@ class _LiveOptions(CameraOptions):
     ] = "movie"
     to: Annotated[
         list[str] | None,
-        Option(help="Repeatable. FicTrac: tcp:PORT, udp:PORT, .dat; JSON: zmq:PORT, .jsonl; track: .h5"),
+        Option(help="Repeatable: tcp:PORT, udp:, zmq:, osc:PORT, serial:PORT@BAUD, lsl:NAME, .dat, .jsonl, .h5"),
     ] = None
+    record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
 
@@ -197,10 +199,11 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.live.loop import open_live, run_live
     from sphereorient.live.outputs import open_output
     from sphereorient.live.page import LivePage, open_page
-    from sphereorient.live.sources import source_of
+    from sphereorient.live.sources import recorded, source_of
+    from sphereorient.movies.record import Recorder
 
     chosen = given.chosen("precise")
-    source, page = source_of(given.source, _tell), None
+    source, page, movies = source_of(given.source, _tell), None, _movies_of(given)
     with ExitStack() as opened:
         outputs = [open_output(name, _tell) for name in given.to or ()]
         for output, _ in outputs:
@@ -223,7 +226,11 @@ def live(given: _LiveOptions) -> None:
         )
         for output, _ in outputs:
             output.begin(blocks)
-        monitor = run_live(set_up, source, outputs, page, _tell)
+        recorders, frame_s = [], set_up.recording.timeline.frame_s
+        for stream in set_up.recording.streams if movies else ():
+            recorders.append(Recorder(movies[stream.name], stream.movie, frame_s, _tell, wait=source.waits))
+            opened.callback(recorders[-1].close)
+        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell)
         if set_up.save_map is not None:
             _tell("the map is finished; this takes some seconds")
             try:
@@ -231,7 +238,25 @@ def live(given: _LiveOptions) -> None:
             except PaintError as error:
                 _tell(str(error))
     if not given.quiet:
-        echo_lines(monitor.summary())
+        echo_lines([*monitor.summary(), *(one.summary() for one in recorders)])
+
+
+def _movies_of(given: _LiveOptions) -> dict[str, Path]:
+    """Return the movie of each camera to record, of several NAME.CAMERA.mkv; OutputError where one cannot be new."""
+    from sphereorient.experiment import load_experiment
+    from sphereorient.live.outputs import check_new
+    from sphereorient.movies.write import WRITERS, times_path
+
+    if (path := given.record) is None:
+        return {}
+    check_ending(path, "--record", WRITERS)
+    if str(path) in (given.to or ()):
+        raise OutputError(refusal("--record", expected="a file of its own", got="that of --to", do="name another one"))
+    names = given.names or tuple(load_experiment(given.experiment).movie_paths)
+    movies = {name: path.with_name(f"{path.stem}.{name}{path.suffix}") if len(names) > 1 else path for name in names}
+    for new in (*movies.values(), *(times_path(movie) for movie in movies.values() if path.suffix.lower() == ".mkv")):
+        check_new(new)
+    return movies
 
 
 def _tell(line: str) -> None:

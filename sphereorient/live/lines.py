@@ -1,14 +1,16 @@
-"""A measured pose as a line of text: FicTrac's, and JSON."""
+"""A measured pose as a line of text, FicTrac's and JSON, and as numbers by name."""
 
 import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.errors import Flag
 from sphereorient.files.provenance import without_nan
 from sphereorient.live.live import Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
@@ -17,6 +19,7 @@ from sphereorient.trajectory.rotations import rotation_vectors
 from sphereorient.trajectory.walk import arcs, fictrac_rows, turned
 
 Floats = NDArray[np.float64]
+AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
 class FicTracLines:
@@ -71,42 +74,41 @@ def fictrac_line(columns: Floats) -> str:
     return ", ".join(f"{value:.14g}" for value in columns.tolist())
 
 
-class JsonLines:
-    """Frames as JSON, each on a line, null for what is not known; with the angular velocity, and where the ball is not
-    held in its place (`fixed`) its velocity, from this frame and those before it. These begin anew where the ball was
-    searched for, and are not known where the orientation is relative: its errors grow, and are not stated. A `ball` of
-    several is named.
+class Quantities:
+    """What is known of each frame by name, with units; lengths are in mm or radii (`length_unit`). With the angular
+    velocity, and where the ball is not held in its place (`fixed`) its velocity, from this frame and those before it.
+    These begin anew where the ball was searched for, and are not known where the orientation is relative: its errors
+    grow, and are not stated. A `ball` of several is named.
     """
 
-    def __init__(self, fixed: bool, ball: str = "") -> None:
-        self._ball = {"ball": ball} if ball else {}
+    def __init__(self, fixed: bool, length_unit: str = "mm", ball: str = "") -> None:
+        self._unit, self._ball = length_unit, {"ball": ball} if ball else {}
         self._turning, self._moving = ForwardRate(), None if fixed else ForwardRate()
         self._before: Measured | None = None
 
-    def line(self, now: Measured) -> str:
-        """Return the line of the next frame."""
+    def of(self, now: Measured) -> dict[str, Any]:
+        """Return those of the next frame: numbers, or lists of a number for each axis; NaN where they are not known."""
+        unit = self._unit
         sigma = np.sqrt(np.diag(now.covariance + now.lasting))
         omega, velocity = self._rates(now)
-        content = self._ball | {
+        return self._ball | {
             "frame": now.number,
             "time_s": now.time_s,
             "valid": now.valid,
-            "position_lab_mm": now.position_lab_mm.tolist(),
+            "position_lab_mm" if unit == "mm" else f"position_{unit}": now.position_lab_mm.tolist(),
             "quaternion_wxyz": quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
             "omega_rad_s": omega.value.tolist(),
-            "velocity_mm_s": velocity.value.tolist(),
+            f"velocity_{unit}_s": velocity.value.tolist(),
             "sigma_rad": sigma[:3].tolist(),
-            "sigma_mm": sigma[3:].tolist(),
+            f"sigma_{unit}": sigma[3:].tolist(),
             "sigma_omega_rad_s": omega.sigma.tolist(),
-            "sigma_velocity_mm_s": velocity.sigma.tolist(),
+            f"sigma_velocity_{unit}_s": velocity.sigma.tolist(),
             "map": now.map_number,
             "flags": now.flags,
             "found": now.found,
             "dropped": now.dropped,
-            "reason": [str(why) for why in now.reason],
             "latency_ms": 1e3 * now.latency_s,
         }
-        return json.dumps(without_nan(content), allow_nan=False)
 
     def _rates(self, now: Measured) -> tuple[Rate, Rate]:
         before, self._before = self._before, now if _states_errors(now) else None
@@ -137,7 +139,7 @@ class Told:
 
     now: Measured
     table: FicTracLines
-    json_lines: JsonLines
+    known: Quantities
 
     @cached_property
     def columns(self) -> Floats:
@@ -154,7 +156,28 @@ class Told:
         """A line of FicTrac's socket."""
         return f"FT, {self.fictrac}"
 
+    @property
+    def short(self) -> str:
+        """The number of the frame, and the rotation vector of R_lab_body, rad, NaN where there is no pose."""
+        x, y, z = rotation_vectors(self.now.R_lab_body[None])[0].tolist()
+        return f"{self.now.number},{x:.5f},{y:.5f},{z:.5f}"
+
+    @cached_property
+    def quantities(self) -> dict[str, Any]:
+        """What is known, see `Quantities.of`."""
+        return self.known.of(self.now)
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """The same, each number by its own name, with the axis behind."""
+        found: dict[str, float] = {}
+        for name, value in self.quantities.items():
+            parts = zip(AXES[len(value)], value, strict=True) if isinstance(value, list) else [("", value)]
+            found |= {f"{name.removesuffix('_wxyz')}{axis}": part for axis, part in parts}
+        return found
+
     @cached_property
     def json(self) -> str:
-        """A line of JSON."""
-        return self.json_lines.line(self.now)
+        """A line of JSON: null for what is not known, flags and reasons by their names."""
+        words = {"flags": [flag.name for flag in Flag(self.now.flags)], "reason": [str(why) for why in self.now.reason]}
+        return json.dumps(without_nan(self.quantities | words), allow_nan=False)

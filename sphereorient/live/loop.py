@@ -15,7 +15,7 @@ from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import limited_cores, silent
 from sphereorient.files.whole_file import writing
 from sphereorient.live.feed import Feed, Tell
-from sphereorient.live.lines import FicTracLines, JsonLines, Told
+from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
 from sphereorient.live.page import LivePage, Monitor
@@ -94,8 +94,8 @@ def run_live(
     recording, tracker = opened.recording, opened.tracker
     first, *others = tracker.appearances
     views, several = tracker.appearances[first].fitter.views, bool(others)
-    table = FicTracLines(views[0].camera.R_cam_lab.numpy())
-    json_lines = {name: JsonLines(recording.experiment.of(name).fixed, name) for name in tracker.appearances}
+    table, experiment = FicTracLines(views[0].camera.R_cam_lab.numpy()), recording.experiment
+    known = {ball: Quantities(experiment.of(ball).fixed, experiment.length_unit, ball) for ball in tracker.appearances}
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
     sys.setswitchinterval(0.0002)  # longest that a thread that computes holds up the one that reads
@@ -108,7 +108,7 @@ def run_live(
         # In one thread: a second one may wait for a core that another program has.
         with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):
-                told = Told(now, table, json_lines[now.ball])
+                told = Told(now, table, known[now.ball])
                 for output, form in outputs:
                     output.send(getattr(told, form))
                 if now.found:

@@ -1,9 +1,10 @@
-"""Where lines and frames go: TCP, UDP, ZeroMQ, files. A slow or dead reader loses lines; it never holds up who writes.
+"""Where lines and frames go: sockets, serial ports, LSL, files. A slow or dead reader loses lines; it holds nobody up.
 
-A new output is a class, and a line of `SOCKETS` or `FILES`.
+A new output is a class, and a line of `SOCKETS`, `NAMED` or `FILES`.
 """
 
 import os
+import re
 import socket
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -21,8 +22,11 @@ from sphereorient.live.live import TrackBlocks
 from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
+SOON_LINES = 200  # likewise, of a serial port: soon it is told that it is too slow, and lines are never much late
 SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
 BLOCK_S = 0.5  # from one write of a track's rows to the next
+LEAST_OF = 256  # frames, of which the least delayed one sets LSL's clock
+UNIT = re.compile(r"_((?:rad|mm|radii)_s|rad|mm|radii|ms|s)(?:_[wxyz])?$")  # in the name of a number
 
 
 class Output:
@@ -62,16 +66,19 @@ class Spool:
     def send(self, thing: object) -> None:
         """Take a thing, and return at once."""
         with self._changed:
-            self.lost += len(self._waiting) == self._waiting.maxlen
+            self.lost += len(self._waiting) == self._waiting.maxlen and not self.gone
             self._waiting.append(thing)
             self._changed.notify()
 
-    def close(self, limit_s: float = SOON_S) -> None:
-        """Write what waits, within a limit, and end."""
+    def close(self, limit_s: float = SOON_S) -> bool:
+        """Write what waits, within a limit, drop the rest, and return whether nothing is being written any more."""
         with self._changed:
             self._ends = True
             self._changed.notify()
         self._thread.join(limit_s)
+        with self._changed:
+            self._waiting.clear()
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
@@ -109,14 +116,112 @@ class UdpOutput(Output):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
-    def send(self, line: str) -> None:
+    def send(self, thing: Any) -> None:
         """Send a line; nobody may be there."""
         with suppress(OSError):
-            self._socket.sendto(f"{line}\n".encode(), self._to)
+            self._socket.sendto(self._bytes(thing), self._to)
+
+    def _bytes(self, thing: Any) -> bytes:
+        return f"{thing}\n".encode()
 
     def close(self) -> None:
         """End."""
         self._socket.close()
+
+
+class OscOutput(UdpOutput):
+    """OSC over UDP: a message /sphereorient a frame, of all numbers (`Told.numbers`) as int32 or float32, in order.
+    Raise OutputError: the package python-osc is missing, or no such host.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._message = package("pythonosc.osc_message_builder", "live").OscMessageBuilder
+        super().__init__(host, port)
+
+    def _bytes(self, thing: dict[str, float]) -> bytes:
+        message = self._message("/sphereorient")
+        for value in thing.values():
+            message.add_arg(value, "f" if isinstance(value, float) else "i")
+        return bytes(message.build().dgram)
+
+
+class LslOutput(Output):
+    """A stream of LSL: a sample of float64 a frame, of all numbers (`Told.numbers`), with their names and units; the
+    least delayed of the last frames sets LSL's clock. It is announced on this machine alone, unless the variable
+    LSLAPICFG names a configuration of LSL.
+    Raise OutputError: the package pylsl, or its library liblsl, is missing.
+    """
+
+    def __init__(self, name: str, tell: Tell) -> None:
+        self._name = name
+        try:
+            self._lsl = package("pylsl", "live")
+        except RuntimeError as error:
+            do = "install liblsl, or name its file in the variable PYLSL_LIB"
+            raise OutputError(refusal(f"lsl:{name}", expected="liblsl", got=error_words(error), do=do)) from None
+        if "LSLAPICFG" not in os.environ:
+            self._lsl.set_config_content("[multicast]\nResolveScope = machine\n[log]\nlevel = -2\n")
+        self._apart_s: deque[float] = deque(maxlen=LEAST_OF)  # LSL's clock at the arrival, less the frame's time
+        self._outlet: Any = None
+
+    def send(self, numbers: dict[str, float]) -> None:
+        """Push a sample; LSL keeps 36,000 of them for each reader."""
+        self._outlet = self._outlet or self._opened(list(numbers))
+        arrived_s = self._lsl.local_clock() - 1e-3 * numbers["latency_ms"]
+        self._apart_s.append(arrived_s - numbers["time_s"])
+        self._outlet.push_sample(list(numbers.values()), numbers["time_s"] + min(self._apart_s))
+
+    def _opened(self, names: list[str]) -> Any:
+        lsl, identity = self._lsl, f"sphereorient {self._name}"
+        info = lsl.StreamInfo(self._name, "Pose", len(names), lsl.IRREGULAR_RATE, lsl.cf_double64, identity)
+        channels = info.desc().append_child("channels")
+        for name in names:
+            unit = UNIT.search(name)
+            channel = channels.append_child("channel").append_child_value("label", name)
+            channel.append_child_value("unit", unit[1].replace("_s", "/s") if unit else "")
+        return lsl.StreamOutlet(info)
+
+    def close(self) -> None:
+        """End the stream."""
+        self._outlet = None
+
+
+class SerialOutput(Output):
+    """A serial port, PORT@BAUD. `tell` gets a line where it fails, after which nothing is sent, and where lines come
+    faster than it takes them: then the oldest are lost.
+    Raise OutputError: the package pyserial is missing, or no such port, one in use, or not a baud rate.
+    """
+
+    def __init__(self, address: str, tell: Tell) -> None:
+        self._name, self._tell = f"serial:{address}", tell
+        serial, (port, _, baud) = package("serial", "live"), address.rpartition("@")
+        try:
+            self._port = serial.Serial(port, int(baud) or -1, exclusive=True)  # 0 hangs up
+        except (OSError, ValueError, ArithmeticError) as error:  # the last two of a rate that the port does not have
+            do = "correct it, or end the program that has the port"
+            expected = "PORT@BAUD, a free port and its baud rate"
+            raise OutputError(refusal(self._name, expected=expected, got=error_words(error), do=do)) from None
+        self._spool = Spool(lambda lines: self._port.write(_joined(lines)), self._failed, SOON_LINES)
+
+    def _failed(self, error: OSError) -> None:
+        do = "connect it and begin again; tracking goes on without it"
+        self._tell(refusal(self._name, expected="a port that takes lines", got=error_words(error), do=do))
+
+    def send(self, line: str) -> None:
+        """Take a line."""
+        before = self._spool.lost
+        self._spool.send(line)
+        if self._spool.lost > before == 0:
+            self._tell(f"{self._name}: lines are lost: they come faster than they are taken; try a higher baud rate.")
+
+    def close(self) -> None:
+        """Write what waits, within a second, and close the port."""
+        if not self._spool.close():
+            self._port.cancel_write()
+            self._spool.close()
+            with suppress(Exception):  # each system has errors of its own
+                self._port.reset_output_buffer()  # the system would wait for a reader
+        self._port.close()
 
 
 class ZmqOutput(Output):
@@ -285,6 +390,12 @@ SOCKETS: Mapping[str, tuple[Callable[[str, int], Output], str]] = {
     "tcp": (TcpOutput, "marked"),
     "udp": (UdpOutput, "marked"),
     "zmq": (ZmqOutput, "json"),
+    "osc": (OscOutput, "numbers"),
+}
+NAMED: Mapping[str, tuple[Callable[[str, Tell], Output], str]] = {
+    "serial": (SerialOutput, "marked"),
+    "serial-short": (SerialOutput, "short"),
+    "lsl": (LslOutput, "numbers"),
 }
 FILES: Mapping[str, tuple[Callable[[Path, Tell], Output], str]] = {
     ".dat": (FileOutput, "fictrac"),
@@ -297,12 +408,16 @@ def open_output(name: str, tell: Tell) -> tuple[Output, str]:
     """Open an output by its name, and return what it takes of a frame too; raise SettingsError for an unknown one."""
     kind, _, address = name.partition(":")
     host, between, port = address.rpartition(":")
-    if kind in SOCKETS and port.isdigit() and int(port) < 1 << 16:
+    if kind in SOCKETS and port.isdecimal() and int(port) < 1 << 16:
         to_socket, form = SOCKETS[kind]
         return to_socket(host if between else HOST, int(port)), form
+    if kind in NAMED and address:
+        to_name, form = NAMED[kind]
+        return to_name(address, tell), form
     if (suffix := Path(name).suffix) in FILES:
         to_file, form = FILES[suffix]
         return to_file(Path(name), tell), form
-    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *(f"NAME{suffix}" for suffix in FILES)])
+    others = ["serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME", *(f"NAME{suffix}" for suffix in FILES)]
+    expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others])
     do = "choose one of these; another machine is tcp:HOST:PORT"
     raise SettingsError(refusal("--to", expected=expected, got=name, do=do))

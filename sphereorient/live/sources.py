@@ -6,7 +6,7 @@ A new source is a function here or in a file of its own, and a line of `SOURCES`
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -20,6 +20,7 @@ from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
 from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
 from sphereorient.live.shared import shared_frames
+from sphereorient.movies.record import Recorder
 
 AGAIN_S = 1.0  # between attempts to open a camera
 
@@ -188,3 +189,16 @@ def source_of(name: str, tell: Tell) -> Source:
         expected = "movie, movie-fast, -, camera:NUMBER, genicam:PRODUCER.cti or shared:FILE"
         raise SettingsError(refusal("--source", expected=expected, got=name, do="choose one of these"))
     return SOURCES[kind + colon](where, tell)
+
+
+def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
+    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none."""
+
+    def frames(recording: Recording) -> Iterator[Arrival]:
+        for arrival in source.frames(recording):
+            room = all(one.room() for one in recorders)
+            for one, picture in zip(recorders, arrival.pictures, strict=True):
+                one.take(arrival.time_s, picture, room)
+            yield arrival
+
+    return replace(source, frames=frames)

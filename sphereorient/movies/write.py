@@ -1,4 +1,4 @@
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -12,6 +12,7 @@ from sphereorient.files.hdf5 import GuardedFile
 from sphereorient.files.whole_file import put_aside, write_text
 from sphereorient.movies.movie import Grey, refused
 
+Times = NDArray[np.float64] | Sequence[float]
 WRITERS = (".mkv", ".h5", ".hdf5")
 PIXEL_FORMATS = {np.dtype(np.uint8): "gray", np.dtype(np.uint16): "gray16le"}
 # Every frame a key frame, with check sums: any frame can be read alone, and damage stays in its frame.
@@ -23,11 +24,11 @@ SLICES, SLICED_PX = "24", 96  # and the least side of a picture that is cut into
 def write_movie(
     path: Path | str,
     frames: Iterable[Grey | None],
-    times_s: NDArray[np.float64] | None = None,
+    times_s: Times | None = None,
     frame_rate_hz: float = 25.0,
 ) -> int:
     """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5); return their number.
-    A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, go into the HDF5 file, or
+    A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, are written last, into HDF5, or
     beside the .mkv into `MOVIE.times.csv`, for `times:` of experiment.yaml; players alone use `frame_rate_hz` of .mkv.
     Raises MovieError: another suffix, no frame, or frames of different size or type; OutputError: the file cannot be
     written; an old file is kept.
@@ -71,7 +72,7 @@ def write_ffv1(path: Path | str, frames: Iterable[Grey | None], frame_rate_hz: f
     return number + 1
 
 
-def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None) -> int:
+def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: Times | None) -> int:
     """Write frames as the data set `frames` (N, H, W), one chunk each, and times as `time` (N,)."""
     count, first, checked = _checked(path, frames)
     with GuardedFile(aside) as guarded:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,10 @@ from overlay_examples import true_track
 
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera
-from sphereorient.live.lines import FicTracLines, JsonLines, fictrac_line
+from sphereorient.live.lines import FicTracLines, Quantities, Told, fictrac_line
 from sphereorient.live.live import Measured
 from sphereorient.report.export import fictrac_table
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Flag, Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -47,17 +48,52 @@ def test_lines_are_the_rows_of_the_exported_table(track):
 
 
 def test_json_has_null_for_what_is_not_known(track):
-    lines = JsonLines(fixed=True)
-    known, lost = [json.loads(lines.line(now)) for now in rows(track)][6:8]
+    known, lost = told(rows(track), fixed=True)[6:8]
     assert known["valid"]
     assert known["sigma_rad"] == pytest.approx([1e-3] * 3)
     assert math.hypot(*known["quaternion_wxyz"]) == pytest.approx(1)
     assert (lost["valid"], lost["quaternion_wxyz"], lost["reason"]) == (False, [None] * 4, ["not_found"])
 
 
-def told(frames: list[Measured], fixed: bool) -> list[dict]:
-    lines = JsonLines(fixed)
-    return [json.loads(lines.line(now)) for now in frames]
+def forms(frames: Iterable[Measured], known: Quantities) -> list[Told]:
+    table = FicTracLines(np.eye(3))
+    return [Told(now, table, known) for now in frames]
+
+
+def told(frames: Iterable[Measured], fixed: bool, unit: str = "mm") -> list[dict]:
+    return [json.loads(one.json) for one in forms(frames, Quantities(fixed, unit))]
+
+
+def test_json_names_flags(track):
+    frames = [replace(now, flags=int(Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT)) for now in rows(track)][:1]
+    assert told(frames, fixed=True)[0]["flags"] == ["ONE_CAMERA", "DOUBTFUL_FIT"]
+    assert told(rows(track), fixed=True)[0]["flags"] == []
+
+
+def test_the_keys_of_lengths_name_their_unit(track):
+    in_mm, in_radii = (told(rows(track), fixed=False, unit=unit)[6] for unit in ("mm", "radii"))
+    lengths = {"position_lab_mm": "position_radii"} | {
+        key: key.replace("mm", "radii") for key in ("sigma_mm", "velocity_mm_s", "sigma_velocity_mm_s")
+    }
+    assert {lengths.get(key, key): value for key, value in in_mm.items()} == in_radii
+    assert not [key for key in in_radii if "mm" in key]
+
+
+def test_numbers_are_those_of_the_json_each_with_a_name(track):
+    one = forms(rows(track), Quantities(fixed=False, length_unit="radii"))[6]
+    shown = json.loads(one.json)
+    assert [one.numbers[f"position_radii_{axis}"] for axis in "xyz"] == shown["position_radii"]
+    assert [one.numbers[f"quaternion_{axis}"] for axis in "wxyz"] == shown["quaternion_wxyz"]
+    assert math.isnan(one.numbers["omega_rad_s_x"])
+    lists = [name for name, value in shown.items() if isinstance(value, list) and name not in ("flags", "reason")]
+    assert len(one.numbers) == len(shown) - len(lists) - 1 + sum(len(shown[name]) for name in lists)
+
+
+def test_the_short_line_is_the_frame_and_the_rotation_vector_of_the_ball(track):
+    known, lost = (one.short.split(",") for one in forms(rows(track), Quantities(fixed=True))[6:8])
+    R = so3.exp(torch.tensor([float(part) for part in known[1:]], dtype=torch.float64))
+    np.testing.assert_allclose(R, track.orientation[6], atol=2e-5)
+    assert (known[0], lost) == ("6", ["7", "nan", "nan", "nan"])
 
 
 def test_json_has_the_rates_of_the_motion_so_far():

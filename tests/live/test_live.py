@@ -20,6 +20,8 @@ from typer.testing import CliRunner
 
 from sphereorient import so3
 from sphereorient.cli import app
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.ball import BallTracker
 from sphereorient.live.live import measured
 from sphereorient.live.loop import open_live
@@ -115,12 +117,40 @@ def test_the_command_writes_and_sends_each_frame(tmp_path):
     assert len((tmp_path / "a.jsonl").read_text().splitlines()) == 40
 
 
+def test_what_is_recorded_beside_is_an_experiment_again(tmp_path):
+    command = [
+        "live",
+        str(EXCERPT / "experiment.yaml"),
+        "--source",
+        "movie-fast",
+        "--record",
+        str(tmp_path / "run.mkv"),
+    ]
+    run = CliRunner().invoke(app, command)
+    assert run.exit_code == 0, run.output
+    assert "40 frames recorded, 0 lost" in run.output
+    given = load_experiment(EXCERPT / "experiment.yaml")
+    movies = {name: tmp_path / f"run.{name}.mkv" for name in given.movie_paths}
+    times = str(tmp_path / "run.cam1.times.csv")
+    again = replace(given, movie_paths=movies, times=times, frame_rate_hz=math.nan, frames=None, start={})
+    with open_recording(given) as before, open_recording(again) as after:
+        assert np.array_equal(after.timeline.time_s, before.timeline.time_s)
+        for one, other in zip(before.streams, after.streams, strict=True):
+            for (shown, _), (expected, _) in zip(other.pictures(), one.pictures(), strict=True):
+                assert np.array_equal(shown, expected)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--to", "tcp:99999999"], "expected tcp:PORT"),
         (["--to", "poses.csv"], "expected tcp:PORT"),
         (["--to", "zmq:x"], "zmq:PORT"),
+        (["--to", "osc:²"], "osc:PORT"),
+        (["--to", "lsl:"], "lsl:NAME"),
+        (["--record", "movie.avi"], "expected .mkv"),
+        (["--record", "no such folder/movie.mkv"], "expected a new file"),
+        (["--record", "new.h5", "--to", "new.h5"], "expected a file of its own"),
         (["--source", "genicam:"], "expected movie"),
         (["--source", "webcam"], "expected movie"),
         (["--source", "camera:"], "expected movie"),

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import math
+import os
 import socket
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
+from types import SimpleNamespace
 
 import pytest
 from live_examples import LIMIT_S, until
 
 from sphereorient.errors import OutputError
-from sphereorient.live.outputs import MOST_LINES, FileOutput, Spool, TcpOutput, UdpOutput, ZmqOutput
+from sphereorient.live.outputs import (
+    MOST_LINES,
+    SOON_LINES,
+    FileOutput,
+    LslOutput,
+    OscOutput,
+    SerialOutput,
+    Spool,
+    TcpOutput,
+    UdpOutput,
+    ZmqOutput,
+    open_output,
+)
+
+LINES = 10_000
 
 
 def test_a_tcp_reader_gets_lines_and_one_that_went_away_holds_nothing_up():
@@ -180,3 +197,203 @@ def test_without_zeromq_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "zmq", None)
     with pytest.raises(OutputError, match=r"pip install 'sphereorient\[live\]'"):
         ZmqOutput("127.0.0.1", 5555)
+
+
+# --- serial ports ---
+
+
+@pytest.fixture
+def line():
+    """A pseudo terminal: the end that a program reads, and the name of the other one."""
+    pty = pytest.importorskip("pty", reason="of POSIX")
+    tty = pytest.importorskip("tty", reason="of POSIX")
+    pytest.importorskip("serial", reason="the extra `live`")
+    reader, port = pty.openpty()
+    tty.setraw(port)
+    yield reader, os.ttyname(port)
+    for end in (reader, port):
+        with suppress(OSError):
+            os.close(end)
+
+
+def test_a_serial_reader_gets_all_lines_in_order(line):
+    reader, port = line
+    output, got = SerialOutput(f"{port}@115200", pytest.fail), bytearray()
+
+    def read() -> None:
+        while got.count(b"\n") < LINES:
+            got.extend(os.read(reader, 10_000))
+
+    thread = Thread(target=read, daemon=True)
+    thread.start()
+    for k in range(LINES):
+        until(lambda at=k: got.count(b"\n") > at - SOON_LINES // 2) if k % 50 == 0 else None
+        output.send(f"FT, {k}, {'x' * 300}")
+    thread.join(LIMIT_S)
+    output.close()
+    assert got.decode().splitlines() == [f"FT, {k}, {'x' * 300}" for k in range(LINES)]
+
+
+def test_a_serial_reader_that_does_not_read_holds_nothing_up_and_is_told(line):
+    _, port = line
+    told: list[str] = []
+    output = SerialOutput(f"{port}@115200", told.append)
+    for k in range(LINES):
+        output.send(f"{k}, {'x' * 300}")
+    output.close()
+    (only,) = told
+    assert "lines are lost" in only
+    SerialOutput(f"{port}@115200", pytest.fail).close()  # the port is free again
+
+
+def test_a_serial_port_that_vanishes_is_told_once(line):
+    reader, port = line
+    told: list[str] = []
+    output = SerialOutput(f"{port}@115200", told.append)
+    os.close(reader)
+    output.send("1")
+    until(lambda: told)
+    for k in range(2 * SOON_LINES):
+        output.send(str(k))
+    output.close()
+    (only,) = told
+    assert "expected a port that takes lines" in only
+
+
+@pytest.mark.parametrize("rate", ["", "@", "@fast", "@0", "@-9600", "@²", "@99999999999999999999"])
+def test_what_is_no_baud_rate_is_told(line, rate):
+    with pytest.raises(OutputError, match="a free port and its baud rate") as told:
+        SerialOutput(f"{line[1]}{rate}", pytest.fail)
+    assert "\n" not in str(told.value)
+
+
+def test_a_serial_port_in_use_or_missing_and_a_file_are_told(line, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    output = SerialOutput(f"{line[1]}@9600", pytest.fail)
+    for port in (line[1], tmp_path / "none", tmp_path / "file"):
+        with pytest.raises(OutputError, match="a free port and its baud rate"):
+            SerialOutput(f"{port}@9600", pytest.fail)
+    output.close()
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+# --- OSC and LSL: all numbers of a frame ---
+
+
+UNITS = {"time_s": "s", "valid": "", "position_radii_x": "radii", "quaternion_w": "", "velocity_radii_s_z": "radii/s"}
+UNITS |= {"position_lab_mm_y": "mm", "sigma_omega_rad_s_x": "rad/s", "sigma_rad_x": "rad", "latency_ms": "ms"}
+
+
+def numbers(k: int) -> dict[str, float]:
+    unknown = dict.fromkeys(UNITS, math.nan)
+    return {"frame": k} | unknown | {"time_s": 7000 + 1e-3 * k, "valid": k % 2 == 0, "latency_ms": 2.0}
+
+
+def test_an_osc_reader_gets_a_message_a_frame_in_order():
+    dispatcher = pytest.importorskip("pythonosc.dispatcher", reason="the extra `live`")
+    server = pytest.importorskip("pythonosc.osc_server", reason="the extra `live`")
+    got: list[tuple[float, ...]] = []
+    told = dispatcher.Dispatcher()
+    told.map("/sphereorient", lambda address, *values: got.append(values))
+    with server.BlockingOSCUDPServer(("127.0.0.1", 0), told) as reader:
+        Thread(target=reader.serve_forever, args=(0.01,), daemon=True).start()
+        output = OscOutput("127.0.0.1", reader.server_address[1])
+        for k in range(LINES):
+            until(lambda at=k: len(got) >= at) if k % 50 == 0 else None  # UDP loses what does not fit its memory
+            output.send(numbers(k))
+        until(lambda: len(got) == LINES)
+        reader.shutdown()
+        output.close()
+    assert [values[0] for values in got] == list(range(LINES))
+    assert got[1] == pytest.approx([float(value) for value in numbers(1).values()], nan_ok=True, abs=1e-3)
+
+
+def test_an_osc_reader_that_is_not_there_holds_nothing_up():
+    pytest.importorskip("pythonosc", reason="the extra `live`")
+    output = OscOutput("127.0.0.1", 9)
+    for k in range(LINES):
+        output.send(numbers(k))
+    output.close()
+
+
+@pytest.fixture
+def stream():
+    pytest.importorskip("pylsl", reason="the extra `live`")
+    output = LslOutput(f"ball {os.getpid()}", pytest.fail)
+    output.send(numbers(-1))  # whoever listens knows it from the first frame on
+    yield output
+    output.close()
+
+
+def inlet():
+    import pylsl
+
+    (info,) = pylsl.resolve_byprop("name", f"ball {os.getpid()}", timeout=LIMIT_S)
+    reader = pylsl.StreamInlet(info)
+    reader.open_stream(LIMIT_S)
+    return reader
+
+
+def test_an_lsl_reader_gets_all_samples_in_order_with_names_units_and_lsl_times(stream):
+    import pylsl
+
+    reader, frames, stamps = inlet(), [], []
+    channel, labels = reader.info().desc().child("channels").child("channel"), {}
+    while not channel.empty():
+        labels[channel.child_value("label")] = channel.child_value("unit")
+        channel = channel.next_sibling("channel")
+    assert labels == {"frame": ""} | UNITS
+    begun_s = pylsl.local_clock()
+    for k in range(LINES):
+        stream.send(numbers(k))
+
+    def pulled() -> bool:
+        samples, times = reader.pull_chunk(timeout=0.1)
+        frames.extend(sample[0] for sample in samples)
+        stamps.extend(times)
+        return len(frames) >= LINES
+
+    until(pulled)
+    assert frames == list(range(LINES))
+    assert begun_s - 0.1 < stamps[0] < begun_s + LIMIT_S  # by LSL's clock, whatever that of the source
+    reader.close_stream()
+
+
+def test_an_lsl_reader_that_does_not_read_holds_nothing_up(stream):
+    reader = inlet()
+    for k in range(5 * LINES):
+        stream.send(numbers(k))
+    assert reader.samples_available() < 5 * LINES
+    reader.close_stream()
+
+
+def test_lsl_times_are_those_of_the_source_less_the_least_delay(monkeypatch):
+    pytest.importorskip("pylsl", reason="the extra `live`")
+    pushed: list[float] = []
+    clock = SimpleNamespace(now_s=100.0)
+    stream = LslOutput("ball", pytest.fail)
+    monkeypatch.setattr("pylsl.local_clock", lambda: clock.now_s)
+    monkeypatch.setattr("pylsl.StreamOutlet.push_sample", lambda self, values, time_s: pushed.append(time_s))
+    for k, late_s in enumerate((0.004, 0.0, 0.03, 0.001)):  # on the way from the exposure
+        clock.now_s = 100.0 + 1e-3 * k + late_s + 0.002
+        stream.send(numbers(k))
+    assert pushed == pytest.approx([100.004, 100.001, 100.002, 100.003])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("serial", "serial:/dev/x@9600"), ("pylsl", "lsl:x"), ("pythonosc", "osc:9")]
+)
+def test_without_its_package_an_output_names_the_extra(kind, name, monkeypatch):
+    for module in [kind, *(one for one in sys.modules if one.startswith(f"{kind}."))]:
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(OutputError, match=r"pip install 'sphereorient\[live\]'"):
+        open_output(name, pytest.fail)
+
+
+def test_without_liblsl_it_is_told_in_a_line(monkeypatch):
+    def absent(name: str, extra: str) -> None:
+        raise RuntimeError("LSL binary library file was not found.\nPlease make sure ...")
+
+    monkeypatch.setattr("sphereorient.live.outputs.package", absent)
+    with pytest.raises(OutputError, match=r"expected liblsl, got .*not found.'; install liblsl"):
+        LslOutput("ball", pytest.fail)

@@ -1,0 +1,138 @@
+"""Raw recording beside a loop that must not wait: frames go through shared memory to a process that writes a movie."""
+
+import multiprocessing
+import shutil
+import signal
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.errors import SphereOrientError, refusal
+from sphereorient.movies.movie import Grey, Movie
+from sphereorient.movies.write import write_movie
+
+RING_BYTES, MOST_WAIT = 128 << 20, 1000  # of the frames that wait for the disk; the smallest pipe holds so many times
+LEFT_BYTES = 200_000_000  # of the disk for others: a recording ends before it is full
+EVERY = 64  # frames from one look at the disk to the next
+BEGIN_S, ROOM_S, SHORTEST_S = 20.0, 0.001, 1e-6  # for the process to begin; between looks for room; of a frame
+
+
+class _Ring(NamedTuple):
+    """Memory of both processes."""
+
+    memory: Any
+    written: Any  # frames that are written
+    shape: tuple[int, ...]
+    dtype: "np.dtype[Any]"
+
+    def frames(self) -> NDArray[Any]:
+        """Return the memory as frames (K, H, W)."""
+        return np.frombuffer(self.memory, self.dtype).reshape(-1, *self.shape)
+
+
+class Recorder:
+    """Records frames, alike those of a movie, and their times in a process of its own. The new movie, .mkv or .h5, gets
+    its name once it is whole, also after a kill of this process. `tell` gets a line where frames begin to be lost, and
+    where the file takes no more: then nothing more is recorded. `wait`: for room, instead of losing frames.
+    """
+
+    def __init__(
+        self, path: Path, like: Movie, frame_s: float, tell: Callable[[str], object], *, wait: bool = False
+    ) -> None:
+        spawn, (height, width), dtype = multiprocessing.get_context("spawn"), like.frame_shape, like.dtype
+        size = height * width * dtype.itemsize
+        memory = spawn.RawArray("B", max(2, min(RING_BYTES // size, MOST_WAIT)) * size)
+        ring = _Ring(memory, spawn.RawValue("Q"), (height, width), dtype)
+        self._path, self._tell, self._wait = path, tell, wait
+        self._frames, self._written = ring.frames(), ring.written
+        self._sent = self._lost = 0
+        self._ended = False
+        stamps, self._stamps = spawn.Pipe(duplex=False)
+        self._told, tells = spawn.Pipe(duplex=False)
+        arguments = path, ring, stamps, tells, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN: of a single frame
+        self._process = spawn.Process(target=_record, args=arguments, name="recorder")
+        self._process.start()
+        stamps.close()
+        tells.close()
+        self._told.poll(BEGIN_S)
+        self._thread = Thread(target=self._listen, name="recorder", daemon=True)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                if line := self._told.recv_bytes().decode():
+                    self._tell(line)
+        self._ended = True
+        self._process.join()
+        if code := self._process.exitcode:
+            got, do = f"its end ({code})", "begin again; tracking goes on without it"
+            self._tell(refusal(str(self._path), expected="a process that records", got=got, do=do))
+
+    def room(self) -> bool:
+        """Return whether there is room for a frame, or it is not recorded any more."""
+        while self._sent - self._written.value >= len(self._frames) and not self._ended:
+            if not self._wait:
+                return False
+            time.sleep(ROOM_S)
+        return True
+
+    def take(self, time_s: float, picture: Grey | None, room: bool) -> None:
+        """Take a frame, black for None, where there is room, or count it as lost."""
+        if not room:
+            if not self._lost:
+                self._tell(f"{self._path}: frames are lost: they come faster than they are written.")
+            self._lost += 1
+            return
+        self._frames[self._sent % len(self._frames)] = 0 if picture is None else picture
+        try:
+            self._stamps.send_bytes(struct.pack("d", time_s))
+            self._sent += 1
+        except OSError:  # it has ended, or was closed
+            self._ended, self._lost = True, self._lost + (not self._stamps.closed)
+
+    def summary(self) -> str:
+        """Return what was recorded, in words."""
+        written = int(self._written.value)
+        return f"{self._path}: {written} frames recorded, {self._lost + self._sent - written} lost"
+
+    def close(self) -> None:
+        """Write what waits, and give the movie its name."""
+        self._stamps.close()
+        self._thread.join()
+
+
+def _record(path: Path, ring: _Ring, stamps: Connection, tells: Connection, frame_s: float, left_bytes: int) -> None:
+    """Write a movie of the frames whose times come, until their sender ends; tell in lines what goes wrong."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
+    times_s, frames = list[float](), ring.frames()
+
+    def taken() -> Iterator[Grey]:
+        shift_s = 0.0
+        with suppress(EOFError):
+            while True:
+                (time_s,) = struct.unpack("d", stamps.recv_bytes())
+                if times_s and time_s + shift_s <= times_s[-1]:  # times of a movie increase
+                    shift_s = times_s[-1] + frame_s - time_s
+                if len(times_s) % EVERY == 0 and (free := shutil.disk_usage(path.parent).free) < left_bytes:
+                    got, do = f"{free / 1e6:.0f} MB left", "make room; the recording ends here, tracking goes on"
+                    tells.send_bytes(refusal(str(path), expected="a disk with room", got=got, do=do).encode())
+                    stamps.close()
+                    return
+                times_s.append(time_s + shift_s)
+                yield frames[ring.written.value % len(frames)]
+                ring.written.value += 1
+
+    tells.send_bytes(b"")  # it has begun
+    try:
+        write_movie(path, taken(), times_s, 1 / frame_s)
+    except SphereOrientError as error:
+        tells.send_bytes(str(error).encode() if times_s else b"")  # without frames no movie is expected
