@@ -9,14 +9,23 @@ from typing import Any
 
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.experiment.recording import TextureMap
 from sphereorient.files.threads import limit_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.locate import Frame
 from sphereorient.mapping.adjustment import adjusted
 from sphereorient.mapping.disks import Crop, Crops
-from sphereorient.mapping.first_pass import ADJUSTED_ERROR, TURNED_RAD, CoarserPictures, FirstPass, KeptFrames
+from sphereorient.mapping.first_pass import (
+    ADJUSTED_ERROR,
+    OUTLINE_ERROR,
+    TURNED_RAD,
+    CoarserPictures,
+    FirstPass,
+    KeptFrames,
+)
 from sphereorient.pose.camera_view import FIRST_BLUR_PX
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.lasting import Lasting
@@ -40,17 +49,31 @@ class LearningTracker:
         self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
         self._aside.submit(_ready)
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
-        self.appearances: Mapping[str, Appearance] = {"": _unknown(place, self._pass)}
+        self._known = _unknown(place, self._pass)
+        self.appearances: Mapping[str, Appearance] = {"": self._known}
+        self._lasting, self._error = self._known.lasting, OUTLINE_ERROR  # of the place, radii in pictures
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
         self._adjusting: tuple[KeptFrames, Future[tuple[Array, ...]]] | None = None
+        self._adjusted_by_rad = 0.0  # turn within the frames that are adjusted
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
         """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
         frames = self._coarse.frames(shots)
         poses, searched = self._pass.next(time_s, frames)
         self._now = (frames, poses) if supported(poses) else None
+        if self._now is not None:
+            self.appearances = {"": replace(self._known, lasting=self._lasting.with_place(self._turned(poses)))}
         return {"": (poses, searched)}
+
+    def _turned(self, poses: Poses) -> Tensor:
+        """Return the covariance (6, 6) of an orientation since the first frame, at a place that is not quite right:
+        all turns are too long or too short by the same share.
+        """
+        covariance = torch.zeros(6, 6, dtype=torch.float64)
+        away = float(so3.log(poses.R_lab_body[0]).norm())
+        covariance[:3, :3] = (self._error * away) ** 2 * torch.eye(3, dtype=torch.float64)
+        return covariance
 
     def between(self) -> None:
         """Keep the frame, and go over to what was adjusted meanwhile."""
@@ -63,8 +86,11 @@ class LearningTracker:
             correction, since = self._kept.corrected(self._adjusting[0], R_lab_body)
             moved.shown(*since.crops(SINCE)).follow(self._pass, correction)
             self._pass, self._adjusting, self.number = moved, None, self.number + 1
+            # Views that are farther apart tell the place better.
+            self._error = OUTLINE_ERROR * min(1.0, TURNED_RAD / self._adjusted_by_rad)
         if self._adjusting is None and self._kept.count >= self._due and self._kept.turned_rad > TURNED_RAD:
             self._due, frames = MORE * self._kept.count, self._kept.so_far()
+            self._adjusted_by_rad = self._kept.turned_rad
             self._adjusting = frames, self._aside.submit(_adjusted, *frames.arrays())
 
     def texture(self) -> TextureMap:

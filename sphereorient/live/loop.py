@@ -77,7 +77,8 @@ def _learning(
         def save() -> str:
             with writing(force=True):  # that of before, by this run
                 write_map(tracker.texture(), path)
-            return f"Wrote {path}"
+            named = "" if experiment.texture_path is not None else f"; next: write texture: {path.name} in sphere:"
+            return f"Wrote {path}{named}"
 
         try:
             yield LiveSetUp(recording=recording, tracker=tracker, save_map=save)
