@@ -61,6 +61,7 @@ def _stdin(recording: Recording) -> Iterator[Arrival]:
 
 def _devices(kind: str, where: str, tell: Tell) -> Source:
     """Return the cameras of a maker: a serial number for each camera of the experiment, in its order."""
+    ends = kind == "camera:" and Path(where).is_file()  # a movie
     stopped, released = Event(), Event()
     released.set()
 
@@ -75,7 +76,7 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
             expected = f"a device for each camera ({', '.join(one.name for one in opened.streams)})"
             do = "add --cameras with one name" + ("" if kind == "camera:" else ", or list serial numbers: A,B")
             raise SettingsError(refusal("--source", expected=expected, got=f"{len(serials)}", do=do))
-        ends, opening = kind == "camera:" and Path(where).is_file(), Lock()
+        opening = Lock()
         released.clear()
         try:
             with ExitStack() as drivers:
@@ -97,7 +98,7 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
         finally:
             released.set()
 
-    return Source(frames=frames, close=close)
+    return Source(frames=frames, waits=ends, close=close)
 
 
 # By name; the functions get what is behind ":".

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import sys
 import time
+from _thread import interrupt_main
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice, pairwise
@@ -16,14 +18,22 @@ import av
 import cv2
 import numpy as np
 import pytest
+import torch
 from fake_makers import GONE, MAKERS, TIMEOUT, Body, install
 from live_examples import EXCERPT, until
+from overlay_examples import true_track
+from typer.testing import CliRunner
 
-from sphereorient.errors import MovieError, SettingsError
+from sphereorient import so3
+from sphereorient.cli import app
+from sphereorient.errors import MovieError, Reason, SettingsError
 from sphereorient.experiment.experiment import DeviceKeys
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.live.feed import Feed
+from sphereorient.live.live import measured
+from sphereorient.live.loop import open_live
 from sphereorient.live.sources import source_of
+from sphereorient.methods.settings import Settings
 from sphereorient.movies import open_movie
 
 HEIGHT = WIDTH = 650
@@ -437,3 +447,67 @@ def test_a_movie_with_a_rotation_tag_comes_as_track_reads_it(angle, tmp_path):
     found = list(source_of(f"camera:{path}", print).frames(recording))
     assert len(found) == 3, "a movie ends"
     assert abs(found[0].pictures[0].astype(int) - read).mean() < 15
+
+
+@pytest.mark.slow  # two seconds of a film, and its set-up
+def test_two_cameras_in_step_give_right_poses(monkeypatch):
+    order, told = [*range(40), *range(38, -1, -1)], []
+
+    def film(pictures: list[np.ndarray], seed: int, lost: int, twice: int) -> Iterator[Any]:
+        random, zero_s = np.random.default_rng(seed), 1e3 * seed
+        for n, k in enumerate(order):
+            due_s = begun_s + 0.025 * n + 0.006 * random.random()
+            while time.perf_counter() < due_s:
+                yield TIMEOUT
+            for _ in range((n != lost) + (n == twice)):
+                yield pictures[k], zero_s + (1 + 5e-5 * seed) * 0.025 * n, n + 1
+
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+        movies = [[picture for picture, _ in stream.pictures()] for stream in opened.recording.streams]
+        first, second = body(serial="a"), body(serial="b")
+        begun_s = time.perf_counter() + 0.5
+        first.script, second.script = [film(movies[0], 1, 40, 50)], [film(movies[1], 2, 60, 45)]
+        install("pylon:", [first, second], monkeypatch)
+        source = source_of("pylon:a,b", told.append)
+        feed = Feed(source.frames(opened.recording), most=1000, wait=True)
+        found = list(islice(measured(opened.tracker, opened.tracker.appearance.fitter.views, feed), len(order) - 1))
+        feed.close()
+        source.close()
+    truth = torch.from_numpy(true_track().orientation)
+    there = [now for now in found if now.valid]
+    assert len(there) > len(found) - 4
+    for now in there:
+        R = torch.from_numpy(now.R_lab_body)
+        assert math.degrees(float(so3.geodesic_distance(R, truth[order[now.number]]))) < 0.5
+    assert sum(now.reason == (Reason.OK, Reason.OK) for now in found) > 40
+    assert any("cam1 missing 1" in line or "cam1 doubled 1" in line or "cam2 doubled 1" in line for line in told)
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_live_while_it_waits_and_releases_the_camera(monkeypatch):
+    def never() -> Iterator[Any]:
+        for k in range(10**6):
+            if k == 20:
+                interrupt_main()
+            yield TIMEOUT
+
+    camera = body()
+    camera.script = [never()]
+    install("vimba:", [camera], monkeypatch)
+    command = ["live", str(EXCERPT / "experiment.yaml"), "--cameras", "cam1", "--source", "vimba:4711"]
+    run = CliRunner().invoke(app, command)
+    assert run.exit_code == 0, run.output
+    assert "0 frames" in run.output
+    assert camera.log[-2:] == ["stopped", "closed"]
+
+
+def test_pylons_own_emulation_behaves_as_the_fake(alone, monkeypatch):
+    pytest.importorskip("pypylon")
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+    keys = DeviceKeys(rate_hz=100, exposure_ms=2, pixel_format="Mono8", offset=(8, 4), trigger="none")
+    frames = source_of("pylon:0815-0000", print).frames(with_keys(alone, cam1=keys))
+    found = list(islice(frames, 3))
+    frames.close()
+    assert found[2].pictures[0].shape == (HEIGHT, WIDTH)
+    with pytest.raises(MovieError, match=r"AcquisitionFrameRateAbs 5000000000\.0"):
+        next(source_of("pylon:0815-0000", print).frames(with_keys(alone, cam1=DeviceKeys(rate_hz=5e9))))
