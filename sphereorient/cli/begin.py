@@ -126,9 +126,8 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     from sphereorient.preflight.mark_masks import drawn_mask
 
     said = read_fictrac_config(config)
-    found = movies or [said.source]
-    (movie,) = found if len(found) == 1 else [None]
-    if not isinstance(movie, Path):
+    movie = movies[0] if movies else said.source
+    if len(movies) > 1 or not isinstance(movie, Path):
         got = f"{len(movies)}" if movies else f"camera {said.source} (src_fn)"
         do = f"film some seconds of this set-up, then `sphereorient init MOVIE --from-fictrac {config}`"
         raise SettingsError(refusal("init --from-fictrac", expected="one movie", got=got, do=do))

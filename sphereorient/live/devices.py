@@ -114,7 +114,8 @@ def _pylon(serial: str) -> Iterator[Device]:
             with camera.RetrieveResult(int(1e3 * WAIT_S), driver.TimeoutHandling_Return) as result:
                 arrived_s = time.perf_counter()
                 if not result.IsValid():
-                    _check_there(not camera.IsCameraDeviceRemoved())
+                    if camera.IsCameraDeviceRemoved():
+                        raise OSError("it was removed")
                     return None
                 picture = result.Array if result.GrabSucceeded() else None  # a copy
                 stamp_s, counter = result.TimeStamp * tick_s or None, result.BlockID
@@ -150,7 +151,8 @@ def _vimba(serial: str) -> Iterator[Device]:
         def shot() -> Shot | None:
             with suppress(Empty):
                 return waiting.get(timeout=WAIT_S)
-            _check_there(serial in [one.get_id() for one in system.get_all_cameras()])
+            if serial not in [one.get_id() for one in system.get_all_cameras()]:
+                raise OSError("it was removed")
             return None
 
         def start() -> None:
@@ -211,11 +213,6 @@ def _check_seen(serial: str, seen: Sequence[str]) -> None:
     if not seen or (serial and serial not in seen):
         got, do = ", ".join(seen) or "none", "connect it, or close the program that has it"
         raise MovieError(refusal("--source", expected=f"a camera {serial}".rstrip(), got=got, do=do))
-
-
-def _check_there(there: bool) -> None:
-    if not there:
-        raise OSError("it was removed")
 
 
 def _known(read: Callable[[], Any]) -> Any:

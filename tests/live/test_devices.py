@@ -440,6 +440,7 @@ def test_a_movie_with_a_rotation_tag_comes_as_track_reads_it(angle, tmp_path):
     assert there
     assert turned.shape[:2] == ((96, 64) if angle == 90 else (64, 96))
     movie = open_movie(path)
+    assert any("rotation tag" in remark for remark in movie.remarks)
     read = next(movie.frames())
     assert abs(read.astype(int) - ramp).mean() < 15, "of limited range"
     fake = SimpleNamespace(name="cam1", movie=movie)
