@@ -32,7 +32,9 @@ class _InitOptions:
     ] = None
     out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
     plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
-    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: take over movie, view, masks.")] = None
+    from_fictrac: Annotated[
+        Path | None, Option(help="FicTrac's config.txt: take over its movie, or that given, view, masks.")
+    ] = None
     set_: Annotated[
         list[str] | None,
         Option("--set", help="A key's value, e.g. --set sphere.diameter=18; else it is asked for at a terminal."),
@@ -48,7 +50,7 @@ class _InitOptions:
 def init(given: _InitOptions) -> None:
     """Look at movies or plate pictures, and write the first file: all keys explained, what can be measured measured."""
     chosen = [source for source in (given.movies, given.plate, given.from_fictrac) if source]
-    if len(chosen) != 1:
+    if len(chosen) != 1 and not (given.from_fictrac and given.movies and not given.plate):
         got, do = f"{len(chosen)} of them", "name movies, or --plate FOLDER, or --from-fictrac config.txt"
         raise SettingsError(refusal("init", expected="one source", got=got, do=do))
     changes = list(given.set_ or [])
@@ -63,7 +65,7 @@ def init(given: _InitOptions) -> None:
     if given.plate:
         _calibration(given.plate, target, changes, given.quiet)
     elif given.from_fictrac:
-        _fictrac(given.from_fictrac, target, changes, given.quiet)
+        _fictrac(given.from_fictrac, given.movies or [], target, changes, given.quiet)
     else:
         _experiment(given.movies or [], target, changes, given.vfov, given.quiet)
 
@@ -116,7 +118,7 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
     _end(target, missing, _next(target, cameras), [cameras] if alone else [])
 
 
-def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
+def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[str], quiet: bool) -> None:
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
     from sphereorient.preflight.fictrac import read_fictrac_config
@@ -124,12 +126,17 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
     from sphereorient.preflight.mark_masks import drawn_mask
 
     said = read_fictrac_config(config)
+    movie = movies[0] if movies else said.source
+    if len(movies) > 1 or not isinstance(movie, Path):
+        got = f"{len(movies)}" if movies else f"camera {said.source} (src_fn)"
+        do = f"film some seconds of this set-up, then `sphereorient init MOVIE --from-fictrac {config}`"
+        raise SettingsError(refusal("init --from-fictrac", expected="one movie", got=got, do=do))
     mask, cameras = target.parent / "cam1_mask.png", target.parent / "cameras.yaml"
     check_writable(cameras)
     check_writable(mask)
     hidden = [{"kind": "hide", "points": polygon} for polygon in said.ignored]
-    shown = drawn_mask(open_movie(said.movie).frame_shape, hidden, None)
-    look = _looked([said.movie], target, quiet, shown)[0]
+    shown = drawn_mask(open_movie(movie).frame_shape, hidden, None)
+    look = _looked([movie], target, quiet, shown)[0]
     diameter_px = 2 * said.circle_px[2] if said.circle_px else look.diameter_px
     look = replace(look, stays=True, diameter_px=diameter_px)  # FicTrac follows no other balls
     made = [cameras]
@@ -144,7 +151,8 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
     _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab, model))
     if not quiet:
         typer.echo(_found(look))
-        _end(target, missing, _next(target, cameras), made)
+        live = [] if isinstance(said.source, Path) else [f"sphereorient live {target} --source camera:{said.source}"]
+        _end(target, missing, [*_next(target, cameras), *live], made)
 
 
 def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:

@@ -176,7 +176,10 @@ def _print_summary(result: "Trajectory", name: str) -> None:
 class _LiveOptions(CameraOptions):
     experiment: ExperimentPath
     source: Annotated[
-        str, Option(help="movie: at its rate; movie-fast; -: stdin; camera:0; genicam:X.cti; shared:FILE.")
+        str,
+        Option(
+            help="movie: at its rate; movie-fast; -; shared:FILE; camera:0; genicam:X.cti#A,B; pylon:A,B; vimba:A,B."
+        ),
     ] = "movie"
     to: Annotated[
         list[str] | None,
@@ -206,6 +209,7 @@ def live(given: _LiveOptions) -> None:
     source, page, movies = source_of(given.source, _tell), None, _movies_of(given)
     with ExitStack() as opened:
         outputs = [open_output(name, _tell) for name in given.to or ()]
+        opened.callback(source.close)
         for output, _ in outputs:
             opened.callback(output.close)
         if len(load_experiment(given.experiment).names) > 1 and any(form != "json" for _, form in outputs):

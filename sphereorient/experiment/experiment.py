@@ -62,6 +62,7 @@ class Experiment:
     response: dict[str, Response] = field(default_factory=dict)  # of the cameras for which the file gives one
     frames: tuple[int, int] | None = None  # first, last + 1; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
+    devices: dict[str, "DeviceKeys"] = field(default_factory=dict)  # of the cameras for which the file has `camera`
     camera_covariance: ParameterCovariance | None = None  # parameters are named camera.parameter
 
     @property
@@ -164,6 +165,16 @@ class FlowKeys(BaseModel, frozen=True, extra="forbid"):
     integral_time: Positive | None = None
 
 
+class DeviceKeys(BaseModel, frozen=True, extra="forbid"):
+    """The key `camera` of a camera: what `live` sets on its device, beside the size of the pictures; None: nothing."""
+
+    trigger: str | None = None  # the device's name of the line, or none: it runs freely
+    exposure_ms: Positive | None = None
+    rate_hz: Positive | None = None
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"] | None = None
+    offset: tuple[FrameNumber, FrameNumber] | None = None  # px, of the picture's first pixel on the sensor
+
+
 class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     """The keys of experiment.yaml (docs/data-format.md)."""
 
@@ -182,6 +193,7 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     flip: dict[str, Literal["none", "vertical", "horizontal", "both"]] = Field(default_factory=dict)
     response: Any = None
     flow: FlowKeys = FlowKeys()
+    camera: dict[str, DeviceKeys] = Field(default_factory=dict)
 
 
 def load_experiment(source: Experiment | Path | str) -> Experiment:
@@ -199,7 +211,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
     needed = (("frame_rate", "times"), ("sphere", "spheres"))
     missing = [" or ".join(either) for either in needed if not document.keys() & set(either)]
     keys = validated(ExperimentKeys, document, str(path), ExperimentError, missing)
-    for key in ("masks", "backgrounds", "start", "flip"):
+    for key in ("masks", "backgrounds", "start", "flip", "camera"):
         check_known(getattr(keys, key), keys.movies, f"{path}, {key}", ExperimentError)
     _check_numbers(path, keys)
     _check_spheres(path, keys)
@@ -242,6 +254,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
         response=_responses(f"{path}, response", keys.response, list(keys.movies)),
         frames=keys.frames,
         flow=keys.flow.model_dump(exclude_none=True),
+        devices=dict(keys.camera),
     )
 
 
@@ -315,6 +328,10 @@ def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
         expected = f"at most the time between frames, {1 / keys.frame_rate:.4g} s"
         raise refused(f"{path}, exposure", expected, f"{keys.exposure:g}", "write it in seconds")
+    for name, device in keys.camera.items():
+        if device.exposure_ms and device.rate_hz and device.exposure_ms > 1e3 / device.rate_hz:
+            where, expected = f"{path}, camera.{name}.exposure_ms", f"at most {1e3 / device.rate_hz:.4g} ms, by rate_hz"
+            raise refused(where, expected, f"{device.exposure_ms:g}", "expose for less, or at a lower rate")
 
 
 def _check_spheres(path: Path, keys: ExperimentKeys) -> None:

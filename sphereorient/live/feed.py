@@ -3,7 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from threading import Condition, Thread
 
@@ -89,6 +89,8 @@ class Feed:
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
+            if isinstance(self._source, Generator):
+                self._source.close()  # a device is released
 
     def restart(self) -> None:
         """Begin with small steps: of the motion from here nothing is known."""

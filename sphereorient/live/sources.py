@@ -6,23 +6,19 @@ A new source is a function here or in a file of its own, and a line of `SOURCES`
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from threading import Event, Lock
 from typing import BinaryIO
 
-import cv2
-import numpy as np
-
-from sphereorient.errors import MovieError, SettingsError, error_words, refusal
+from sphereorient.errors import MovieError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording
-from sphereorient.files.picture import luma
-from sphereorient.files.provenance import package
-from sphereorient.live.feed import Arrival, FrameBytes, Picture, Tell
+from sphereorient.live.devices import MAKERS, RELEASE_S, Camera, device_frames, worded
+from sphereorient.live.feed import Arrival, FrameBytes, Tell
 from sphereorient.live.shared import shared_frames
 from sphereorient.movies.record import Recorder
-
-AGAIN_S = 1.0  # between attempts to open a camera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +28,7 @@ class Source:
     frames: Callable[[Recording], Iterator[Arrival]]
     waits: bool = False  # for the tracking, instead of dropping frames
     even: bool = False  # at the rate of the experiment
+    close: Callable[[], None] = lambda: None  # releases what it holds
 
 
 def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
@@ -59,116 +56,50 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
         number += 1
 
 
-def camera_pictures(
-    device: int | str, open_device: Callable[..., cv2.VideoCapture] = cv2.VideoCapture
-) -> Iterator[Picture]:
-    """Yield grey pictures of OpenCV's camera of a number or address while it gives some; MovieError: no such camera."""
-    capture = open_device(device)
-    try:
-        if not capture.isOpened():
-            do = "connect it, or name another number"
-            raise MovieError(refusal(f"camera {device}", expected="a camera", got="none that opens", do=do))
-        while True:
-            there, picture = capture.read()
-            if not there:
-                return
-            yield picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
-    finally:
-        capture.release()
-
-
-def genicam_pictures(where: str) -> Iterator[Picture]:
-    """Yield grey pictures of the first GenICam camera of the producer that its maker's driver brings, PRODUCER.cti, or
-    of that with a serial number: PRODUCER.cti#SERIAL.
-    Raise MovieError: the package harvesters is missing, no such camera, one of colour, or one that fails.
-    """
-    name = f"genicam:{where}"
-    driver = package("harvesters.core", "genicam", MovieError)
-    producer, _, serial = where.partition("#")
-    try:
-        with driver.Harvester() as harvester:
-            harvester.add_file(producer, check_existence=True, check_validity=True)
-            harvester.update()
-            if not harvester.device_info_list:
-                do = "connect it, or close the program that has it"
-                raise MovieError(refusal(name, expected="a camera", got="none", do=do))
-            with harvester.create({"serial_number": serial} if serial else 0) as camera:
-                camera.start()
-                while True:
-                    try:
-                        # Of one call of a GenICam driver; a camera that waits for its trigger is asked again.
-                        buffer = camera.fetch(timeout=1.0)
-                    except driver.TimeoutException:
-                        continue
-                    with buffer:  # its memory is the driver's again behind this
-                        shown = buffer.payload.components[0]
-                        if not shown.data_format.startswith("Mono"):
-                            do = "set its PixelFormat to Mono8 or Mono16"
-                            raise MovieError(refusal(name, expected="grey pictures", got=shown.data_format, do=do))
-                        picture = np.array(shown.data.reshape(shown.height, -1)[:, : shown.width])  # padding behind
-                    yield picture
-    except MovieError:
-        raise
-    except Exception as error:  # each driver has errors of its own
-        do = "look whether the maker's viewer shows its pictures"
-        raise MovieError(refusal(name, expected="a camera that works", got=error_words(error), do=do)) from None
-
-
-def device_frames(
-    name: str, open_pictures: Callable[[], Iterator[Picture]], stream: CameraStream, tell: Tell | None
-) -> Iterator[Arrival]:
-    """Yield frames of a camera with the time of their arrival. With `tell`, which gets what is wrong in one line, a
-    camera that ends, fails or changes its pictures after its first frame is opened again, each second.
-    Raise MovieError: no camera, or pictures of another size or type than the experiment's movie.
-    """
-    (height, width), kind = stream.movie.frame_shape, stream.movie.dtype
-    begun, number, fault = time.perf_counter(), 0, ""
-    while True:
-        found = f"{name}: no picture comes any more."
-        try:
-            for picture in open_pictures():
-                arrived_s = time.perf_counter()
-                if (*picture.shape, picture.dtype) != (height, width, kind):
-                    got = f"{picture.shape[1]} x {picture.shape[0]} px {picture.dtype}"
-                    do = "set the camera to the size and depth of the movie that the experiment names"
-                    raise MovieError(refusal(name, expected=f"{width} x {height} px {kind}", got=got, do=do))
-                if fault and tell is not None:
-                    tell(f"{name}: pictures come again.")
-                fault = ""
-                yield Arrival(number=number, time_s=arrived_s - begun, pictures=[picture], arrived_s=arrived_s)
-                number += 1
-        except MovieError as error:
-            if tell is None or not number:
-                raise
-            found = str(error)
-        if tell is None or not number:
-            return
-        if not fault:
-            tell(f"{found} It is opened again each second.")
-        fault = found
-        time.sleep(AGAIN_S)
-
-
 def _stdin(recording: Recording) -> Iterator[Arrival]:
     return raw_frames(sys.stdin.buffer, recording.streams, 1 / recording.timeline.frame_s)
 
 
-def _genicam(where: str, tell: Tell) -> Source:
-    pictures = partial(genicam_pictures, where)
-    return Source(frames=lambda opened: device_frames(f"genicam:{where}", pictures, _only_stream(opened), tell))
+def _devices(kind: str, where: str, tell: Tell) -> Source:
+    """Return the cameras of a maker: a serial number for each camera of the experiment, in its order."""
+    ends = kind == "camera:" and Path(where).is_file()  # a movie
+    stopped, released = Event(), Event()
+    released.set()
 
+    def close() -> None:
+        stopped.set()
+        released.wait(RELEASE_S)
 
-def _camera(where: str, tell: Tell) -> Source:
-    pictures = partial(camera_pictures, int(where) if where.isdigit() else where)
-    again = None if Path(where).is_file() else tell  # a movie ends
-    return Source(frames=lambda opened: device_frames(f"camera {where}", pictures, _only_stream(opened), again))
+    def frames(opened: Recording) -> Iterator[Arrival]:
+        producer, _, listed = where.partition("#") if kind == "genicam:" else ("", "", where)
+        serials = [listed] if kind == "camera:" else listed.split(",")
+        if len(serials) != len(opened.streams):
+            expected = f"a device for each camera ({', '.join(one.name for one in opened.streams)})"
+            do = "add --cameras with one name" + ("" if kind == "camera:" else ", or list serial numbers: A,B")
+            raise SettingsError(refusal("--source", expected=expected, got=f"{len(serials)}", do=do))
+        opening = Lock()
+        released.clear()
+        try:
+            with ExitStack() as drivers:
+                with worded(f"{kind}{where}"):
+                    open_device = drivers.enter_context(MAKERS[kind](producer))
+                cameras = [
+                    Camera(
+                        name=f"{kind}{serial or producer}",
+                        open=partial(open_device, serial),
+                        stream=stream,
+                        keys=None if ends else opened.experiment.devices.get(stream.name),
+                        flip=opened.experiment.flip.get(stream.name, "none"),
+                        tell=None if ends else tell,
+                        opening=opening,
+                    )
+                    for serial, stream in zip(serials, opened.streams, strict=True)
+                ]
+                yield from device_frames(cameras, tell, stopped)
+        finally:
+            released.set()
 
-
-def _only_stream(recording: Recording) -> CameraStream:
-    if len(recording.streams) > 1:
-        do = "add --cameras with one name"
-        raise SettingsError(refusal("--source", expected="one camera", got=f"{len(recording.streams)}", do=do))
-    return recording.streams[0]
+    return Source(frames=frames, waits=ends, close=close)
 
 
 # By name; the functions get what is behind ":".
@@ -176,8 +107,7 @@ SOURCES: Mapping[str, Callable[[str, Tell], Source]] = {
     "movie": lambda *_: Source(frames=partial(movie_frames, paced=True), even=True),
     "movie-fast": lambda *_: Source(frames=partial(movie_frames, paced=False), waits=True, even=True),
     "-": lambda *_: Source(frames=_stdin, waits=True, even=True),
-    "camera:": _camera,
-    "genicam:": _genicam,
+    **{kind: partial(_devices, kind) for kind in MAKERS},
     "shared:": lambda where, _: Source(frames=lambda opened: shared_frames(Path(where), opened.streams)),
 }
 
@@ -186,7 +116,7 @@ def source_of(name: str, tell: Tell) -> Source:
     """Return the source of a name, such as movie or camera:0; raise SettingsError for an unknown one."""
     kind, colon, where = name.partition(":")
     if kind + colon not in SOURCES or bool(colon) != bool(where):
-        expected = "movie, movie-fast, -, camera:NUMBER, genicam:PRODUCER.cti or shared:FILE"
+        expected = "movie, movie-fast, -, shared:FILE, camera:NUMBER, genicam:PRODUCER.cti, pylon:SERIAL or vimba:ID"
         raise SettingsError(refusal("--source", expected=expected, got=name, do="choose one of these"))
     return SOURCES[kind + colon](where, tell)
 

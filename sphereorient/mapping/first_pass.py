@@ -349,17 +349,22 @@ class KeptFrames:
         return same
 
     def corrected(self, done: "KeptFrames", R_lab_body: Tensor) -> tuple[Tensor, "KeptFrames"]:
-        """Take orientations (N, 3, 3) from an adjustment of the frames of some time ago, and turn later ones alike.
-        Return that turn (3, 3), in the lab, and the later frames.
+        """Take orientations (N, 3, 3) from an adjustment of the frames of some time ago, and let later ones go on from
+        there: at a wrong place all turns are too long or too short by the same share. Return by which turn (3, 3), in
+        the lab, the last frame is corrected, and the later frames.
         """
-        turn = R_lab_body[-1] @ done._rows[-1].R_lab_body.mT
         since, before = self.so_far(), set(map(id, done._rows))
         since._rows = [one for one in self._rows if id(one) not in before]
+        was = torch.stack([one.R_lab_body for one in done._rows])
+        steps, right = (so3.log(R[1:] @ R[:-1].mT) for R in (was, R_lab_body))
+        share = float((steps * right).sum() / steps.square().sum().clamp_min(1e-12))
+        old, new = was[-1], R_lab_body[-1]
         for one in since._rows:
-            one.R_lab_body = turn @ one.R_lab_body
+            R = so3.exp(share * so3.log(one.R_lab_body @ old.mT)) @ new
+            old, new, one.R_lab_body = one.R_lab_body, R, R
         for one, R in zip(done._rows, R_lab_body, strict=True):
             one.R_lab_body = R
-        return turn, since
+        return new @ old.mT, since
 
     def adjusted(self, progress: Progress = silent) -> Adjustment:
         """Return what the frames have in common.

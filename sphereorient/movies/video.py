@@ -23,6 +23,7 @@ LOSSLESS = "lossless"
 PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so may have a grey first plane
 NOTHING = "none from the decoder"
 PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
+TURNED_REMARK = "read as it is stored: players and ffmpeg turn it by {} degrees clockwise, as its rotation tag says"
 SHOWN = 8  # missing frames named in a remark
 SLACK = 1.5  # frames by which a rounded duration may be too long
 
@@ -48,7 +49,8 @@ class VideoMovie(Movie):
             super().__init__(path, form, count, (frame.height, frame.width), grey_dtype(frame.format))
             damaged = (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
             cut_off = self._truncated(_stated_frames(container, count))
-            self.remarks = (*damaged, *cut_off, *_remarks(container, self._pixels, self._index))
+            turned = (TURNED_REMARK.format(-frame.rotation % 360),) if frame.rotation else ()
+            self.remarks = (*damaged, *cut_off, *turned, *_remarks(container, self._pixels, self._index))
 
     def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, str]:
         """Return the packet table, and the error that ended it, if any."""

@@ -28,7 +28,7 @@ NOT_READ = {
 class FicTracConfig:
     """What a config.txt says of camera, ball and animal."""
 
-    movie: Path
+    source: Path | int  # a movie, or the number of a camera
     rate_hz: float | None  # None: that of the file
     vfov_deg: float  # field of view, from the top of the picture to its bottom
     fisheye: bool  # equidistant: vfov_deg / height is the angle of every pixel
@@ -64,7 +64,7 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
         raise refused(f"{path}, c2a_r", "three numbers, rad", f"{len(turn)}", "correct it")
     limb = np.array(_numbers(values.get("roi_circ", "")))
     return FicTracConfig(
-        movie=path.parent / values["src_fn"],
+        source=int(values["src_fn"]) if values["src_fn"].isdecimal() else path.parent / values["src_fn"],
         rate_hz=rate[0] if len(rate) == 1 and rate[0] > 0 else None,
         vfov_deg=vfov[0],
         fisheye=fisheye,

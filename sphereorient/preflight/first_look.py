@@ -30,6 +30,7 @@ STAYS, NEAR = 0.15, 1.0  # of the radius: a ball whose outlines scatter, or lie 
 SEEN, ALWAYS = 0.4, 0.99  # share of the frames in which a ball is found at least, that moves, or that sinks slowly
 PICTURES, SLOW_PICTURES = 40, 100  # all over the movie, for a ball that stays, or sways
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
+DEVICE = {"trigger": "Line1", "exposure_ms": 0.4, "rate_hz": 600.0, "pixel_format": "Mono8", "offset": [0, 0]}
 FLOW = {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3}
 
 
@@ -152,6 +153,7 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
         key("flip", "mirrored movies: vertical, horizontal, both", example=each("vertical")),
         key("response", "of the cameras: linear, srgb, {gamma: 2.2}, or a table; learnt without it", example="srgb"),
         key("flow", "SI, for reports", example=FLOW),
+        key("camera", "what `live` sets on each device; trigger: none runs freely", example=each(DEVICE)),
     ]
 
 

@@ -142,6 +142,17 @@ FAULTS = {
     "a response that falls": (SHORT + "response: [[0, 0], [90, 120], [255, 100]]\n", "response"),
     "a response that is no curve": (SHORT + "response: {gamma: bright}\n", "response"),
     "a response of no camera": (SHORT + "response: {cam7: srgb}\n", "got 'cam7'"),
+    "settings of no camera": (SHORT + "camera: {cam7: {}}\n", "got 'cam7'"),
+    "a setting of a camera that there is not": (SHORT + "camera: {cam1: {triger: Line1}}\n", "'trigger'"),
+    "a pixel format of colour": (
+        SHORT + "camera: {cam1: {pixel_format: BayerRG8}}\n",
+        "pixel_format: expected 'Mono8'",
+    ),
+    "a line that YAML reads as no": (SHORT + "camera: {cam1: {trigger: off}}\n", "cam1.trigger: expected"),
+    "an exposure longer than the interval": (
+        SHORT + "camera: {cam1: {exposure_ms: 4, rate_hz: 500}}\n",
+        "exposure_ms: expected at most 2 ms",
+    ),
     "a flip of no camera": (SHORT + "flip: {cam7: both}\n", "got 'cam7'"),
     "schema": (
         SHORT.replace("experiment/1", "experiment/7"),
@@ -156,6 +167,16 @@ FAULTS = {
     "no yaml": ("a: [", "expected YAML"),
     "tabs": ("a:\n\t- b", "expected YAML"),
 }
+
+
+def test_what_live_sets_on_a_camera_is_read(folder):
+    given = "{cam1: {trigger: Line1, exposure_ms: 0.4, rate_hz: 600, pixel_format: Mono12, offset: [8, 4]}}"
+    (name, keys), *others = load_experiment(written(folder, SHORT + f"camera: {given}\n")).devices.items()
+    assert not others
+    assert (name, keys.trigger, keys.exposure_ms, keys.rate_hz) == ("cam1", "Line1", 0.4, 600.0)
+    assert (keys.pixel_format, keys.offset) == ("Mono12", (8, 4))
+    free = load_experiment(written(folder, SHORT + "camera: {cam1: {trigger: none}}\n")).devices["cam1"]
+    assert (free.trigger, free.exposure_ms) == ("none", None)
 
 
 @pytest.mark.parametrize(("text", "message"), FAULTS.values(), ids=FAULTS)

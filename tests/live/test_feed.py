@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import islice, pairwise
+from itertools import islice
 from threading import Event, Semaphore
 from types import SimpleNamespace
 
@@ -20,7 +20,7 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.live import shared
 from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
-from sphereorient.live.sources import camera_pictures, device_frames, movie_frames, raw_frames
+from sphereorient.live.sources import movie_frames, raw_frames
 
 
 def let(count: int, goes_on: Semaphore) -> Iterator[Arrival]:
@@ -165,82 +165,6 @@ def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):
         next(frames)
         ring._words[ENDED] = 1
         assert list(frames) == []
-
-
-class FakeDevice:
-    """A camera of OpenCV."""
-
-    def __init__(self, pictures: list[np.ndarray], *, opens: bool = True) -> None:
-        self.pictures, self.opens, self.released = list(pictures), opens, False
-
-    def isOpened(self) -> bool:
-        return self.opens
-
-    def read(self) -> tuple[bool, np.ndarray | None]:
-        return (True, self.pictures.pop(0)) if self.pictures else (False, None)
-
-    def release(self) -> None:
-        self.released = True
-
-
-@pytest.fixture
-def stream(recording):
-    return recording.streams[0]
-
-
-def grey(stream, value: int = 7) -> np.ndarray:
-    return np.full(stream.movie.frame_shape, value, np.uint8)
-
-
-def frames_of(stream, *devices: FakeDevice, tell=None) -> Iterator[Arrival]:
-    waiting = list(devices)
-    return device_frames("camera 0", lambda: camera_pictures(0, lambda number: waiting.pop(0)), stream, tell)
-
-
-def test_a_camera_gives_grey_pictures_of_the_size_of_the_movie(stream):
-    colour = np.dstack([grey(stream, value) for value in (10, 20, 30)])  # blue, green, red
-    device = FakeDevice([colour, colour[..., 0]])
-    first, second = frames_of(stream, device)
-    assert (int(first.pictures[0][0, 0]), int(second.pictures[0][0, 0])) == (22, 10)
-    assert device.released
-    with pytest.raises(MovieError, match="px"):
-        list(frames_of(stream, FakeDevice([colour[:-1]])))
-    with pytest.raises(MovieError, match="none that opens"):
-        list(frames_of(stream, FakeDevice([], opens=False)))
-
-
-def test_a_camera_that_ends_or_changes_its_pictures_is_told_once_and_taken_up_again(stream, monkeypatch):
-    monkeypatch.setattr("sphereorient.live.sources.AGAIN_S", 0.001)
-    told: list[str] = []
-    devices = [
-        FakeDevice([grey(stream), grey(stream)]),
-        FakeDevice([], opens=False),
-        FakeDevice([], opens=False),
-        FakeDevice([grey(stream)]),
-        FakeDevice([grey(stream)[:-1]]),
-        FakeDevice([grey(stream)]),
-    ]
-    frames = frames_of(stream, *devices, tell=told.append)
-    found = [next(frames) for _ in range(4)]
-    assert [one.number for one in found] == [0, 1, 2, 3]
-    assert all(a.time_s < b.time_s for a, b in pairwise(found))
-    assert [line.split(";")[0] for line in told] == [
-        "camera 0: no picture comes any more. It is opened again each second.",
-        "camera 0: pictures come again.",
-        "camera 0: no picture comes any more. It is opened again each second.",
-        "camera 0: pictures come again.",
-    ]
-    assert all(device.released for device in devices[:5])
-
-
-def test_a_camera_that_changes_its_size_is_told(stream, monkeypatch):
-    monkeypatch.setattr("sphereorient.live.sources.AGAIN_S", 0.001)
-    told: list[str] = []
-    devices = [FakeDevice([grey(stream), grey(stream)[:-1]]), FakeDevice([grey(stream)])]
-    frames = frames_of(stream, *devices, tell=told.append)
-    assert [next(frames).number for _ in range(2)] == [0, 1]
-    assert "got 650 x 649 px" in told[0]
-    assert told[1] == "camera 0: pictures come again."
 
 
 def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypatch):

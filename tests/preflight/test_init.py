@@ -268,6 +268,24 @@ def test_fictrac_is_taken_over(clean, tmp_path):
     assert mask[10, 10] == 255
 
 
+def test_a_camera_of_fictrac_wants_a_movie_of_the_set_up_and_is_the_source_of_live(clean, tmp_path):
+    movie, _ = two_movies(clean, tmp_path)
+    config, out = tmp_path / "config.txt", tmp_path / "experiment.yaml"
+    config.write_text(CONFIG.replace("src_fn           : cam1.mkv", "src_fn           : 2"))
+    with pytest.raises(
+        SettingsError, match=r"expected one movie, got camera 2 \(src_fn\); film .*init MOVIE --from-fic"
+    ):
+        init("--from-fictrac", config, "--out", out)
+    with pytest.raises(SettingsError, match="expected one movie, got 2"):
+        init(movie, movie, "--from-fictrac", config, "--out", out)
+    assert not out.exists()
+    said = init(movie, "--from-fictrac", config, "--out", out)
+    assert f"sphereorient live {out} --source camera:2" in said
+    experiment = load_experiment(out)
+    assert experiment.movie_paths["cam1"] == movie
+    assert float(experiment.cameras["cam1"].f_px) == pytest.approx(120.0 / math.tan(math.radians(22.5)))
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

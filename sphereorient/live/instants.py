@@ -1,0 +1,183 @@
+"""Which pictures of several cameras show one instant, by the time stamps of their devices."""
+
+import math
+import statistics
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sphereorient.errors import MovieError, refusal
+from sphereorient.live.feed import Arrival, Picture, Tell
+
+JOINING, SURE = 16, 256  # pictures by which a camera comes into step; by which it does in any case
+NEAR = 0.25  # shortest intervals of late: pictures of one instant lie nearer
+SHORTEST = 4  # delays of a camera that agree: then nothing held these pictures up
+DRIFT = 1e-4  # of two devices' clocks, at most
+FOLLOW = 0.125  # share of the drift that is taken over at each instant: stamps scatter
+LATE_S = 0.01, 0.1  # an instant waits for its last picture for one usual interval, within these
+SILENT = 3  # usual intervals without a picture: no instant waits for the camera
+SILENT_S = 1.0  # at least: then another camera gives the time
+JUMP_S = 1.0  # a clock that goes back further was set anew
+TOLD_S = 10.0  # between lines about pictures that are not there
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """A picture as its device gave it."""
+
+    picture: Picture | None  # None: it did not arrive whole
+    arrived_s: float  # by the clock of time.perf_counter
+    stamp_s: float | None = None  # by the clock of the device, from any zero on; None: it has none
+    counter: int | None = None  # of the device, of all pictures that it took; None: it has none
+
+
+@dataclass(eq=False)
+class _Clock:
+    """What a device's clock and counter say, and how it lies to the time of all."""
+
+    name: str
+    offset_s: float | None = None  # stamp + offset is the time of all; None: out of step
+    counter: int | None = None
+    stamps: deque[float] = field(default_factory=lambda: deque(maxlen=SURE))
+    lags: deque[float] = field(default_factory=lambda: deque(maxlen=SURE))  # arrival - stamp
+
+    def forget(self) -> None:
+        self.offset_s = self.counter = None
+        self.stamps.clear()
+        self.lags.clear()
+
+
+@dataclass(eq=False)
+class _Instant:
+    time_s: float
+    arrived_s: float  # of its first picture
+    pictures: list[Picture | None]
+    steps: dict[int, int] = field(default_factory=dict)  # of the counters of cameras that took a picture
+
+
+class Instants:
+    """Puts the pictures together that cameras took at one instant.
+
+    The first camera gives the time. Another one comes into step by its first 16 pictures: those of one instant arrive
+    together, but for delays; the shortest ones count. From there on stamps alone decide, and follow the clock's drift.
+    An instant goes on with None for a camera whose picture is missing, late or not whole; `tell` gets the counts.
+    """
+
+    def __init__(self, names: Sequence[str], tell: Tell) -> None:
+        self._clocks = [_Clock(name) for name in names]
+        self._tell, self._begun_s = tell, math.nan  # arrival of the first picture
+        self._steps: deque[float] = deque(maxlen=32)  # between pictures of a camera
+        self._open: list[_Instant] = []  # in order of time
+        self._times: deque[float] = deque(maxlen=2 * JOINING)  # of those that are gone
+        self._number = -1
+        self._lacks, self._told, self._tell_s = Counter[str](), 0, -math.inf
+
+    @property
+    def _usual_s(self) -> float:
+        """Usual interval; 0: not known."""
+        return statistics.median(self._steps) if len(self._steps) >= 8 else min(self._steps, default=0.0)
+
+    def restart(self, camera: int) -> None:
+        """Forget a camera's clock: its device was opened."""
+        self._clocks[camera].forget()
+
+    def take(self, camera: int, shot: Shot) -> None:
+        """Take a picture of a camera. Raise MovieError: one of several whose device has no clock."""
+        clock, several = self._clocks[camera], len(self._clocks) > 1
+        if several and shot.stamp_s is None:
+            self._lacks[untimed := f"{clock.name} without a time stamp"] += 1
+            if self._lacks[untimed] > 1:  # a clock may begin at 0, which others give for none
+                do = "choose one camera with --cameras"
+                raise MovieError(refusal(clock.name, expected="time stamps of the device", got="none", do=do))
+            return
+        stamp_s = shot.arrived_s if shot.stamp_s is None else shot.stamp_s
+        near_s = NEAR * min(self._steps, default=0.0) if several else 0.0
+        step = 1 if shot.counter is None or clock.counter is None else max(1, shot.counter - clock.counter)
+        clock.counter = shot.counter
+        if clock.stamps:
+            step_s = stamp_s - clock.stamps[-1]
+            if -JUMP_S <= step_s <= near_s:
+                self._lacks[f"{clock.name} doubled"] += 1
+                return
+            if step_s < 0 or step_s * DRIFT > near_s > 0:
+                clock.forget()  # nobody knows how far it drifted
+            else:
+                self._steps.append(step_s)
+        clock.stamps.append(stamp_s)
+        clock.lags.append(shot.arrived_s - stamp_s)
+        self._begun_s = shot.arrived_s if math.isnan(self._begun_s) else self._begun_s
+        in_step = clock.offset_s is not None
+        clock.offset_s = clock.offset_s if in_step else self._offset_s(clock)
+        if clock.offset_s is None:
+            return
+        if self._times and stamp_s + clock.offset_s < self._times[-1] + near_s:
+            self._lacks[f"{clock.name} late"] += in_step
+            return
+        self._put(camera, stamp_s + clock.offset_s, shot, step, near_s)
+
+    def _offset_s(self, clock: _Clock) -> float | None:
+        """Return stamp + offset by the shortest delays, then by the instants that lie nearest; None: not known yet."""
+        since_s = clock.stamps[-1] + clock.lags[-1] - max(SILENT_S, SILENT * self._usual_s)
+        in_step = [one for one in self._clocks if one.offset_s is not None]
+        lead = next((one for one in in_step if one.stamps[-1] + one.lags[-1] > since_s), None)
+        if lead is None or lead.offset_s is None:
+            for one in in_step:  # they do not film any more
+                one.forget()
+            return clock.lags[-1] - self._begun_s
+        if len(clock.lags) % JOINING or len(lead.lags) < SHORTEST:
+            return None
+        own, of_lead = (np.sort(one.lags)[:SHORTEST] for one in (clock, lead))
+        offset_s = float(lead.offset_s + own[0] - of_lead[0])
+        times = np.array([*self._times, *(one.time_s for one in self._open)])
+        away = times[None] - (np.array(clock.stamps)[-JOINING:, None] + offset_s)
+        nearest = np.take_along_axis(away, abs(away).argmin(1)[:, None], 1)
+        middle, within_s = float(np.median(nearest)), NEAR * self._usual_s
+        agree = max(np.ptp(own), np.ptp(of_lead), 2 * np.median(abs(nearest - middle))) < within_s
+        return offset_s + middle if agree and (abs(middle) < within_s or len(clock.lags) == SURE) else None
+
+    def _put(self, camera: int, time_s: float, shot: Shot, step: int, near_s: float) -> None:
+        """Put a picture to its instant."""
+        clock = self._clocks[camera]
+        found = next((one for one in self._open if abs(one.time_s - time_s) < near_s), None)
+        if found is None:
+            found = _Instant(time_s, shot.arrived_s, [None] * len(self._clocks))
+            self._open = sorted([*self._open, found], key=lambda one: one.time_s)
+        elif clock.offset_s is not None:
+            clock.offset_s += FOLLOW * (found.time_s - time_s)
+        found.pictures[camera], found.steps[camera] = shot.picture, step
+        self._lacks[f"{clock.name} incomplete"] += shot.picture is None
+
+    @property
+    def due_s(self) -> float:
+        """When the next instant goes on with what it has, by the clock of time.perf_counter."""
+        return self._open[0].arrived_s + min(max(self._usual_s, LATE_S[0]), LATE_S[1]) if self._open else math.inf
+
+    def ready(self, now_s: float) -> Iterator[Arrival]:
+        """Yield the instants that wait for no picture any more, in order."""
+        while self._open and (self.due_s <= now_s or not self._awaited(self._open[0])):
+            yield self._arrival(self._open.pop(0))
+        if now_s > self._tell_s and (count := self._lacks.total()) > self._told:
+            self._told, self._tell_s = count, now_s + TOLD_S
+            lacks = ", ".join(f"{what} {count}" for what, count in self._lacks.items() if count)
+            self._tell(f"pictures not used or not there so far: {lacks}; frames go on without them.")
+
+    def _awaited(self, instant: _Instant) -> bool:
+        """Return whether a camera may yet give its picture of an instant."""
+        earliest_s = instant.time_s - SILENT * self._usual_s
+        return any(
+            clock.offset_s is not None and earliest_s < clock.stamps[-1] + clock.offset_s < instant.time_s
+            for camera, clock in enumerate(self._clocks)
+            if camera not in instant.steps
+        )
+
+    def _arrival(self, instant: _Instant) -> Arrival:
+        lost = min(instant.steps.values()) - 1  # by all
+        for camera, clock in enumerate(self._clocks):
+            missing = camera not in instant.steps and clock.offset_s is not None
+            self._lacks[f"{clock.name} missing"] += lost + missing
+        self._number += 1 + lost
+        self._times.append(instant.time_s)
+        pictures, arrived_s = instant.pictures, instant.arrived_s
+        return Arrival(number=self._number, time_s=instant.time_s, pictures=pictures, arrived_s=arrived_s)
