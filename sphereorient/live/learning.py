@@ -33,6 +33,7 @@ from sphereorient.pose.poses import Poses, supported
 
 Array = NDArray[Any]
 FIRST, MORE = 24, 1.5  # frames of the first adjustment, and by how many times more of the next one
+DRIFT_LEFT = 1 / 3  # of the error of turns at the first place, in frames that are not adjusted yet
 SINCE = 16  # of the frames that came meanwhile, evenly spread, that are added to its map: it must not take long
 
 
@@ -52,6 +53,7 @@ class LearningTracker:
         self._known = _unknown(place, self._pass)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
         self._lasting, self._error = self._known.lasting, OUTLINE_ERROR  # of the place, radii in pictures
+        self._drift_rad = 0.0  # of the frames that came while the map was adjusted
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
         self._adjusting: tuple[KeptFrames, Future[tuple[Array, ...]]] | None = None
@@ -72,7 +74,7 @@ class LearningTracker:
         """
         covariance = torch.zeros(6, 6, dtype=torch.float64)
         away = float(so3.log(poses.R_lab_body[0]).norm())
-        covariance[:3, :3] = (self._error * away) ** 2 * torch.eye(3, dtype=torch.float64)
+        covariance[:3, :3] = ((self._error * away) ** 2 + self._drift_rad**2) * torch.eye(3, dtype=torch.float64)
         return covariance
 
     def between(self) -> None:
@@ -88,6 +90,7 @@ class LearningTracker:
             self._pass, self._adjusting, self.number = moved, None, self.number + 1
             # Views that are farther apart tell the place better.
             self._error = OUTLINE_ERROR * min(1.0, TURNED_RAD / self._adjusted_by_rad)
+            self._drift_rad = OUTLINE_ERROR * DRIFT_LEFT * since.path_rad
         if self._adjusting is None and self._kept.count >= self._due and self._kept.turned_rad > TURNED_RAD:
             self._due, frames = MORE * self._kept.count, self._kept.so_far()
             self._adjusted_by_rad = self._kept.turned_rad

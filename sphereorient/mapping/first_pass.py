@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -324,6 +325,12 @@ class KeptFrames:
         """The largest turn from the first frame to another."""
         turns = [so3.geodesic_distance(self._rows[0].R_lab_body, one.R_lab_body) for one in self._rows]
         return max(map(float, turns), default=0.0)
+
+    @property
+    def path_rad(self) -> float:
+        """The sum of the turns from each frame to the next."""
+        R = [one.R_lab_body for one in self._rows]
+        return sum(float(so3.geodesic_distance(a, b)) for a, b in pairwise(R))
 
     def add(self, shots: Sequence[Frame], poses: Poses) -> None:
         """Keep a frame with a pose where the ball has turned since the last one that was kept."""

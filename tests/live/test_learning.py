@@ -48,6 +48,7 @@ def test_an_adjustment_takes_drift_away_and_the_body_frame_goes_on(ball):
     off_deg = torch.rad2deg(so3.geodesic_distance(R, ball.R[:70] @ ball.R[0].mT))  # the first frame is the zero
     assert (off_deg < 2.5 * lasting_deg + 0.2).all()
     assert lasting_deg[51] < 0.7 * lasting_deg[50]
+    assert off_deg[51:].max() < 0.5 * off_deg[50]
     steps = error_deg(R[1:] @ R[:-1].mT, ball.R[1:] @ ball.R[:-1].mT)
     assert steps[:50].median() < 0.2
     assert steps[51:].median() < 0.15
