@@ -18,7 +18,7 @@ from sphereorient.live.feed import Feed, Tell
 from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
-from sphereorient.live.page import LivePage, Monitor
+from sphereorient.live.page import Monitor, PageProcess
 from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
@@ -87,7 +87,7 @@ def _learning(
 
 
 def run_live(
-    opened: LiveSetUp, source: Source, outputs: Sequence[tuple[Output, str]], page: LivePage | None, tell: Tell
+    opened: LiveSetUp, source: Source, outputs: Sequence[tuple[Output, str]], page: PageProcess | None, tell: Tell
 ) -> Monitor:
     """Track the frames of a source until it ends, or Ctrl-C, and return what was counted. `outputs`: with what each
     takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines.
@@ -102,8 +102,7 @@ def run_live(
     feed = Feed(source.frames(recording), most=64, wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
     if page is not None:
-        page.views, page.radius_mm, page.save_map = views, recording.experiment.radius_mm, opened.save_map
-        page.monitor = monitor  # last: now it has begun
+        page.begin(recording, monitor.running, opened.save_map)
     try:
         with suppress(KeyboardInterrupt):
             for now in measured(tracker, views, monitor):
@@ -112,7 +111,9 @@ def run_live(
                     output.send(getattr(told, form))
                 if now.found:
                     feed.restart()
-                monitor.saw(now, None if page is None else told.columns)
+                monitor.saw(now)
+                if page is not None:
+                    page.saw(monitor.arrival, now)
     finally:
         feed.close()
     return monitor

@@ -190,7 +190,7 @@ class LslOutput(Output):
 
 
 class SharedOutput(Output):
-    """A ring of poses in a file that other programs map into memory (`shared`): all numbers (`lines.numbers_of`). A
+    """A ring of poses in a file that other programs map into memory (`shared`): all numbers (`lines.Quantities`). A
     reader that is slow sees by their count that it lost some. Raise OutputError: there is such a file, or no folder.
     """
 

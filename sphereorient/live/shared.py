@@ -1,9 +1,9 @@
-"""A ring of frames, as pictures or as poses, in a file that programs map into memory: one writes, others read the newest.
+"""A ring of frames, as pictures or as poses, in a file that programs map into memory: one writes, others read.
 
 Bytes, little-endian: "SPHEREO1"; then uint64: slots, bytes a slot, slots written so far, 1 at the end; then float64
-times (s) of the slots; then the slots. Number n lies in slot n % slots. A writer writes time and content first, then the
-number of slots written. A slot holds the pictures of all cameras at one instant, row by row; or a pose: float64 numbers
-in the order of `lines.numbers_of`, NaN for what is not known.
+times (s) of the slots; then the slots. Number n lies in slot n % slots. A writer writes time and content first, then
+the number of slots written. A slot holds the pictures of all cameras at one instant, row by row; or a pose: float64
+numbers in the order of `lines.Quantities`, NaN for what is not known.
 """
 
 import mmap
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment.recording import CameraStream
 from sphereorient.live.feed import Arrival, FrameBytes
-from sphereorient.live.lines import numbers_of
 
 MAGIC = b"SPHEREO1"
 SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # places of the numbers behind MAGIC
@@ -33,7 +32,7 @@ NEXT_S = 0.0002  # between looks for a new slot
 # No look before this share of the usual interval has passed: each holds up the thread that computes. From one frame to
 # the next that interval changes by these factors at most.
 NO_LOOK, SHRINKS, GROWS = 0.7, 0.5, 1.2
-POSES, POSE_BYTES = 4096, WORD * len(numbers_of("mm"))  # of a ring of poses: slots, and bytes of each
+POSES, POSE_BYTES = 4096, WORD * 33  # of a ring of poses: slots, and bytes of each
 
 
 class SharedFrames:
@@ -84,7 +83,7 @@ Slot = tuple[int, float, bytes, float]  # number, time (s), content, when it was
 
 
 class SlotReader:
-    """A ring that another program writes, of slots of `size` bytes. Raise MovieError: none there, or of another size."""
+    """A ring that another program writes, slots of `size` bytes. Raise MovieError: none there, or of another size."""
 
     def __init__(self, path: Path, size: int) -> None:
         try:
@@ -137,7 +136,7 @@ def shared_frames(path: Path, streams: Sequence[CameraStream]) -> Iterator[Arriv
 
 
 def shared_poses(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield the poses of a ring, (33,) in the order of `numbers_of`, with their count, as `shared_slots` does."""
+    """Yield the poses of a ring, (33,) in the order of `Quantities`, with their count, as `shared_slots` does."""
     for number, _, content, _ in shared_slots(path, POSE_BYTES):
         yield number, np.frombuffer(content, "<f8")
 
@@ -153,8 +152,8 @@ def shared_slots(path: Path, size: int) -> Iterator[Slot]:
         for found in _slots(SlotReader(path, size), path):
             if again := found is None:
                 break
-            number, *content = found
-            yield before + number, *content
+            number, time_s, content, arrived_s = found
+            yield before + number, time_s, content, arrived_s
         before += number + 1
 
 

@@ -15,10 +15,11 @@ from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import Experiment, open_movies
 from sphereorient.experiment.recording import given_mask
+from sphereorient.files.page_server import Answer, Json
 from sphereorient.files.picture import eight_bits, write_picture
 from sphereorient.movies import Movie, flipped_picture
 from sphereorient.preflight.first_look import FirstLook, look_at_movie
-from sphereorient.preflight.mark import Json, Marking, png
+from sphereorient.preflight.mark import Marking, png
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
@@ -44,7 +45,7 @@ class MaskMarking(Marking):
         """What each movie shows without any mask drawn here."""
         return {name: look_at_movie(name, movie, self.masks[name]) for name, movie in self.movies.items()}
 
-    def shown(self, steps: Sequence[str]) -> bytes | Json | None:
+    def shown(self, steps: Sequence[str]) -> Answer:
         """Return the state, a frame, a mask, an outline or a rendered ball."""
         match steps:
             case ["state"]:
@@ -57,7 +58,7 @@ class MaskMarking(Marking):
                 return self.outline(name)
             case ["rendered", name]:
                 return self.rendered(name)
-        return None
+        return super().shown(steps)
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Save the mask of a camera, of `shapes` and `keep`."""
