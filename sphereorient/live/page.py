@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -37,6 +38,7 @@ from sphereorient.live.feed import Arrival, Feed, FrameBytes, Tell
 from sphereorient.live.lines import FicTracLines
 from sphereorient.live.live import Measured
 from sphereorient.live.shared import POSES, SharedFrames, SlotReader
+from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
 from sphereorient.trajectory.walk import FICTRAC
 
@@ -268,6 +270,10 @@ class LivePage:
         self._told_s: deque[float] = deque(maxlen=KEPT)  # when a frame was measured
         self._path: deque[tuple[float, float]] = deque(maxlen=20_000)
 
+    @cached_property
+    def _setup(self) -> MaskMarking:
+        return MaskMarking(self._recording.experiment.path)
+
     def follow(self) -> None:
         """Take what the loop writes and answers, until its process ends."""
         with suppress(EOFError, OSError):
@@ -311,12 +317,16 @@ class LivePage:
                 return PAGE
             case ["look"]:
                 return self.look()
+            case ["setup", *rest]:
+                return self._setup.shown(rest)
         return None
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Answer:
         """Start or stop measuring, or save the map: the loop does it; raise OutputError where it cannot."""
         self.take()
         match steps:
+            case ["setup", *rest]:
+                return self._setup.done(rest, asked)
             case ["start" | "stop" | "save" as word] if self._rings is not None:
                 with self._asking:
                     self._commands.send_bytes(word.encode())

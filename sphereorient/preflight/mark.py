@@ -55,7 +55,7 @@ class Marking(ABC):
         except FAULTS as fault:
             raise self.refused(str(self.path), "YAML", yaml_words(fault), "correct the file there") from None
 
-    def write(self, place: Sequence[str | int], value: Mapping[str, Any], by_hand: str) -> None:
+    def write(self, place: Sequence[str | int], value: Any, by_hand: str) -> None:
         """Write a value in one line of the file, whose other lines stay, see `with_value`; `by_hand`: else to do."""
         text = with_value(self._text(), place, value)
         if text is None:
