@@ -180,7 +180,9 @@ class _LiveOptions(CameraOptions):
     ] = "movie"
     to: Annotated[
         list[str] | None,
-        Option(help="Repeatable: tcp:PORT, udp:, zmq:, osc:, serial:PORT@BAUD, lsl:NAME, shared:FILE, .dat, .jsonl, .h5"),
+        Option(
+            help="Repeatable: tcp:PORT, udp:, zmq:, osc:, serial:PORT@BAUD, lsl:NAME, shared:FILE, .dat, .jsonl, .h5"
+        ),
     ] = None
     record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
