@@ -106,46 +106,49 @@ class MaskMarking(Marking):
         """Track the clip with the `shapes` of a mask, `keep`, and what else is given: `circle`, u, v, radius, px;
         `light`, a value of the key response; `vfov_deg`. Raise SphereOrientError where one is impossible.
         """
-        shown = drawn_mask(self._movie(name).frame_shape, asked["shapes"], self.masks[name] if asked["keep"] else None)
         with self.lock, tempfile.TemporaryDirectory() as folder:
-            tried, mask = self.experiment, Path(folder, "mask.png")
-            flip = tried.flip.get(name, "none")
-            write_picture(mask, flipped_picture(np.where(shown, 255, 0).astype(np.uint8), flip))
-            tried = replace(tried, mask_paths=tried.mask_paths | {name: mask})
-            if asked.get("circle") is not None:
-                tried = replace(tried, circles=tried.circles | {name: _circle(asked["circle"])})
-            if asked.get("light") is not None:
-                tried = replace(tried, response=tried.response | {name: response_of("light", asked["light"])})
-            if asked.get("vfov_deg") is not None:
-                cameras = Path(folder, "cameras.yaml")
-                write_text(cameras, self._cameras(name, asked["vfov_deg"]))
-                tried = replace(tried, cameras={one: load_cameras(cameras)[one] for one in tried.cameras})
-            return self.clip.tracked(tried)
+            return self.clip.tracked(self._changed(name, asked, Path(folder)))
+
+    def _changed(self, name: str, asked: Mapping[str, Any], folder: Path) -> Experiment:
+        shown = drawn_mask(self._movie(name).frame_shape, asked["shapes"], self.masks[name] if asked["keep"] else None)
+        tried = self.experiment
+        write_picture(folder / "mask.png", self._as_filmed(name, shown))
+        tried = replace(tried, mask_paths=tried.mask_paths | {name: folder / "mask.png"})
+        if asked.get("circle") is not None:
+            tried = replace(tried, circles=tried.circles | {name: _circle(asked["circle"])})
+        if asked.get("light") is not None:
+            tried = replace(tried, response=tried.response | {name: response_of("light", asked["light"])})
+        if asked.get("vfov_deg") is not None:
+            write_text(folder / "cameras.yaml", self._cameras(name, asked["vfov_deg"]))
+            known = load_cameras(folder / "cameras.yaml")
+            tried = replace(tried, cameras={one: known[one] for one in tried.cameras})
+        return tried
 
     def adopt(self, name: str, asked: Mapping[str, Any]) -> Json:
-        """Write what `track` was asked into mask, experiment.yaml and cameras.yaml, whose other lines stay."""
-        content, files = self.read(), []
-        cameras = None if asked.get("vfov_deg") is None else self._cameras(name, asked["vfov_deg"])
-        circle = None if asked.get("circle") is None else _circle(asked["circle"])
+        """Write what `track` would be asked into mask, experiment.yaml and cameras.yaml, whose other lines stay."""
+        with self.lock, tempfile.TemporaryDirectory() as folder:
+            tried = self._changed(name, asked, Path(folder))  # all of it is possible
+        keys: Json = {}
+        if asked.get("circle") is not None:
+            keys["circles"] = {one: [round(part, 2) for part in circle] for one, circle in tried.circles.items()}
         if asked.get("light") is not None:
-            response_of("light", asked["light"])
-        if asked["shapes"]:
-            files.append(self.save(name, asked["shapes"], keep=bool(asked["keep"]))["file"])
+            old = self.read().get("response")
+            each = old if isinstance(old, dict) and old.keys() != {"gamma"} else dict.fromkeys(self.movies, old)
+            keys["response"] = {one: part for one, part in (each | {name: asked["light"]}).items() if part is not None}
+        files = [self.save(name, asked["shapes"], keep=bool(asked["keep"]))["file"]] if asked["shapes"] else []
         with self.lock:
-            if circle is not None:
-                value = dict(content.get("circles") or {}) | {name: [round(part, 2) for part in circle]}
-                self.write(["circles"], value, f"write circles: {flow(value)} there")
-            if asked.get("light") is not None:
-                old = content.get("response")
-                each = old if isinstance(old, dict) and old.keys() != {"gamma"} else dict.fromkeys(self.movies, old)
-                value = {one: part for one, part in (each | {name: asked["light"]}).items() if part is not None}
-                self.write(["response"], value, f"write response: {flow(value)} there")
-            if cameras is not None:
+            for key, value in keys.items():
+                self.write([key], value, f"write {key}: {flow(value)} there")
+            if asked.get("vfov_deg") is not None:
                 with writing(force=True):
-                    write_text(self.experiment.cameras_path, cameras)
-                files.append(str(self.experiment.cameras_path))
+                    write_text(tried.cameras_path, self._cameras(name, asked["vfov_deg"]))
+                files.append(str(tried.cameras_path))
             self.experiment = load_experiment(self.path)
         return {"files": [*files, str(self.path)]}
+
+    def _as_filmed(self, name: str, shown: Bools) -> NDArray[np.uint8]:
+        """Return a mask as a picture, flipped as the movie's file is."""
+        return flipped_picture(np.where(shown, 255, 0).astype(np.uint8), self.experiment.flip.get(name, "none"))
 
     def _cameras(self, name: str, vfov_deg: object) -> str:
         """Return the text of cameras.yaml with another field of view of a camera."""
@@ -235,10 +238,9 @@ class MaskMarking(Marking):
         shown), OutputError (a file cannot be written).
         """
         shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
-        flip = self.experiment.flip.get(name, "none")
         file = self.path.parent / f"{name}_mask.png"
         with self.lock:
-            write_picture(file, flipped_picture(np.where(shown, 255, 0).astype(np.uint8), flip))
+            write_picture(file, self._as_filmed(name, shown))
             masks = dict((self.read() or {}).get("masks") or {})
             if masks.get(name) != file.name:
                 self.write(["masks"], masks | {name: file.name}, f"write masks: {{{name}: {file.name}}} there")

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_examples import LIMIT_S, until
+from live_examples import LIMIT_S, rows, until
+from overlay_examples import true_track
 
 from sphereorient.errors import MovieError, OutputError
-from sphereorient.live.lines import numbers_of
+from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.outputs import open_output
 from sphereorient.live.shared import POSES, shared_poses
 
-NAMES = list(numbers_of("mm"))
+NAMES = list(Told(next(rows(true_track())), FicTracLines(np.eye(3)), Quantities(True)).numbers)
 READER = """
 import sys
 from pathlib import Path
