@@ -14,7 +14,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -137,16 +136,6 @@ class Monitor:
         ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Plan:
-    """What the page's process is told."""
-
-    experiment: Path
-    cameras: Sequence[str] | None
-    folder: Path  # of the rings
-    token: str
-
-
 class PageWriter:
     """The loop side of the page: it copies a row of each frame, and at most `PICTURES_HZ` times a second its pictures,
     into rings in a folder, and obeys commands. `tell` gets a line where none can come any more.
@@ -213,10 +202,11 @@ class PageProcess(PageWriter):
         door, token = listen(port, "--page", OutputError), new_token()
         memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
         folder = Path(tempfile.mkdtemp(prefix="sphereorient-", dir=memory))
-        plan = _Plan(experiment=experiment, cameras=cameras, folder=folder, token=token)
         spawn = multiprocessing.get_context("spawn")
         commands, theirs = spawn.Pipe()
-        self.process = spawn.Process(target=_serve, args=(plan, door, theirs), name="page", daemon=True)
+        self.process = spawn.Process(
+            target=_serve, args=(experiment, cameras, folder, token, door, theirs), name="page", daemon=True
+        )
         self.process.start()
         self.address = address(door, token)
         door.close()
@@ -239,7 +229,9 @@ def _saved(save_map: Callable[[], str] | None) -> str:
     return save_map()
 
 
-def _serve(plan: _Plan, door: socket.socket, commands: Connection) -> None:
+def _serve(
+    experiment: Path, cameras: Sequence[str] | None, folder: Path, token: str, door: socket.socket, commands: Connection
+) -> None:
     """Serve the page until the loop's process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
     if hasattr(os, "nice"):
@@ -247,11 +239,11 @@ def _serve(plan: _Plan, door: socket.socket, commands: Connection) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     limit_cores(1)
-    with open_recording(plan.experiment, plan.cameras, textured=False) as recording:
-        page = LivePage(recording, plan.folder, commands)
-        Thread(target=PageServer(page, door, plan.token).serve_forever, name="page", daemon=True).start()
+    with open_recording(experiment, cameras, textured=False) as recording:
+        page = LivePage(recording, folder, commands)
+        Thread(target=PageServer(page, door, token).serve_forever, name="page", daemon=True).start()
         page.follow()
-    shutil.rmtree(plan.folder, ignore_errors=True)  # where the loop was killed
+    shutil.rmtree(folder, ignore_errors=True)  # where the loop was killed
 
 
 class LivePage:
