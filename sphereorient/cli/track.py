@@ -183,7 +183,9 @@ class _LiveOptions(CameraOptions):
     ] = "movie"
     to: Annotated[
         list[str] | None,
-        Option(help="Repeatable: tcp:PORT, udp:, zmq:, osc:PORT, serial:PORT@BAUD, lsl:NAME, .dat, .jsonl, .h5"),
+        Option(
+            help="Repeatable: tcp:PORT, udp:, zmq:, osc:, serial:PORT@BAUD, lsl:NAME, shared:FILE, .dat, .jsonl, .h5"
+        ),
     ] = None
     record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
@@ -201,7 +203,7 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.live.live import TrackBlocks
     from sphereorient.live.loop import open_live, run_live
     from sphereorient.live.outputs import open_output
-    from sphereorient.live.page import LivePage, open_page
+    from sphereorient.live.page import PageProcess
     from sphereorient.live.sources import recorded, source_of
     from sphereorient.movies.record import Recorder
 
@@ -216,10 +218,9 @@ def live(given: _LiveOptions) -> None:
             got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
             raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
         if given.page is not None:
-            page = LivePage()
-            server = opened.enter_context(open_page(page, given.page))
-            opened.callback(server.shutdown)
-            typer.echo(f"page: {server.address}", err=True)
+            page = PageProcess(given.experiment, given.names, given.page, _tell)
+            opened.callback(page.close)
+            typer.echo(f"page: {page.address}", err=True)
         set_up = opened.enter_context(open_live(given.experiment, chosen, given.names, given.learnt))
         blocks = TrackBlocks(
             recording=set_up.recording,

@@ -55,6 +55,9 @@ class Experiment:
     spheres: tuple[Sphere, ...] = (Sphere(),)
     mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something static hides the sphere
     background_paths: dict[str, Path] = field(default_factory=dict)  # scene without the sphere
+    circles: dict[str, tuple[float, float, float]] = field(
+        default_factory=dict
+    )  # outline of a fixed ball: u, v, radius
     times: str | None = None  # path of a table, or "movies": their time stamps; None: constant frame rate
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
     start_given: bool = False  # whether the file has `start`; time stamps then begin there
@@ -186,6 +189,7 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     spheres: dict[str, SphereKeys] = Field(default_factory=dict, min_length=1)
     masks: dict[str, str] = Field(default_factory=dict)
     backgrounds: dict[str, str] = Field(default_factory=dict)
+    circles: dict[str, tuple[FiniteFloat, FiniteFloat, Positive]] = Field(default_factory=dict)
     cameras: str
     movies: dict[str, str] = Field(min_length=1, max_length=MAX_CAMERAS)
     start: dict[str, FrameNumber] = Field(default_factory=dict)
@@ -211,7 +215,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
     needed = (("frame_rate", "times"), ("sphere", "spheres"))
     missing = [" or ".join(either) for either in needed if not document.keys() & set(either)]
     keys = validated(ExperimentKeys, document, str(path), ExperimentError, missing)
-    for key in ("masks", "backgrounds", "start", "flip", "camera"):
+    for key in ("masks", "backgrounds", "circles", "start", "flip", "camera"):
         check_known(getattr(keys, key), keys.movies, f"{path}, {key}", ExperimentError)
     _check_numbers(path, keys)
     _check_spheres(path, keys)
@@ -247,6 +251,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
         spheres=tuple(sphere(name, one) for name, one in spheres.items()),
         mask_paths=at(keys.masks),
         background_paths=at(keys.backgrounds),
+        circles=dict(keys.circles),
         times=keys.times if keys.times in (None, MOVIES_OWN) else str(path.parent / str(keys.times)),
         start={name: keys.start.get(name, 0) for name in keys.movies},
         start_given=bool(keys.start),
@@ -301,12 +306,13 @@ def _responses(where: str, given: Any, cameras: Sequence[str]) -> dict[str, Resp
     if given is None:
         return {}
     if not isinstance(given, dict) or given.keys() == {"gamma"}:
-        return dict.fromkeys(cameras, _response(where, given))
+        return dict.fromkeys(cameras, response_of(where, given))
     check_known(given, cameras, where, ExperimentError)
-    return {name: _response(f"{where}.{name}", one) for name, one in given.items()}
+    return {name: response_of(f"{where}.{name}", one) for name, one in given.items()}
 
 
-def _response(where: str, given: Any) -> Response:
+def response_of(where: str, given: Any) -> Response:
+    """Return the response that a value of the key `response` describes; ExperimentError, with `where`: none does."""
     with suppress(ValueError, TypeError, AttributeError):
         if given in ("linear", "srgb"):
             return Response(srgb=given == "srgb")

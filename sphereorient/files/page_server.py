@@ -1,16 +1,34 @@
-"""What the pages of `mark` and `live` share: a server that answers this machine alone, to who knows its address."""
+"""The server of pages in the browser: it answers this machine alone, to who knows the random token of the address."""
 
 import json
 import secrets
-from collections.abc import Callable
+import socket
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 from urllib.parse import unquote
 
 from sphereorient.errors import SphereOrientError, error_words, refusal
 
 HOST = "127.0.0.1"
+MOST_BYTES = 1_000_000  # of a request
+KINDS = {".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8"}
+KINDS |= {".js": "text/javascript; charset=utf-8"}
+Json = dict[str, Any]
+Answer = Path | bytes | Json | None  # a file of the page, a picture as PNG, values, or nothing
+
+
+class Page(Protocol):
+    """What lies behind the token; it is asked from several threads. `steps` are the parts of the path."""
+
+    def shown(self, steps: Sequence[str]) -> Answer:
+        """Return what lies at a path; None: nothing."""
+
+    def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Answer:
+        """Do what is asked for at a path, and return what was done; None: nothing is done there."""
 
 
 def new_token() -> str:
@@ -18,28 +36,78 @@ def new_token() -> str:
     return secrets.token_urlsafe(16)
 
 
-class PageHandler(BaseHTTPRequestHandler):
+def listen(port: int, option: str, error: type[SphereOrientError]) -> socket.socket:
+    """Return a socket of this machine for a page; port 0: any free one. Raise `error`, with the `option`: in use."""
+    try:
+        return socket.create_server((HOST, port))
+    except OSError as fault:
+        do, got = f"choose another {option}", error_words(fault)
+        raise error(refusal(f"{option} {port}", expected="a free port", got=got, do=do)) from None
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves a page on a socket of `listen`; call `serve_forever`."""
+
+    def __init__(self, page: Page, door: socket.socket, token: str) -> None:
+        class Handler(_Handler):
+            pass
+
+        Handler.page, Handler.token = page, token
+        super().__init__(door.getsockname(), Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = door
+        self.address = address(door, token)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing where who asked has gone away."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
+def address(door: socket.socket, token: str) -> str:
+    """Return the address of the page on a socket."""
+    return f"http://{HOST}:{door.getsockname()[1]}/{token}/"
+
+
+class _Handler(BaseHTTPRequestHandler):
     """Answers requests whose path begins with the token and that name this machine."""
 
     protocol_version = "HTTP/1.1"
-    token: str  # of the class that a server is given
+    page: Page
+    token: str
 
-    def _steps(self) -> list[str] | None:
-        """Return the parts of the path behind the token; None for who does not know it, or another host's page."""
+    def do_GET(self) -> None:
+        self._answer(self.page.shown)
+
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdigit() or int(length) > MOST_BYTES:
+            self.close_connection = True
+            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+            return
+        content = self.rfile.read(int(length))
+        try:
+            asked = json.loads(content)
+        except (ValueError, RecursionError):
+            asked = None
+        self._answer(lambda steps: self.page.done(steps, asked if isinstance(asked, dict) else {}))
+
+    def _answer(self, make: Callable[[Sequence[str]], Answer]) -> None:
+        """Send what `make` returns of the path behind the token, or its error; nothing is there where it is None, for
+        who does not know the token, and for another host's page.
+        """
         host = self.headers.get("Host", "").rpartition(":")[0]
         first, *steps = self.path.partition("?")[0].lstrip("/").split("/")
-        known = secrets.compare_digest(first.encode(), self.token.encode())
-        return [unquote(step) for step in steps] if known and host in (HOST, "localhost") else None
-
-    def _answer(self, make: Callable[[], Any]) -> None:
-        """Send what `make` returns, a PNG file or values, or its error; nothing is there where it is None."""
+        known = secrets.compare_digest(first.encode(), self.token.encode()) and host in (HOST, "localhost")
         try:
-            answer = make()
+            answer = make([unquote(step) for step in steps]) if known else None
         except SphereOrientError as error:
             self._send(json.dumps({"error": str(error)}).encode(), "application/json", HTTPStatus.BAD_REQUEST)
             return
         if answer is None:
             self.send_error(HTTPStatus.NOT_FOUND)
+        elif isinstance(answer, Path):
+            self._send(answer.read_bytes(), KINDS[answer.suffix])
         elif isinstance(answer, bytes):
             self._send(answer, "image/png")
         else:
@@ -56,15 +124,3 @@ class PageHandler(BaseHTTPRequestHandler):
 
     def log_message(self, form: str, *values: object) -> None:
         """Print nothing: the page tells what happens."""
-
-
-class PageServer(ThreadingHTTPServer):
-    """Serves a page on this machine; port 0: any free one. Raise `error`, with the `option`, for a port in use."""
-
-    def __init__(self, handler: type[PageHandler], port: int, option: str, error: type[SphereOrientError]) -> None:
-        try:
-            super().__init__((HOST, port), handler)
-        except OSError as fault:
-            do, got = f"choose another {option}", error_words(fault)
-            raise error(refusal(f"{option} {port}", expected="a free port", got=got, do=do)) from None
-        self.address = f"http://{HOST}:{self.server_address[1]}/{handler.token}/"

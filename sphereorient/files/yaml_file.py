@@ -128,8 +128,8 @@ def parse_yaml(text: str) -> Any:
     return _BoundedLoader(text).get_single_data()
 
 
-def with_value(text: str, place: Sequence[str | int], value: Mapping[str, Any]) -> str | None:
-    """Return a YAML text with the mapping at `place`, keys and numbers of list entries, written in one line there; all
+def with_value(text: str, place: Sequence[str | int], value: Any) -> str | None:
+    """Return a YAML text with the value at `place`, keys and numbers of list entries, written in one line there; all
     else, comments included, stays. An absent last key is added, in the place of one that is commented out. None where
     that could lose something: an old value in several lines, or a form that is not understood.
     """

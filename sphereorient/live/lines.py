@@ -29,42 +29,45 @@ class FicTracLines:
 
     def __init__(self, R_cam_lab: Floats) -> None:
         self._R_cam_lab = R_cam_lab  # (3, 3)
-        self._before: Measured | None = None
+        self._before: tuple[float, Floats] | None = None  # time, s, and R_lab_body (3, 3) of the frame before
         self._first = np.eye(3)  # R_lab_body where this stretch begins
         self._sequence = 0
         self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
 
-    def columns(self, now: Measured) -> Floats:
-        """Return the columns (25,) of the next frame."""
-        before, self._before = self._before, now
-        start = now.valid and (before is None or not before.valid)
+    def columns(self, number: int, time_s: float, R_lab_body: Floats, error_rad: float) -> Floats:
+        """Return the columns (25,) of the next frame: its number, time, orientation (3, 3), NaN without a pose, and
+        stated error.
+        """
+        before, self._before = self._before, (time_s, R_lab_body)
+        valid = math.isfinite(R_lab_body[0, 0])
+        start = valid and (before is None or not math.isfinite(before[1][0, 0]))
         if start:
-            self._first, self._sequence = now.R_lab_body, 0
+            self._first, self._sequence = R_lab_body, 0
             self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
-        R_before = now.R_lab_body if before is None or start else before.R_lab_body
-        turn = rotation_vectors((now.R_lab_body @ R_before.T)[None])
+        R_before = R_lab_body if before is None or start else before[1]
+        turn = rotation_vectors((R_lab_body @ R_before.T)[None])
         ahead, right, about, step = arcs(turn)
-        if now.valid:
+        if valid:
             self._path = self._path + turned(step, np.array([self._heading]))
             self._heading = (self._heading + float(about[0])) % (2 * math.pi)
             self._sums = self._sums + np.column_stack([ahead, right])
         self._sequence += 1
-        nothing = 0.0 if now.valid else np.nan
+        nothing = 0.0 if valid else np.nan
         rows = fictrac_rows(
             self._R_cam_lab,
-            (now.R_lab_body @ self._first.T)[None],
+            (R_lab_body @ self._first.T)[None],
             ahead,
             right,
             np.array([start]),
-            frame=now.number + 1,
+            frame=number + 1,
             turn_lab=turn,
-            error=now.error_rad,
+            error=error_rad,
             path=self._path + nothing,
             heading=self._heading + nothing,
             sums=self._sums + nothing,
-            time_ms=1e3 * now.time_s,
+            time_ms=1e3 * time_s,
             sequence=self._sequence,
-            step_ms=math.nan if before is None else 1e3 * (now.time_s - before.time_s),
+            step_ms=math.nan if before is None else 1e3 * (time_s - before[0]),
         )
         return rows.ravel()
 
@@ -144,7 +147,8 @@ class Told:
     @cached_property
     def columns(self) -> Floats:
         """FicTrac's columns (25,)."""
-        return self.table.columns(self.now)
+        now = self.now
+        return self.table.columns(now.number, now.time_s, now.R_lab_body, now.error_rad)
 
     @cached_property
     def fictrac(self) -> str:

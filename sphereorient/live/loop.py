@@ -18,7 +18,7 @@ from sphereorient.live.feed import Feed, Tell
 from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
-from sphereorient.live.page import LivePage, Monitor
+from sphereorient.live.page import Monitor, PageProcess
 from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
@@ -87,15 +87,15 @@ def _learning(
 
 
 def run_live(
-    opened: LiveSetUp, source: Source, outputs: Sequence[tuple[Output, str]], page: LivePage | None, tell: Tell
+    opened: LiveSetUp, source: Source, outputs: Sequence[tuple[Output, str]], page: PageProcess | None, tell: Tell
 ) -> Monitor:
     """Track the frames of a source until it ends, or Ctrl-C, and return what was counted. `outputs`: with what each
     takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines.
     """
     recording, tracker = opened.recording, opened.tracker
-    first, *others = tracker.appearances
-    views, several = tracker.appearances[first].fitter.views, bool(others)
-    table, experiment = FicTracLines(views[0].camera.R_cam_lab.numpy()), recording.experiment
+    first = next(iter(tracker.appearances))  # of several balls the page shows this one
+    experiment, camera = recording.experiment, recording.streams[0].camera
+    table = FicTracLines(camera.R_cam_lab.numpy())
     known = {ball: Quantities(experiment.of(ball).fixed, experiment.length_unit, ball) for ball in tracker.appearances}
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
@@ -103,8 +103,7 @@ def run_live(
     feed = Feed(source.frames(recording), most=64, wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
     if page is not None:
-        page.views, page.radius_mm, page.save_map = views, recording.experiment.radius_mm, opened.save_map
-        page.monitor = monitor  # last: now it has begun
+        page.begin(recording, monitor.running, opened.save_map)
     try:
         # In one thread: a second one may wait for a core that another program has.
         with suppress(KeyboardInterrupt), limited_cores(1):
@@ -114,8 +113,9 @@ def run_live(
                     output.send(getattr(told, form))
                 if now.found:
                     feed.restart()
-                if now.ball == first:
-                    monitor.saw(now, None if page is None or several else told.columns)
+                monitor.saw(now)
+                if page is not None and now.ball == first:
+                    page.saw(monitor.arrival, now)
     finally:
         feed.close()
     return monitor

@@ -14,11 +14,14 @@ from pathlib import Path
 from threading import Condition, Thread
 from typing import IO, Any
 
+import numpy as np
+
 from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.page_server import HOST
 from sphereorient.files.provenance import package
 from sphereorient.live.feed import Tell
 from sphereorient.live.live import TrackBlocks
+from sphereorient.live.shared import POSE_BYTES, POSES, SharedFrames
 from sphereorient.trajectory import Trajectory, journal
 
 MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
@@ -184,6 +187,24 @@ class LslOutput(Output):
     def close(self) -> None:
         """End the stream."""
         self._outlet = None
+
+
+class SharedOutput(Output):
+    """A ring of poses in a file that other programs map into memory (`shared`): all numbers (`lines.Quantities`). A
+    reader that is slow sees by their count that it lost some. Raise OutputError: there is such a file, or no folder.
+    """
+
+    def __init__(self, address: str, tell: Tell) -> None:
+        check_new(Path(address))
+        self._ring = SharedFrames(Path(address), POSE_BYTES, POSES)
+
+    def send(self, numbers: dict[str, float]) -> None:
+        """Write a pose; nobody is waited for."""
+        self._ring.write(numbers["time_s"], [np.fromiter(numbers.values(), np.float64)])
+
+    def close(self) -> None:
+        """Tell readers the end, and remove the file."""
+        self._ring.close()
 
 
 class SerialOutput(Output):
@@ -396,6 +417,7 @@ NAMED: Mapping[str, tuple[Callable[[str, Tell], Output], str]] = {
     "serial": (SerialOutput, "marked"),
     "serial-short": (SerialOutput, "short"),
     "lsl": (LslOutput, "numbers"),
+    "shared": (SharedOutput, "numbers"),
 }
 FILES: Mapping[str, tuple[Callable[[Path, Tell], Output], str]] = {
     ".dat": (FileOutput, "fictrac"),
@@ -417,7 +439,8 @@ def open_output(name: str, tell: Tell) -> tuple[Output, str]:
     if (suffix := Path(name).suffix) in FILES:
         to_file, form = FILES[suffix]
         return to_file(Path(name), tell), form
-    others = ["serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME", *(f"NAME{suffix}" for suffix in FILES)]
+    named = "serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME", "shared:FILE"
+    others = [*named, *(f"NAME{suffix}" for suffix in FILES)]
     expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others])
     do = "choose one of these; another machine is tcp:HOST:PORT"
     raise SettingsError(refusal("--to", expected=expected, got=name, do=do))

@@ -1,16 +1,26 @@
-"""What `live` counts and keeps of its frames, for the summary and for the page that shows it while it runs; the page
-draws the newest frame when asked, in threads of its own.
+"""What `live` counts of its frames, for the summary; and its page in the browser, which a process of its own serves and
+draws: the loop writes poses and, now and then, pictures into memory that both see.
 """
 
 import base64
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import socket
+import tempfile
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from http import HTTPStatus
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
+from multiprocessing.connection import Connection
 from pathlib import Path
-from threading import Event, Thread
+from queue import SimpleQueue
+from threading import Event, Lock, Thread
 from typing import Any
 
 import cv2
@@ -18,13 +28,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.errors import OutputError, Reason, refusal
-from sphereorient.files.page_server import PageHandler, PageServer, new_token
+from sphereorient.errors import MovieError, OutputError, Reason, SphereOrientError, refusal
+from sphereorient.experiment.recording import Recording, open_recording
+from sphereorient.files.page_server import Answer, Json, PageServer, address, listen, new_token
 from sphereorient.files.picture import eight_bits
 from sphereorient.files.provenance import without_nan
-from sphereorient.live.feed import Arrival, Feed, Tell
+from sphereorient.files.threads import limit_cores
+from sphereorient.live.feed import Arrival, Feed, FrameBytes, Tell
+from sphereorient.live.lines import FicTracLines
 from sphereorient.live.live import Measured
-from sphereorient.pose import CameraView
+from sphereorient.live.shared import POSES, SharedFrames, SlotReader
+from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
 from sphereorient.trajectory.walk import FICTRAC
 
@@ -51,34 +65,36 @@ NOT_EXPLAINED = (
 )
 PAGE = Path(__file__).with_name("page.html")
 WIDEST = 640  # px, of a picture that is sent
-Json = dict[str, Any]
+PICTURES_HZ = 30.0  # at most, that the page gets
+TAKE_S = 0.1  # between looks for new poses
+WORD, ROW = 8, 5 + 3 + 9  # of a frame: number, time (s), latency (ms), dropped, error (rad), position (mm), R_lab_body
+REASONS = list(Reason)
+STOPPED = "Tracking is stopped: no frame is measured."
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
-    """The newest frame."""
+@dataclass(eq=False)
+class _Absence:
+    """Since when a ball is not found."""
 
-    arrival: Arrival
-    now: Measured
-    heading_rad: float
+    lost: tuple[float, Measured] | None = None  # time of the source, s, and the last frame without a pose
+    told: bool = False
+    in_a_row: int = 0  # frames with a pose
 
 
 class Monitor:
-    """Hands on the frames of a feed, waiting while it is stopped, and takes what was measured: a few references."""
+    """Hands on the frames of a feed, waiting while it is stopped, and counts what was measured. Of several balls a frame
+    counts as lost if it shows one of them nowhere.
+    """
 
     def __init__(self, feed: Feed, tell: Tell = lambda line: None) -> None:
         self.count = self.lost = 0
-        self.newest: Seen | None = None
         self.latency_ms: deque[float] = deque(maxlen=KEPT)
-        self.told_s: deque[float] = deque(maxlen=KEPT)  # when a frame was measured, by the clock of time.perf_counter
-        self.path: deque[tuple[float, float]] = deque(maxlen=20_000)
         self.running = Event()
         self.running.set()
         self._feed, self._tell = feed, tell
-        self._lost: tuple[float, Measured] | None = None  # since when, of the source, and the last frame without a pose
-        self._told = False
-        self._in_a_row = 0  # frames with a pose
-        self._arrival: Arrival | None = None
+        self._absence: defaultdict[str, _Absence] = defaultdict(_Absence)  # of each ball
+        self._counted = self._counted_lost = -1  # numbers of the last frames
+        self.arrival: Arrival  # the last frame
 
     @property
     def dropped(self) -> int:
@@ -88,46 +104,44 @@ class Monitor:
     def __iter__(self) -> Iterator[Arrival]:
         for arrival in self._feed:
             self.running.wait()
-            self._tell_lost(max(arrival.time_s, self._feed.newest_s))  # before this one is searched: that takes long
-            self._arrival = arrival
+            for absence in self._absence.values():  # before this one is searched: that takes long
+                self._tell_lost(absence, max(arrival.time_s, self._feed.newest_s))
+            self.arrival = arrival
             yield arrival
 
-    def saw(self, now: Measured, columns: NDArray[np.float64] | None) -> None:
-        """Take what was measured of the last frame, with FicTrac's columns (25,) where they are known."""
-        assert self._arrival is not None  # it was yielded before
-        self.count, self.lost = self.count + 1, self.lost + (not now.valid)
-        self.latency_ms.append(1e3 * now.latency_s)
-        self.told_s.append(time.perf_counter())
-        self._watch(now)
-        heading_rad = float("nan")
-        if columns is not None:
-            x, y = columns[FICTRAC["path"]].tolist()
-            self.path.append((x, y))
-            heading_rad = float(columns[FICTRAC["heading"]][0])
-        self.newest = Seen(arrival=self._arrival, now=now, heading_rad=heading_rad)
+    def saw(self, now: Measured) -> None:
+        """Take what was measured of a ball in the last frame."""
+        if now.number != self._counted:
+            self.count, self._counted = self.count + 1, now.number
+            self.latency_ms.append(1e3 * now.latency_s)
+        if not now.valid and now.number != self._counted_lost:
+            self.lost, self._counted_lost = self.lost + 1, now.number
+        self._watch(self._absence[now.ball], now)
 
-    def _watch(self, now: Measured) -> None:
+    def _watch(self, of: _Absence, now: Measured) -> None:
         """Tell a ball that is not found for a while, and that it is found again."""
-        self._in_a_row = self._in_a_row + 1 if now.valid else 0
+        of.in_a_row = of.in_a_row + 1 if now.valid else 0
         if now.valid:
-            if self._in_a_row >= CONFIRMED:
-                if self._told:
-                    self._tell(f"frame {now.number}: the ball is found again.")
-                self._lost, self._told = None, False
+            if of.in_a_row >= CONFIRMED:
+                if of.told:
+                    self._tell(f"frame {now.number}: {_called(now)} is found again.")
+                of.lost, of.told = None, False
             return
-        self._lost = now.time_s if self._lost is None else self._lost[0], now
-        self._tell_lost(now.time_s)
+        of.lost = now.time_s if of.lost is None else of.lost[0], now
+        self._tell_lost(of, now.time_s)
 
-    def _tell_lost(self, time_s: float) -> None:
+    def _tell_lost(self, of: _Absence, time_s: float) -> None:
         """Tell a ball that is not found for a while at a time of the source, once, with the likely cause."""
-        if self._lost is None or self._told or time_s - self._lost[0] < LOST_S:
+        if of.lost is None or of.told or time_s - of.lost[0] < LOST_S:
             return
-        now, self._told = self._lost[1], True
+        now, of.told = of.lost[1], True
         why = ", ".join(sorted({str(reason) for reason in now.reason}))
         cause = next((words for reason, words in CAUSES.items() if reason in now.reason), "no picture can be used")
         if Reason.LOW_SCORE in now.reason and self.lost > MOSTLY * self.count:
             cause = NOT_EXPLAINED
-        self._tell(f"frame {now.number}: the ball is not found for {LOST_S:g} s ({why}): {cause}; tracking goes on.")
+        self._tell(
+            f"frame {now.number}: {_called(now)} is not found for {LOST_S:g} s ({why}): {cause}; tracking goes on."
+        )
 
     def summary(self) -> list[str]:
         """Return the counts and latencies in words."""
@@ -139,114 +153,259 @@ class Monitor:
         ]
 
 
-@dataclass(eq=False)
-class LivePage:
-    """What the page shows and does. `save_map` writes a map that is learnt meanwhile and says so; None: no button."""
+def _called(now: Measured) -> str:
+    return f"ball {now.ball}" if now.ball else "the ball"
 
-    token: str = field(default_factory=new_token)
-    monitor: Monitor | None = None  # None: not begun yet
-    views: Sequence[CameraView] = ()
-    radius_mm: float = 1.0
-    save_map: Callable[[], str] | None = None
+
+class PageWriter:
+    """The loop side of the page: it copies a row of each frame, and at most `PICTURES_HZ` times a second its pictures,
+    into rings in a folder, and obeys commands. `tell` gets a line where none can come any more.
+    """
+
+    def __init__(self, folder: Path, commands: Connection, tell: Tell) -> None:
+        self.folder, self._commands, self._tell = folder, commands, tell
+        self._closing, self._next_s = False, 0.0
+        self._rings: tuple[SharedFrames, SharedFrames] | None = None
+
+    def begin(self, recording: Recording, running: Event, save_map: Callable[[], str] | None) -> None:
+        """Begin with the frames of a recording: the page sets and clears `running`; `save_map` writes a map that is
+        learnt meanwhile and says so; None: no button.
+        """
+        poses = SharedFrames(self.folder / "poses", WORD * ROW, POSES)
+        size = FrameBytes(recording.streams).size + WORD * (len(recording.streams) + 1 + ROW)
+        self._rings = poses, SharedFrames(self.folder / "pictures", size, 4)
+        self._blank = [np.zeros(stream.movie.frame_shape, stream.movie.dtype) for stream in recording.streams]
+        self._learns = save_map is not None
+        Thread(target=self._listen, args=(running, save_map), name="page", daemon=True).start()
+
+    def saw(self, arrival: Arrival, now: Measured) -> None:
+        """Take a frame and what was measured of it."""
+        assert self._rings is not None  # it has begun
+        numbers = [now.number, now.time_s, 1e3 * now.latency_s, now.dropped, now.error_rad]
+        row = np.concatenate([numbers, now.position_lab_mm, now.R_lab_body.ravel()])
+        now_s, (poses, pictures) = time.perf_counter(), self._rings
+        poses.write(now_s, [row])
+        if now_s >= self._next_s:
+            self._next_s = now_s + 1 / PICTURES_HZ
+            shown = [blank if one is None else one for one, blank in zip(arrival.pictures, self._blank, strict=True)]
+            words = np.array([*map(REASONS.index, now.reason), self._learns], np.float64)
+            pictures.write(now.time_s, [*shown, words, row])
+
+    def _listen(self, running: Event, save_map: Callable[[], str] | None) -> None:
+        """Do what the page asks for."""
+        with suppress(EOFError, OSError):
+            while True:
+                word = self._commands.recv_bytes().decode()
+                try:
+                    if word == "save":
+                        said = {"said": _saved(save_map)}
+                    else:
+                        (running.set if word == "start" else running.clear)()
+                        said = {"said": "Tracking goes on." if word == "start" else STOPPED}
+                except SphereOrientError as error:
+                    said = {"error": str(error)}
+                self._commands.send_bytes(json.dumps(said).encode())
+        if not self._closing:
+            running.set()  # nobody could start it again
+            self._tell("page: its process has ended; tracking goes on without the page.")
+
+    def close(self) -> None:
+        """Remove the rings."""
+        self._closing = True
+        for ring in self._rings or ():
+            ring.close()
+
+
+class PageProcess(PageWriter):
+    """A page in the browser, served by a process of its own; port 0: any free one. Raise OutputError: it is in use."""
+
+    def __init__(self, experiment: Path, cameras: Sequence[str] | None, port: int, tell: Tell) -> None:
+        door, token = listen(port, "--page", OutputError), new_token()
+        memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
+        folder = Path(tempfile.mkdtemp(prefix="sphereorient-", dir=memory))
+        spawn = multiprocessing.get_context("spawn")
+        commands, theirs = spawn.Pipe()
+        self.process = spawn.Process(
+            target=_serve, args=(experiment, cameras, folder, token, door, theirs), name="page", daemon=True
+        )
+        self.process.start()
+        self.address = address(door, token)
+        door.close()
+        theirs.close()
+        super().__init__(folder, commands, tell)
+
+    def close(self) -> None:
+        """End the process."""
+        self._closing = True
+        self.process.terminate()
+        self.process.join()
+        super().close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _saved(save_map: Callable[[], str] | None) -> str:
+    if save_map is None:
+        do = "begin without a map"
+        raise OutputError(refusal("map", expected="one that is learnt meanwhile", got="none", do=do))
+    return save_map()
+
+
+def _serve(
+    experiment: Path, cameras: Sequence[str] | None, folder: Path, token: str, door: socket.socket, commands: Connection
+) -> None:
+    """Serve the page until the loop's process ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
+    if hasattr(os, "nice"):
+        os.nice(10)  # tracking goes first
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    limit_cores(1)
+    with open_recording(experiment, cameras, textured=False) as recording:
+        page = LivePage(recording, folder, commands)
+        Thread(target=PageServer(page, door, token).serve_forever, name="page", daemon=True).start()
+        page.follow()
+    shutil.rmtree(folder, ignore_errors=True)  # where the loop was killed
+
+
+class LivePage:
+    """What the page shows and does, in its process: it reads the rings in a folder, and sends commands to the loop."""
+
+    def __init__(self, recording: Recording, folder: Path, commands: Connection) -> None:
+        self._recording, self._folder, self._commands = recording, folder, commands
+        self._layout = FrameBytes(recording.streams)
+        self._lines = FicTracLines(next(iter(recording.cameras.values())).R_cam_lab.numpy())
+        self._rings: tuple[SlotReader, SlotReader] | None = None  # None: not begun yet
+        self._replies: SimpleQueue[Json] = SimpleQueue()
+        self._lock, self._asking, self._running = Lock(), Lock(), True
+        self._count = self._lost = self._dropped = 0
+        self._heading_rad = float("nan")
+        self._latency_ms: deque[float] = deque(maxlen=KEPT)
+        self._told_s: deque[float] = deque(maxlen=KEPT)  # when a frame was measured
+        self._path: deque[tuple[float, float]] = deque(maxlen=20_000)
+
+    @cached_property
+    def _setup(self) -> MaskMarking:
+        return MaskMarking(self._recording.experiment.path)
+
+    def follow(self) -> None:
+        """Take what the loop writes and answers, until its process ends."""
+        with suppress(EOFError, OSError):
+            while True:
+                if self._commands.poll(TAKE_S):
+                    self._replies.put(json.loads(self._commands.recv_bytes()))
+                self.take()
+
+    def take(self) -> None:
+        """Take the poses that were written since."""
+        if self._rings is None:
+            size = self._layout.size + WORD * (len(self._recording.streams) + 1 + ROW)
+            with suppress(MovieError):  # not begun yet
+                pictures = SlotReader(self._folder / "pictures", size)
+                self._rings = SlotReader(self._folder / "poses", WORD * ROW), pictures
+        if self._rings is None:
+            return
+        poses, _ = self._rings
+        with self._lock:
+            written = poses.written
+            for number in range(poses.oldest(self._count) if written > self._count else written, written):
+                self._count = number + 1
+                if (slot := poses.read(number)) is not None:
+                    self._add(slot[1], np.frombuffer(slot[2]))
+
+    def _add(self, told_s: float, row: NDArray[np.float64]) -> None:
+        number, time_s, latency_ms, dropped, error_rad = row[:5].tolist()
+        R = row[8:].reshape(3, 3)
+        self._lost, self._dropped = self._lost + bool(np.isnan(R[0, 0])), self._dropped + int(dropped)
+        self._latency_ms.append(latency_ms)
+        self._told_s.append(told_s)
+        columns = self._lines.columns(int(number), time_s, R, error_rad)
+        x, y = columns[FICTRAC["path"]].tolist()
+        self._path.append((x, y))
+        self._heading_rad = float(columns[FICTRAC["heading"]][0])
+
+    def shown(self, steps: Sequence[str]) -> Answer:
+        """Return the page, or what is known now."""
+        match steps:
+            case [""]:
+                return PAGE
+            case ["look"]:
+                return self.look()
+            case ["setup", *rest]:
+                return self._setup.shown(rest)
+        return None
+
+    def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Answer:
+        """Start or stop measuring, or save the map: the loop does it; raise OutputError where it cannot."""
+        self.take()
+        match steps:
+            case ["setup", *rest]:
+                return self._setup.done(rest, asked)
+            case ["start" | "stop" | "save" as word] if self._rings is not None:
+                with self._asking:
+                    self._commands.send_bytes(word.encode())
+                    said = self._replies.get()
+                if "error" in said:
+                    raise OutputError(said["error"])
+                self._running = {"start": True, "stop": False}.get(word, self._running)
+                return said
+            case ["start" | "stop" | "save"]:
+                return {"said": "The set-up is looked at; no frame is measured yet."}
+        return None
 
     def look(self) -> Json:
         """Return what is known now: counts, latencies, path, and each camera's newest picture with what is drawn."""
-        monitor = self.monitor
-        if monitor is None or monitor.newest is None:
-            return {"begun": monitor is not None}
-        seen, now = monitor.newest, monitor.newest.now
-        latency = np.array(monitor.latency_ms.copy())
-        told_s = monitor.told_s.copy()
+        self.take()
+        if self._rings is None or not (count := self._rings[1].written):
+            return {"begun": self._rings is not None}
+        slot = self._rings[1].read(count - 1)
+        if slot is None or not self._count:
+            return {"begun": True}
+        cameras = len(self._recording.streams)
+        pictures = self._layout.pictures(slot[2])
+        words, row = np.split(np.frombuffer(slot[2], np.float64, offset=self._layout.size).copy(), [cameras + 1])
+        R, valid = row[8:].reshape(3, 3), bool(np.isfinite(row[8]))
+        with self._lock:
+            latency, told_s = np.array(self._latency_ms), self._told_s.copy()
+            path = list(islice(self._path, 0, None, max(1, len(self._path) // 1000)))  # of the path
         counts, edges = np.histogram(latency, 40, (0.0, max(float(np.quantile(latency, 0.99)) * 1.2, 1.0)))
         middle, slow = np.quantile(latency, (0.5, 0.99))
-        steps = monitor.path.copy()
-        path = list(islice(steps, 0, None, max(1, len(steps) // 1000)))  # of the path
         return {
             "begun": True,
-            "running": monitor.running.is_set(),
-            "count": monitor.count,
-            "lost": monitor.lost,
-            "dropped": monitor.dropped,
+            "running": self._running,
+            "count": self._count,
+            "lost": self._lost,
+            "dropped": self._dropped,
             "rate_hz": (len(told_s) - 1) / (told_s[-1] - told_s[0]) if len(told_s) > 1 else None,
-            "frame": now.number,
-            "time_s": now.time_s,
-            "valid": now.valid,
-            "reason": [str(why) for why in now.reason],
-            "error_deg": without_nan(float(np.degrees(now.error_rad))),
+            "frame": int(row[0]),
+            "time_s": row[1],
+            "valid": valid,
+            "reason": [str(REASONS[int(k)]) for k in words[:-1]],
+            "error_deg": without_nan(float(np.degrees(row[4]))),
             "latency": {"counts": counts.tolist(), "last_ms": float(edges[-1]), "median_ms": middle, "p99_ms": slow},
             "path": without_nan([list(step) for step in path]),
-            "heading_rad": without_nan(seen.heading_rad),
-            "cameras": [self._camera(c, seen) for c in range(len(self.views))],
-            "map": self.save_map is not None,
+            "heading_rad": without_nan(self._heading_rad),
+            "cameras": [self._camera(c, pictures[c], row[5:8], R if valid else None) for c in range(cameras)],
+            "map": bool(words[-1]),
         }
 
-    def _camera(self, c: int, seen: Seen) -> Json:
-        view, now, picture = self.views[c], seen.now, seen.arrival.pictures[c]
-        width, height = view.camera.image_size
-        found: Json = {"name": view.name, "width": width, "height": height, "picture": _jpeg(picture)}
-        if now.valid:
-            here = Path3D(
-                position_mm=now.position_lab_mm[None],
-                R_lab_body=now.R_lab_body[None],
-                smoothed=np.zeros(1, bool),
-                radius_mm=self.radius_mm,
-            )
-            tips, near = axes_px(view.camera, here, 0)
-            drawn = {"outline": outline_px(view.camera, here, 0), "tips": tips}
-            drawn["centre"] = view.camera.project(torch.from_numpy(now.position_lab_mm)).numpy()
+    def _camera(self, c: int, picture: NDArray[Any], X: NDArray[np.float64], R: NDArray[np.float64] | None) -> Json:
+        stream = self._recording.streams[c]
+        width, height = stream.camera.image_size
+        found: Json = {"name": stream.name, "width": width, "height": height, "picture": _jpeg(picture)}
+        if R is not None:
+            radius_mm = self._recording.experiment.radius_mm
+            here = Path3D(position_mm=X[None], R_lab_body=R[None], smoothed=np.zeros(1, bool), radius_mm=radius_mm)
+            tips, near = axes_px(stream.camera, here, 0)
+            drawn = {"outline": outline_px(stream.camera, here, 0), "tips": tips}
+            drawn["centre"] = stream.camera.project(torch.from_numpy(X)).numpy()
             found |= {name: without_nan(points.tolist()) for name, points in drawn.items()} | {"near": near.tolist()}
         return found
 
-    def go(self, running: bool) -> Json:
-        """Start or stop measuring; what comes while it is stopped is not measured."""
-        if self.monitor is not None:
-            (self.monitor.running.set if running else self.monitor.running.clear)()
-        return {"said": "Tracking goes on." if running else "Tracking is stopped: no frame is measured."}
 
-    def saved(self) -> Json:
-        """Write the map; raise OutputError where none is learnt."""
-        if self.save_map is None:
-            do = "begin without a map"
-            raise OutputError(refusal("map", expected="one that is learnt meanwhile", got="none", do=do))
-        return {"said": self.save_map()}
-
-
-def _jpeg(picture: NDArray[Any] | None) -> str | None:
-    if picture is None:
-        return None
+def _jpeg(picture: NDArray[Any]) -> str:
     picture = picture if picture.dtype == np.uint8 else eight_bits(picture)
     if (width := picture.shape[1]) > WIDEST:
         size = WIDEST, round(picture.shape[0] * WIDEST / width)
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
-
-
-def open_page(page: LivePage, port: int) -> PageServer:
-    """Serve a page on this machine in threads; raise OutputError for a port in use. Port 0: any free one."""
-
-    class Handler(PageHandler):
-        token = page.token
-
-        def do_GET(self) -> None:
-            match self._steps():
-                case [""]:
-                    self._send(PAGE.read_bytes(), "text/html; charset=utf-8")
-                case ["look"]:
-                    self._answer(page.look)
-                case _:
-                    self.send_error(HTTPStatus.NOT_FOUND)
-
-        def do_POST(self) -> None:
-            self.close_connection = True  # whatever was sent with it is not read
-            match self._steps():
-                case ["start" | "stop" as word]:
-                    self._answer(lambda: page.go(word == "start"))
-                case ["save"]:
-                    self._answer(page.saved)
-                case _:
-                    self.send_error(HTTPStatus.NOT_FOUND)
-
-    server = PageServer(Handler, port, "--page", OutputError)
-    Thread(target=server.serve_forever, name="page", daemon=True).start()
-    return server

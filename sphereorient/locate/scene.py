@@ -37,6 +37,7 @@ LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint o
 
 OUTLINES_MIN = 8  # that can show a scatter
 # A ball is not fixed where its outlines scatter by more than all of these: px, of the radius, and of their own errors.
+GIVEN_PX = 0.5  # error of an outline that is given
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 2.0
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
@@ -84,7 +85,8 @@ def find_scenes(
     in_place = photograph or all(one.experiment.sphere.in_place for one in each.values())
     if in_place and (empty is None or None in sizes.values()):
         sways = not all(one.experiment.fixed for one in each.values())
-        find = still_ball if photograph else swaying_ball if sways else fixed_ball
+        fixed = partial(fixed_ball, circle=recording.experiment.circles.get(stream.name))
+        find = still_ball if photograph else swaying_ball if sways else fixed
         outline, guess = find(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
         background = guess if empty is None else None
@@ -187,10 +189,12 @@ def fixed_ball(
     locating: LocateSettings,
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
+    circle: tuple[float, float, float] | None = None,
 ) -> tuple[Outline, Background]:
     """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
     Return its outline, and the background with a guess behind it.
-    `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere.
+    `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere; `circle`
+    is the outline u, v, radius, px, where that is given.
 
     Raises:
         ExperimentError: nothing round changes.
@@ -201,6 +205,11 @@ def fixed_ball(
     if shown is not None:
         scatter = np.where(shown, scatter, np.float32(0))
     full_scale = float(np.iinfo(pictures.dtype).max)
+    if circle is not None:
+        u, v, radius = circle
+        given = Outline(u_px=u, v_px=v, radius_px=radius, rms_px=GIVEN_PX, coverage=1.0)
+        scene = _around(middle, scatter, given, full_scale)
+        return given, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255
     moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter against single pixels, px
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)

@@ -166,11 +166,12 @@ def _fixed_scene(
     recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings
 ) -> tuple[Outline, CameraScene]:
     """Return outline and scene of a fixed ball; PaintError if outlines scatter far more in place than in size."""
-    pictures = stream.spread(4 * settings.background_frames)
+    circle = recording.experiment.circles.get(stream.name)
+    pictures = stream.spread((1 if circle else 4) * settings.background_frames)
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
-    outline, background = fixed_ball(pictures, locating, empty, stream.shown)
+    outline, background = fixed_ball(pictures, locating, empty, stream.shown, circle)
     scene = CameraScene(background=background, diameter_px=2 * outline.radius_px, response=stream.response)
-    wander = wander_px(pictures, scene, locating)
+    wander = 0.0 if circle else wander_px(pictures, scene, locating)
     if wander:
         got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: sways`"
         raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))

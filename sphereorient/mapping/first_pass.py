@@ -403,12 +403,12 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
     Raises PaintError: the ball does not turn, or the map explains hardly a frame.
     """
     coarse, count = CoarserPictures.of(place), min(FOLLOWED, len(recording.timeline))
-    found, kept = _swept(recording, coarse, FirstPass(coarse.place), min(count, BEGIN), progress)
+    found, kept = swept(recording, coarse, FirstPass(coarse.place), min(count, BEGIN), progress)
     if kept.turned_rad < TURNED_RAD and count > BEGIN:  # it rests at first
-        found, kept = _swept(recording, coarse, FirstPass(coarse.place), count, progress)
+        found, kept = swept(recording, coarse, FirstPass(coarse.place), count, progress)
     adjustment = kept.adjusted(progress)
     if count > len(found):
-        found, kept = _swept(recording, *_after(adjustment, coarse, recording), count, progress)
+        found, kept = swept(recording, *_after(adjustment, coarse, recording), count, progress)
         adjustment = kept.adjusted(progress)
     seen, shown = sum(map(supported, found)), count if place.fixed else int(place.seen.any(1).sum())
     if seen < LEAST_FOUND * shown:
@@ -420,7 +420,7 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
 def followed_by(adjustment: Adjustment, recording: Recording, place: Crops, progress: Progress) -> list[Poses]:
     """Return the poses of all frames by the place and map of an adjustment of some, `place` as given to it."""
     after = _after(adjustment, CoarserPictures.of(place), recording)
-    return _swept(recording, *after, len(recording.timeline), progress)[0]
+    return swept(recording, *after, len(recording.timeline), progress)[0]
 
 
 def _after(adjustment: Adjustment, coarse: CoarserPictures, recording: Recording) -> tuple[CoarserPictures, FirstPass]:
@@ -431,9 +431,10 @@ def _after(adjustment: Adjustment, coarse: CoarserPictures, recording: Recording
     return replace(coarse, place=replace(coarse.place, position_lab_mm=X)), follower
 
 
-def _swept(
+def swept(
     recording: Recording, coarse: CoarserPictures, follower: FirstPass, count: int, progress: Progress
 ) -> tuple[list[Poses], KeptFrames]:
+    """Follow the first `count` frames; return their poses, and those kept of them."""
     pairs = zip(recording.streams, coarse.whole, strict=True)
     shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
     kept, found = KeptFrames(coarse.place), list[Poses]()

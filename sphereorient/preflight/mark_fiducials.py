@@ -13,8 +13,9 @@ from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.plates import read_plate_picture
 from sphereorient.calibration.targets import FIDUCIALS, DotPlate
 from sphereorient.errors import CameraError
+from sphereorient.files.page_server import Answer, Json
 from sphereorient.files.picture import eight_bits
-from sphereorient.preflight.mark import Json, Marking, png
+from sphereorient.preflight.mark import Marking, png
 
 
 class FiducialMarking(Marking):
@@ -33,7 +34,7 @@ class FiducialMarking(Marking):
         self.clicked = {it: it.clicked_px for it in self.document.pictures}
         self.dots: dict[Picture, Dots] = {}
 
-    def shown(self, steps: Sequence[str]) -> bytes | Json | None:
+    def shown(self, steps: Sequence[str]) -> Answer:
         """Return the state, a picture, or what is found in it."""
         match steps:
             case ["state"]:
@@ -43,7 +44,7 @@ class FiducialMarking(Marking):
             case ["view", number] if number.isdigit():
                 picture = self._picture(number)
                 return self.view(picture, self.clicked.get(picture))
-        return None
+        return super().shown(steps)
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Try or save the clicked `points` of a picture."""

@@ -1,7 +1,9 @@
-"""Masks that people draw in the browser: what hides the ball; saved beside the experiment."""
+"""Masks that people draw in the browser, what hides the ball, and other keys that are tried there on a short clip."""
 
 import base64
+import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,14 +13,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.errors import ExperimentError, MovieError, refusal
+from sphereorient.cameras import PinholeCamera, field_of_focal, load_cameras
+from sphereorient.cameras.model import focal_of_field
+from sphereorient.errors import CameraError, ExperimentError, MovieError, refusal
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.experiment import Experiment, open_movies
+from sphereorient.experiment.experiment import Experiment, open_movies, response_of
 from sphereorient.experiment.recording import given_mask
+from sphereorient.files.page_server import Answer, Json
 from sphereorient.files.picture import eight_bits, write_picture
+from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text, writing
+from sphereorient.files.yaml_file import flow, parse_yaml, with_value
 from sphereorient.movies import Movie, flipped_picture
+from sphereorient.preflight.clip import Clip
 from sphereorient.preflight.first_look import FirstLook, look_at_movie
-from sphereorient.preflight.mark import Json, Marking, png
+from sphereorient.preflight.mark import Marking, png
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
@@ -28,7 +36,7 @@ FAR_PX = 1e5
 
 
 class MaskMarking(Marking):
-    """An experiment whose masks are drawn."""
+    """An experiment whose masks are drawn, and whose circle, light and field of view are tried."""
 
     page = "mark_masks.html"
     error = ExperimentError
@@ -44,7 +52,12 @@ class MaskMarking(Marking):
         """What each movie shows without any mask drawn here."""
         return {name: look_at_movie(name, movie, self.masks[name]) for name, movie in self.movies.items()}
 
-    def shown(self, steps: Sequence[str]) -> bytes | Json | None:
+    @cached_property
+    def clip(self) -> Clip:
+        """The first frames, which are tracked again."""
+        return Clip(self.experiment)
+
+    def shown(self, steps: Sequence[str]) -> Answer:
         """Return the state, a frame, a mask, an outline or a rendered ball."""
         match steps:
             case ["state"]:
@@ -57,26 +70,100 @@ class MaskMarking(Marking):
                 return self.outline(name)
             case ["rendered", name]:
                 return self.rendered(name)
-        return None
+        return super().shown(steps)
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
-        """Save the mask of a camera, of `shapes` and `keep`."""
-        if len(steps) != 2 or steps[0] != "save":
-            return None
-        if not {"shapes", "keep"} <= set(asked):
-            raise _refused("request", "shapes and keep, as JSON", "another thing")
-        return self.save(steps[1], asked["shapes"], keep=bool(asked["keep"]))
+        """Save the mask of a camera, of `shapes` and `keep`; track a clip with these and other keys, or save those."""
+        match steps:
+            case ["save" | "track" | "adopt" as what, name]:
+                if not {"shapes", "keep"} <= set(asked):
+                    raise _refused("request", "shapes and keep, as JSON", "another thing")
+                if what == "save":
+                    return self.save(name, asked["shapes"], keep=bool(asked["keep"]))
+                return self.track(name, asked) if what == "track" else self.adopt(name, asked)
+        return None
 
     def state(self) -> Json:
         """Return what the page begins with."""
         return {
             "experiment": str(self.path),
             "cameras": [
-                {"name": name, "movie": Path(movie.path).name, "frames": len(movie)}
+                {"name": name, "movie": Path(movie.path).name, "frames": len(movie), **self._tried(name)}
                 | dict(zip(("height", "width"), movie.frame_shape, strict=True))
                 for name, movie in self.movies.items()
             ],
+            "tries": self.experiment.alone and self.experiment.fixed,
         }
+
+    def _tried(self, name: str) -> Json:
+        """Return what can be tried, as it is now: circle u, v, radius, px, and vertical field of view, degrees."""
+        camera, vfov_deg = self.experiment.cameras[name], None
+        if isinstance(camera, PinholeCamera):
+            vfov_deg = field_of_focal(camera.image_size[1], float(camera.f_px))
+        return {"circle": self.experiment.circles.get(name), "vfov_deg": vfov_deg}
+
+    def track(self, name: str, asked: Mapping[str, Any]) -> Json:
+        """Track the clip with the `shapes` of a mask, `keep`, and what else is given: `circle`, u, v, radius, px;
+        `light`, a value of the key response; `vfov_deg`. Raise SphereOrientError where one is impossible.
+        """
+        with self.lock, tempfile.TemporaryDirectory() as folder:
+            return self.clip.tracked(self._changed(name, asked, Path(folder)))
+
+    def _changed(self, name: str, asked: Mapping[str, Any], folder: Path) -> Experiment:
+        shown = drawn_mask(self._movie(name).frame_shape, asked["shapes"], self.masks[name] if asked["keep"] else None)
+        tried = self.experiment
+        write_picture(folder / "mask.png", self._as_filmed(name, shown))
+        tried = replace(tried, mask_paths=tried.mask_paths | {name: folder / "mask.png"})
+        if asked.get("circle") is not None:
+            tried = replace(tried, circles=tried.circles | {name: _circle(asked["circle"])})
+        if asked.get("light") is not None:
+            tried = replace(tried, response=tried.response | {name: response_of("light", asked["light"])})
+        if asked.get("vfov_deg") is not None:
+            write_text(folder / "cameras.yaml", self._cameras(name, asked["vfov_deg"]))
+            known = load_cameras(folder / "cameras.yaml")
+            tried = replace(tried, cameras={one: known[one] for one in tried.cameras})
+        return tried
+
+    def adopt(self, name: str, asked: Mapping[str, Any]) -> Json:
+        """Write what `track` would be asked into mask, experiment.yaml and cameras.yaml, whose other lines stay."""
+        with self.lock, tempfile.TemporaryDirectory() as folder:
+            tried = self._changed(name, asked, Path(folder))  # all of it is possible
+        keys: Json = {}
+        if asked.get("circle") is not None:
+            keys["circles"] = {one: [round(part, 2) for part in circle] for one, circle in tried.circles.items()}
+        if asked.get("light") is not None:
+            old = self.read().get("response")
+            each = old if isinstance(old, dict) and old.keys() != {"gamma"} else dict.fromkeys(self.movies, old)
+            keys["response"] = {one: part for one, part in (each | {name: asked["light"]}).items() if part is not None}
+        files = [self.save(name, asked["shapes"], keep=bool(asked["keep"]))["file"]] if asked["shapes"] else []
+        with self.lock:
+            for key, value in keys.items():
+                self.write([key], value, f"write {key}: {flow(value)} there")
+            if asked.get("vfov_deg") is not None:
+                with writing(force=True):
+                    write_text(tried.cameras_path, self._cameras(name, asked["vfov_deg"]))
+                files.append(str(tried.cameras_path))
+            self.experiment = load_experiment(self.path)
+        return {"files": [*files, str(self.path)]}
+
+    def _as_filmed(self, name: str, shown: Bools) -> NDArray[np.uint8]:
+        """Return a mask as a picture, flipped as the movie's file is."""
+        return flipped_picture(np.where(shown, 255, 0).astype(np.uint8), self.experiment.flip.get(name, "none"))
+
+    def _cameras(self, name: str, vfov_deg: object) -> str:
+        """Return the text of cameras.yaml with another field of view of a camera."""
+        (angle,) = _numbers([vfov_deg], "vfov_deg").tolist()
+        path = self.experiment.cameras_path
+        text = read_text(path, TEXT_BYTES, "cameras", CameraError, "correct the path")
+        entry = parse_yaml(text)["cameras"][name]
+        height = self.experiment.cameras[name].image_size[1]
+        in_px = "vfov_deg" not in entry and "f_px" in entry
+        key, value = ("f_px", focal_of_field(height, angle)) if in_px else ("vfov_deg", angle)
+        new = with_value(text, ["cameras", name, key], value)
+        if new is None or "fx" in entry:
+            do = f"write vfov_deg: {angle:g} of {name} there by hand"
+            raise CameraError(refusal(str(path), expected="a key vfov_deg in a line", got="another form", do=do))
+        return new
 
     def frame(self, name: str, number: int) -> bytes:
         """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
@@ -151,10 +238,9 @@ class MaskMarking(Marking):
         shown), OutputError (a file cannot be written).
         """
         shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
-        flip = self.experiment.flip.get(name, "none")
         file = self.path.parent / f"{name}_mask.png"
         with self.lock:
-            write_picture(file, flipped_picture(np.where(shown, 255, 0).astype(np.uint8), flip))
+            write_picture(file, self._as_filmed(name, shown))
             masks = dict((self.read() or {}).get("masks") or {})
             if masks.get(name) != file.name:
                 self.write(["masks"], masks | {name: file.name}, f"write masks: {{{name}: {file.name}}} there")
@@ -203,6 +289,14 @@ def _numbers(values: object, name: str) -> NDArray[np.float64]:
     if not (np.isfinite(array).all() and (np.abs(array) < FAR_PX).all()):
         raise _refused(name, f"numbers below {FAR_PX:g} px", repr(values)[:40])
     return array
+
+
+def _circle(values: object) -> tuple[float, float, float]:
+    circle = _numbers(values, "circle")
+    if circle.shape != (3,) or not circle[2] > 0:
+        raise _refused("circle", "u, v and a radius, px", repr(values)[:40])
+    u, v, radius = circle.tolist()
+    return u, v, radius
 
 
 def _refused(name: str, expected: str, got: str) -> ExperimentError:

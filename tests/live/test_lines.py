@@ -41,7 +41,17 @@ def test_lines_are_the_rows_of_the_exported_table(track):
         T_cam_lab_mm=torch.zeros(3),
     )
     table, lines = fictrac_table(track, camera), FicTracLines(camera.R_cam_lab.numpy())
-    found = np.array([[float(part) for part in fictrac_line(lines.columns(now)).split(", ")] for now in rows(track)])
+    found = np.array(
+        [
+            [
+                float(part)
+                for part in fictrac_line(lines.columns(now.number, now.time_s, now.R_lab_body, now.error_rad)).split(
+                    ", "
+                )
+            ]
+            for now in rows(track)
+        ]
+    )
     assert found.shape == (len(track), 25)
     rest = [k for k in range(25) if k != 4]  # the stated error is another one here
     np.testing.assert_allclose(found[:, rest], table[:, rest], atol=1e-9)

@@ -32,7 +32,7 @@ def watched(frames: Sequence[Measured]) -> list[str]:
     arrivals = (Arrival(number=now.number, time_s=now.time_s, pictures=[], arrived_s=0.0) for now in frames)
     monitor = Monitor(Feed(arrivals, 1, wait=True), said.append)
     for _, now in zip(monitor, frames, strict=True):
-        monitor.saw(now, None)
+        monitor.saw(now)
     return said
 
 
@@ -76,7 +76,7 @@ def test_a_source_that_goes_on_while_a_frame_is_searched_tells_how_long_that_too
     lost = shown(61, (), Reason.LOW_SCORE)
     for newest, told in ((0.49, 0), (0.6, 1)):
         arrival = next(frames)
-        monitor.saw(lost[arrival.number], None)
+        monitor.saw(lost[arrival.number])
         gate.set()
         until(lambda at=newest: feed.newest_s == pytest.approx(at))
         assert len(said) == 0
@@ -114,7 +114,7 @@ def test_the_map_of_another_ball_is_told(tmp_path):
         monitor = Monitor(Feed(slow, 1, wait=True), said.append)
         for now in measured(opened.tracker, opened.tracker.appearances[""].fitter.views, monitor):
             assert not now.valid
-            monitor.saw(now, None)
+            monitor.saw(now)
     assert len(said) == 1
     assert said[0].startswith("frame 4: the ball is not found for 0.5 s (low_score)")
     assert "the map of another one" in said[0]

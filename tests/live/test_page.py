@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import base64
 import json
+import math
+import socket
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing import Pipe
 from pathlib import Path
-from threading import Thread
-from types import SimpleNamespace
+from threading import Event, Thread
 from typing import Any
 
 import cv2
@@ -18,18 +21,19 @@ import numpy as np
 import pytest
 import torch
 from live_examples import EXCERPT, rows, until
+from live_examples import arrivals as numbered
 from overlay_examples import true_track
 
 from sphereorient.errors import OutputError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.files.page_server import HOST
+from sphereorient.files.page_server import HOST, PageServer, listen, new_token
 from sphereorient.live.feed import Arrival, Feed
-from sphereorient.live.lines import FicTracLines
-from sphereorient.live.page import LivePage, Monitor, open_page
+from sphereorient.live.page import LivePage, Monitor, PageProcess, PageWriter
 from sphereorient.live.sources import movie_frames
 from sphereorient.trajectory import Reason
 
 pytest_plugins = ["browser_examples"]
+TOKEN = new_token()
 
 
 @pytest.fixture(scope="module")
@@ -50,17 +54,36 @@ def poses():
     orientation[7:9] = np.nan
     for now in rows(replace(track, orientation=orientation)):
         where = position[now.number] if now.valid else now.position_lab_mm
-        yield replace(now, position_lab_mm=where, latency_s=0.001 * (1 + now.number))
+        yield replace(now, position_lab_mm=where, reason=2 * now.reason, latency_s=0.001 * (1 + now.number))
 
 
-def shown(recording, arrivals: list[Arrival], count: int) -> LivePage:
-    """A page after some frames."""
-    views = [SimpleNamespace(name=name, camera=camera) for name, camera in recording.cameras.items()]
-    monitor = Monitor(Feed(iter(arrivals), 100, wait=True))
-    lines = FicTracLines(views[0].camera.R_cam_lab.numpy())
-    for _, now, _ in zip(monitor, poses(), range(count), strict=False):
-        monitor.saw(now, lines.columns(now))
-    return LivePage(monitor=monitor, views=views, radius_mm=recording.experiment.radius_mm)
+@dataclass
+class Shown:
+    """A page after some frames, and what the loop knows of it."""
+
+    page: LivePage
+    running: Event
+    told: list[str]
+
+
+@contextmanager
+def shown(recording, arrivals: list[Arrival], folder: Path, count: int, save_map=None) -> Iterator[Shown]:
+    ours, theirs = Pipe()
+    running, told = Event(), []
+    running.set()
+    writer = PageWriter(folder, ours, told.append)
+    writer.begin(recording, running, save_map)
+    for arrival, now, _ in zip(arrivals, poses(), range(count), strict=False):
+        writer.saw(arrival, now)
+    page = LivePage(recording, folder, theirs)
+    Thread(target=page.follow, daemon=True).start()
+    yield Shown(page, running, told)
+    writer.close()
+
+
+@pytest.fixture(autouse=True)
+def each_picture(monkeypatch):
+    monkeypatch.setattr("sphereorient.live.page.PICTURES_HZ", math.inf)
 
 
 def ask(address: str, post: bool = False, **headers: str) -> tuple[int, Any]:
@@ -72,9 +95,9 @@ def ask(address: str, post: bool = False, **headers: str) -> tuple[int, Any]:
         return error.code, error.read()
 
 
-def test_the_page_tells_what_was_measured_of_the_newest_frame(recording, arrivals):
-    page = shown(recording, arrivals, 20)
-    look = json.loads(json.dumps(page.look(), allow_nan=False))
+def test_the_page_tells_what_was_measured_of_the_newest_frame(recording, arrivals, tmp_path):
+    with shown(recording, arrivals, tmp_path, 20) as seen:
+        look = json.loads(json.dumps(seen.page.look(), allow_nan=False))
     now = list(poses())[19]
     assert (look["frame"], look["count"], look["lost"], look["dropped"]) == (19, 20, 2, 0)
     assert look["error_deg"] == pytest.approx(np.degrees(now.error_rad))
@@ -98,66 +121,107 @@ def test_the_page_tells_what_was_measured_of_the_newest_frame(recording, arrival
         assert from_centre.mean() > max(np.linalg.norm(np.array(tips) - camera["centre"], axis=1)) * 0.98
 
 
-def test_a_frame_without_a_pose_has_a_reason_and_no_outline(recording, arrivals):
-    look = json.loads(json.dumps(shown(recording, arrivals, 8).look(), allow_nan=False))
-    assert (look["valid"], look["error_deg"], look["reason"]) == (False, None, [str(Reason.NOT_FOUND)])
+def test_a_frame_without_a_pose_has_a_reason_and_no_outline(recording, arrivals, tmp_path):
+    with shown(recording, arrivals, tmp_path, 8) as seen:
+        look = json.loads(json.dumps(seen.page.look(), allow_nan=False))
+    assert (look["valid"], look["error_deg"], look["reason"]) == (False, None, 2 * [str(Reason.NOT_FOUND)])
     assert all("outline" not in camera and camera["picture"] for camera in look["cameras"])
 
 
 @pytest.fixture
-def served(recording, arrivals) -> Iterator[tuple[LivePage, str]]:
-    page = shown(recording, arrivals, 20)
-    server = open_page(page, 0)
-    yield page, server.address
-    server.shutdown()
-    server.server_close()
-
-
-def test_others_get_nothing(served):
-    page, place = served
-    base = place.removesuffix(f"{page.token}/")
-    for path in ("", "look", "wrong/look", f"{page.token}/nothing"):
-        assert ask(base + path)[0] == 404
-    assert ask(f"{base}wrong/stop", post=True)[0] == 404
-    assert ask(f"{place}look", Host="evil.example:80")[0] == 404
-    assert page.monitor.running.is_set()
-
-
-def test_stop_holds_the_next_frame_and_start_lets_it_go(served):
-    page, place = served
-    found: list[int] = []
-    assert ask(f"{place}stop", post=True)[0] == 200
-    Thread(target=lambda: found.extend(one.number for one in page.monitor), daemon=True).start()
-    assert json.loads(ask(f"{place}look")[1])["running"] is False
-    assert found == []
-    assert ask(f"{place}start", post=True)[0] == 200
-    until(lambda: found == list(range(21, 40)))  # 20 was asked for by the loop that ended
-
-
-def test_a_map_is_saved_where_one_is_learnt(served):
-    page, place = served
-    status, said = ask(f"{place}save", post=True)
-    assert (status, "learnt meanwhile" in json.loads(said)["error"]) == (400, True)
-    page.save_map = lambda: "Wrote map.png."
-    assert json.loads(ask(f"{place}save", post=True)[1]) == {"said": "Wrote map.png."}
-
-
-def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recording):
-    page = LivePage()
-    server = open_page(page, 0)
-    try:
-        assert json.loads(ask(f"{server.address}look")[1]) == {"begun": False}
-        with pytest.raises(OutputError, match="expected a free port"):
-            open_page(LivePage(), server.server_address[1])
-    finally:
+def served(recording, arrivals, tmp_path) -> Iterator[tuple[Shown, str]]:
+    with shown(recording, arrivals, tmp_path, 20, lambda: "Wrote map.png.") as seen:
+        server = PageServer(seen.page, listen(0, "--page", OutputError), TOKEN)
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield seen, server.address
         server.shutdown()
         server.server_close()
 
 
+def test_others_get_nothing(served):
+    seen, place = served
+    base = place.removesuffix(f"{TOKEN}/")
+    for path in ("", "look", "wrong/look", f"{TOKEN}/nothing"):
+        assert ask(base + path)[0] == 404
+    assert ask(f"{base}wrong/stop", post=True)[0] == 404
+    assert ask(f"{place}look", Host="evil.example:80")[0] == 404
+    assert ask(f"{place}stop", post=True, Host="evil.example:80")[0] == 404
+    assert seen.running.is_set()
+
+
+def test_stop_and_start_reach_the_loop(served):
+    seen, place = served
+    assert ask(f"{place}stop", post=True)[0] == 200
+    assert not seen.running.is_set()
+    assert json.loads(ask(f"{place}look")[1])["running"] is False
+    assert ask(f"{place}start", post=True)[0] == 200
+    assert seen.running.is_set()
+
+
+def test_a_stopped_monitor_holds_the_next_frame():
+    found: list[int] = []
+    monitor = Monitor(Feed(numbered(30), 100, wait=True))
+    monitor.running.clear()
+    Thread(target=lambda: found.extend(one.number for one in monitor), daemon=True).start()
+    assert found == []
+    monitor.running.set()
+    until(lambda: found == list(range(30)))
+
+
+def test_a_map_is_saved_where_one_is_learnt(served, recording, arrivals, tmp_path):
+    _, place = served
+    assert json.loads(ask(f"{place}save", post=True)[1]) == {"said": "Wrote map.png."}
+    assert json.loads(ask(f"{place}look")[1])["map"] is True
+    (tmp_path / "other").mkdir()
+    with shown(recording, arrivals, tmp_path / "other", 3) as seen:
+        assert seen.page.look()["map"] is False
+        with pytest.raises(OutputError, match="learnt meanwhile"):
+            seen.page.done(["save"], {})
+
+
+def test_what_the_page_misses_is_counted_and_pictures_are_few(recording, arrivals, tmp_path, monkeypatch):
+    """More poses than the ring holds before the page looks for the first time."""
+    monkeypatch.setattr("sphereorient.live.page.PICTURES_HZ", 1e-3)
+    monkeypatch.setattr("sphereorient.live.page.POSES", 16)
+    with shown(recording, arrivals, tmp_path, 40) as seen:
+        look = seen.page.look()
+    assert (look["count"], sum(look["latency"]["counts"])) == (40, 15)
+    assert look["frame"] == 0, "the only picture"
+
+
+def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recording, tmp_path):
+    page = LivePage(recording, tmp_path, Pipe()[1])
+    assert page.look() == {"begun": False}
+    assert "no frame is measured yet" in page.done(["stop"], {})["said"]
+    with socket.create_server((HOST, 0)) as taken, pytest.raises(OutputError, match="expected a free port"):
+        PageProcess(EXCERPT / "experiment.yaml", None, taken.getsockname()[1], pytest.fail)
+
+
+@pytest.mark.slow  # a process of its own, which imports torch
+def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, arrivals):
+    told: list[str] = []
+    running = Event()
+    page = PageProcess(EXCERPT / "experiment.yaml", None, 0, told.append)
+    try:
+        page.begin(recording, running, None)
+        folder = page.folder
+        page.saw(arrivals[0], next(poses()))
+        assert json.loads(ask(f"{page.address}look")[1])["frame"] == 0
+        assert ask(f"{page.address}stop", post=True)[0] == 200
+        page.process.kill()
+        until(lambda: told)
+        assert told == ["page: its process has ended; tracking goes on without the page."]
+        assert running.is_set(), "nobody could start it again"
+        page.saw(arrivals[1], next(poses()))
+    finally:
+        page.close()
+    assert not folder.exists()
+    assert len(told) == 1
+
+
 @pytest.mark.slow  # a browser
 def test_a_person_looks_and_stops(served, browser: Any, tmp_path: Path):
-    page, place = served
-    page.save_map = lambda: "Wrote map.png."
+    seen, place = served
     tab = browser.new_page(viewport={"width": 1280, "height": 800})
     wrong: list[str] = []
     tab.on("pageerror", lambda error: wrong.append(str(error)))
@@ -174,7 +238,7 @@ def test_a_person_looks_and_stops(served, browser: Any, tmp_path: Path):
     assert (cells["frame"], cells["frames measured"], cells["without a pose"]) == ("19", "20", "2")
     tab.get_by_role("button", name="stop").click()
     tab.get_by_text("Tracking is stopped").wait_for()
-    assert not page.monitor.running.is_set()
+    assert not seen.running.is_set()
     tab.get_by_role("button", name="start").click()
     tab.get_by_text("Tracking goes on").wait_for()
     tab.get_by_role("button", name="save map").click()

@@ -1,0 +1,83 @@
+"""A short clip of an experiment, tracked again while circle, mask, light and field of view are changed by hand."""
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sphereorient.cameras.response import Response
+from sphereorient.experiment.experiment import Experiment, refused
+from sphereorient.experiment.recording import given_mask, open_recording
+from sphereorient.files.page_server import Json
+from sphereorient.files.threads import silent
+from sphereorient.locate.scene import fixed_ball
+from sphereorient.mapping.adjustment import adjusted
+from sphereorient.mapping.disks import held_place
+from sphereorient.mapping.first_pass import CoarserPictures, FirstPass, swept
+from sphereorient.methods.method import one_thread
+from sphereorient.methods.settings import Settings
+from sphereorient.movies import Grey, flipped_picture
+from sphereorient.pose.poses import supported
+
+FRAMES, APART, TOGETHER = 200, 4, 50  # of the clip; of it that show a circle, each so many; that are adjusted together
+
+
+class Clip:
+    """The first frames of an experiment's movies, kept in memory; a ball that moves is refused (ExperimentError)."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        if not experiment.alone or not experiment.fixed:
+            do = "track it with `sphereorient track`"
+            raise refused(f"{experiment.path}, sphere.fixed", "one ball that stays in its place", "another", do)
+        with open_recording(experiment, textured=False) as recording:
+            self._frame_s = recording.timeline.frame_s
+            read = {one.name: one.pictures(0, FRAMES) for one in recording.streams}
+            self._pictures = {name: [one for one, _ in each if one is not None] for name, each in read.items()}
+
+    def tracked(self, experiment: Experiment) -> Json:
+        """Track the clip as an experiment that differs in circles, masks, response and cameras says, without a map, by
+        the first pass of `track` and `live`, and what it shows adjusted together. Return counts and figures for people.
+        Raises SphereOrientError: nothing is found, or the ball does not turn.
+        """
+        begun, settings = time.perf_counter(), Settings()
+        with tempfile.TemporaryDirectory() as folder:
+            paths = {name: Path(folder, f"{name}.npy") for name in self._pictures}
+            shown = {name: _light(each, experiment.response.get(name)) for name, each in self._pictures.items()}
+            for name, lit in shown.items():
+                np.save(paths[name], np.array([flipped_picture(one, experiment.flip.get(name, "none")) for one in lit]))
+            masks = {name: given_mask(experiment, name, lit[0].shape) for name, lit in shown.items()}
+            clip = replace(experiment, movie_paths=paths, frame_rate_hz=1 / self._frame_s, times=None, frames=None)
+            clip = replace(clip, start=dict.fromkeys(paths, 0), start_given=False, response={}, background_paths={})
+            circles = {
+                one: clip.circles.get(one)
+                or fixed_ball(np.array(lit[::APART]), settings.locate, None, masks[one])[0].circle
+                for one, lit in shown.items()
+            }
+            clip = replace(clip, circles=circles)
+            with open_recording(clip, textured=False) as recording, one_thread():
+                place = held_place(recording, settings.paint, settings.locate)
+                coarse, count = CoarserPictures.of(place), len(recording.timeline)
+                found, kept = swept(recording, coarse, FirstPass(coarse.place), count, silent)
+                left = adjusted(*kept.crops(TOGETHER)).left
+        seen = [one for one in found if supported(one)]
+        variance = [float(one.covariance[0, :3, :3].trace()) for one in seen]
+        return {
+            "frames": count,
+            "found": len(seen),
+            "score": float(np.median([float(one.score[0, one.use].mean()) for one in seen])),
+            "error_deg": float(np.degrees(np.sqrt(np.median(variance)))),
+            "left": 100 * left,
+            "circles": circles,
+            "seconds": time.perf_counter() - begun,
+        }
+
+
+def _light(pictures: Sequence[Grey], response: Response | None) -> Sequence[Grey]:
+    """Return pictures as a linear camera shows them, where the response is given."""
+    if response is None or response.linear:
+        return pictures
+    full = float(np.iinfo(pictures[0].dtype).max)
+    return [(response.light(one, full) * (65535 / full)).round().astype(np.uint16) for one in pictures]

@@ -1,0 +1,139 @@
+"""A clip is tracked again on the page while circle, mask, light and field of view are changed, and these are saved."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mark_examples import opened, served
+
+from sphereorient.errors import SphereOrientError
+from sphereorient.experiment import load_experiment
+from sphereorient.preflight.mark_masks import MaskMarking
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
+
+pytest_plugins = ["browser_examples"]
+NOTHING: dict[str, Any] = {"shapes": [], "keep": True}
+VFOV_DEG = 20.0
+CORNER = {"kind": "hide", "points": [[0, 0], [20, 0], [0, 20]]}
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory) -> Path:
+    """A ball that turns in its place, of one camera, with comments in its files."""
+    settings = SynthSettings(
+        frames=60, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
+        exposure_samples=1, omega_rms=60.0, seed=5,
+    )  # fmt: skip
+    path = write_synthetic_experiment(tmp_path_factory.mktemp("turns"), settings)
+    content = yaml.safe_load(path.read_text())
+    movie = content["movies"]["cam1"]
+    path.write_text(
+        f"# mine\nschema: {content['schema']}\nframe_rate: {content['frame_rate']}\n"
+        f"sphere: {{diameter: null, fixed: true}}  # a ball\ncameras: one.yaml\nmovies: {{cam1: {movie}}}\n"
+    )
+    path.with_name("one.yaml").write_text(
+        "# my camera\nschema: sphereorient-cameras/1\ncameras:\n  cam1:\n    model: pinhole\n"
+        f"    image_size: [150, 150]\n    vfov_deg: {VFOV_DEG}  # measured\n"
+    )
+    return path
+
+
+@pytest.fixture
+def marking(turning: Path, tmp_path: Path) -> MaskMarking:
+    for file in turning.parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return MaskMarking(tmp_path / turning.name)
+
+
+def test_a_wrong_circle_is_seen_in_the_figures(marking):
+    right = marking.done(["track", "cam1"], NOTHING)
+    u, v, radius = right["circles"]["cam1"]
+    assert radius == pytest.approx(28, abs=1)
+    assert (right["found"], right["frames"]) == (60, 60)
+    wrong = marking.done(["track", "cam1"], NOTHING | {"circle": [u + 4, v, radius]})
+    assert wrong["circles"]["cam1"] == (u + 4, v, radius)
+    assert wrong["score"] < right["score"] - 0.02
+    assert wrong["error_deg"] > right["error_deg"]
+
+
+def test_mask_light_and_field_of_view_are_those_that_are_tried(marking):
+    circle = list(marking.done(["track", "cam1"], NOTHING)["circles"]["cam1"])
+    right = marking.done(["track", "cam1"], NOTHING | {"circle": circle})
+    disk = {"kind": "hide", "u": circle[0], "v": circle[1], "radius": 16}
+    for more in ({"shapes": [disk]}, {"light": {"gamma": 0.4}}, {"vfov_deg": 70.0}):
+        other = marking.done(["track", "cam1"], NOTHING | {"circle": circle} | more)
+        assert abs(other["left"] - right["left"]) > 0.02 * right["left"], more
+    assert not list(marking.path.parent.glob("*mask*")), "nothing is written until it is saved"
+
+
+def test_what_was_tried_is_saved_and_all_else_stays(marking):
+    asked = NOTHING | {"circle": [75.25, 74.5, 28.0], "light": {"gamma": 2.2}, "vfov_deg": 25, "shapes": [CORNER]}
+    files = marking.done(["adopt", "cam1"], asked)["files"]
+    saved = load_experiment(marking.path)
+    assert saved.circles == {"cam1": (75.25, 74.5, 28.0)}
+    assert saved.response["cam1"].gamma == 2.2
+    assert float(saved.cameras["cam1"].f_px) == pytest.approx(75 / math.tan(math.radians(12.5)))
+    assert saved.mask_paths["cam1"].name == "cam1_mask.png"
+    assert {Path(file).name for file in files} == {"cam1_mask.png", "one.yaml", marking.path.name}
+    assert marking.path.read_text().startswith("# mine\n")
+    assert "# a ball" in marking.path.read_text()
+    assert "vfov_deg: 25.0  # measured" in saved.cameras_path.read_text()
+    tried = marking.done(["track", "cam1"], NOTHING)
+    assert tried["circles"] == {"cam1": (75.25, 74.5, 28.0)}, "the saved one from now on"
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"circle": [1, 2]}, "radius"),
+        ({"circle": [1, 2, -3]}, "radius"),
+        ({"light": "dim"}, "linear, srgb"),
+        ({"vfov_deg": "wide"}, "expected numbers"),
+        ({"vfov_deg": 200}, "between 0 and 180"),
+        ({"shapes": [{"kind": "hide", "u": 75, "v": 75, "radius": 500}]}, "all of it hidden"),
+    ],
+)
+def test_impossible_values_are_told_and_change_nothing(marking, asked, words):
+    before = {path.name: path.read_bytes() for path in marking.path.parent.iterdir()}
+    for what in ("track", "adopt"):
+        with pytest.raises(SphereOrientError, match=words):
+            marking.done([what, "cam1"], NOTHING | asked)
+    assert {path.name: path.read_bytes() for path in marking.path.parent.iterdir()} == before
+
+
+def test_a_ball_that_moves_is_refused(marking):
+    marking.path.write_text(marking.path.read_text().replace("fixed: true", "fixed: false"))
+    moves = MaskMarking(marking.path)
+    assert moves.state()["tries"] is False
+    with pytest.raises(SphereOrientError, match="stays in its place"):
+        moves.done(["track", "cam1"], NOTHING)
+
+
+def test_a_given_circle_is_where_the_ball_is_sought(marking):
+    marking.path.write_text(marking.path.read_text() + "circles: {cam1: [70.0, 74.0, 30.0]}\n")
+    assert MaskMarking(marking.path).done(["track", "cam1"], NOTHING)["circles"] == {"cam1": (70.0, 74.0, 30.0)}
+    marking.path.write_text(marking.path.read_text().replace("30.0]", "-30.0]"))
+    with pytest.raises(SphereOrientError, match="greater than 0"):
+        load_experiment(marking.path)
+
+
+@pytest.mark.slow  # a browser
+def test_a_person_tries_another_circle_and_saves_it(marking, browser):
+    with served(marking) as address, opened(browser, f"{address}/{marking.token}/") as page:
+        page.get_by_role("button", name="track", exact=True).click()
+        page.wait_for_function("document.getElementById('figures').rows.length === 2")
+        found = float(page.get_by_label("radius").input_value())
+        page.get_by_label("radius").fill(f"{found - 3:.1f}")
+        page.get_by_role("button", name="track", exact=True).click()
+        page.wait_for_function("document.getElementById('figures').rows.length === 3")
+        cells = page.evaluate("[...document.querySelectorAll('#figures td')].map(cell => cell.textContent)")
+        assert np.isfinite([float(cell) for cell in cells]).all()
+        assert float(cells[6]) < float(cells[1]), "the score"
+        page.get_by_role("button", name="save these").click()
+        page.get_by_text("Wrote").wait_for()
+    assert load_experiment(marking.path).circles["cam1"][2] == pytest.approx(found - 3)
