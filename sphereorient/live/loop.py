@@ -94,8 +94,8 @@ def run_live(
     """
     recording, tracker = opened.recording, opened.tracker
     first = next(iter(tracker.appearances))  # of several balls the page shows this one
-    experiment, camera = recording.experiment, recording.streams[0].camera
-    table = FicTracLines(camera.R_cam_lab.numpy())
+    experiment, views = recording.experiment, tracker.appearances[first].fitter.views
+    table = FicTracLines(views[0].camera.R_cam_lab.numpy())
     known = {ball: Quantities(experiment.of(ball).fixed, experiment.length_unit, ball) for ball in tracker.appearances}
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it

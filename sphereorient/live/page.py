@@ -82,8 +82,8 @@ class _Absence:
 
 
 class Monitor:
-    """Hands on the frames of a feed, waiting while it is stopped, and counts what was measured. Of several balls a frame
-    counts as lost if it shows one of them nowhere.
+    """Hands on the frames of a feed, waiting while it is stopped, and counts what was measured. A frame counts as lost
+    where one of several balls is.
     """
 
     def __init__(self, feed: Feed, tell: Tell = lambda line: None) -> None:
