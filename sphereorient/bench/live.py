@@ -208,12 +208,13 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
     number, came_s, *_ = table = table[FIRST:].T
     at, written_s = number.astype(int) - 1, np.array(writer.written_s)
     shown = [k for k in range(at[0], at[-1] + 1) if not timing.dark(k)] if len(at) else []
+    lit = np.isin(at, shown)
     ends_s += [written_s[k] for k in shown if timing.dark(k - 1)]
     right_s = came_s[error_deg < RIGHT_DEG]
     return Delays(
         written=len(shown),
-        delay_s=came_s - written_s[at],
-        lost=int(np.isnan(table[2]).sum()) - sum(timing.dark(k) for k in at.tolist()),
+        delay_s=(came_s - written_s[at])[lit],
+        lost=int(np.isnan(table[2][lit]).sum()),
         error_deg=error_deg,
         memory_mb=np.array(memory_mb),
         back_s=np.array([min((s - end_s for s in right_s if s > end_s), default=np.inf) for end_s in ends_s]),

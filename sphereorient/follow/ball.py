@@ -21,7 +21,8 @@ from sphereorient.follow.initialise import LOOSE, Initialiser, by_decreasing_siz
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
-from sphereorient.pose.fitter import HOPELESS, DisksPx, Fitter, Steps
+from sphereorient.pose.fit import HOPELESS
+from sphereorient.pose.fitter import DisksPx, Fitter, Steps
 from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 

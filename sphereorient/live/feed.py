@@ -14,7 +14,8 @@ from sphereorient.experiment.recording import CameraStream
 
 Picture = NDArray[np.generic]
 Tell = Callable[[str], object]  # gets what is wrong, in one line
-LATE, GROWS = 2, 3  # frames that may wait; times the step before, of the next one
+LATE, GROWS = 1, 2  # frames that may wait; times the step before, of the next one
+STEADY = 8  # frames in a row without a search: then the next search is not for a motion that steps hide
 STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
 
 
@@ -61,7 +62,8 @@ class Feed:
         self._changed = Condition()
         self._ended = self._closed = False
         self._fault: Exception | None = None
-        self._step = 0  # from the frame before to the last one; 0: none
+        self._overrun = False  # whether frames behind the last one were dropped
+        self._step, self._since = 0, STEADY  # from the frame before to the last one; frames since the last search
         self._thread = Thread(target=self._read, name="feed", daemon=True)
         self._thread.start()
 
@@ -73,7 +75,7 @@ class Feed:
                         self._changed.wait()
                     if len(self._waiting) >= self._most:
                         self._waiting.popleft()
-                        self.dropped += 1
+                        self.dropped, self._overrun = self.dropped + 1, True
                     self._waiting.append(arrival)
                     self.newest_s = self.newest_s if self._wait else arrival.time_s
                     if self._last_s:
@@ -93,8 +95,15 @@ class Feed:
                 self._source.close()  # a device is released
 
     def restart(self) -> None:
-        """Begin with small steps: of the motion from here nothing is known."""
-        self._step = 0
+        """Begin with small steps, since of the motion from here nothing is known: with one of up to `GROWS` frames, and
+        where that soon leads to another search with one of a single frame. Where frames behind the last one were
+        dropped meanwhile, none of those that wait is near it, and they are passed over.
+        """
+        with self._changed:
+            self._step, self._since = int(self._since >= STEADY), 0
+            if self._overrun:
+                self.dropped += len(self._waiting)
+                self._waiting.clear()
 
     def close(self) -> None:
         """Read no further frame."""
@@ -108,13 +117,13 @@ class Feed:
                 self._await()
                 if not self._waiting:
                     break
-                arrival = self._waiting.popleft()
+                arrival, self._overrun = self._waiting.popleft(), False
                 most = min(len(self._waiting) + 1 - LATE, GROWS * self._step)
                 if not self._wait and most > 1:
                     self.dropped += most - 1
                     for _ in range(most - 1):
                         arrival = self._waiting.popleft()
-                self._step = max(most, 1)
+                self._step, self._since = max(most, 1), self._since + 1
                 self._changed.notify_all()
             yield arrival
         if self._fault is not None:

@@ -1,7 +1,6 @@
 """`live`: the set-up learnt from its movie, or only its place, and the loop over the frames of a source."""
 
 import gc
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import limited_cores, silent
 from sphereorient.files.whole_file import writing
-from sphereorient.live.feed import Feed, Tell
+from sphereorient.live.feed import Feed, FrameBytes, Tell
 from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
@@ -23,6 +22,9 @@ from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
+
+
+MOST_WAITING, MOST_BYTES = 512, 64 << 20  # frames that wait
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,8 +101,8 @@ def run_live(
     known = {ball: Quantities(experiment.of(ball).fixed, experiment.length_unit, ball) for ball in tracker.appearances}
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
-    sys.setswitchinterval(0.0002)  # longest that a thread that computes holds up the one that reads
-    feed = Feed(source.frames(recording), most=64, wait=source.waits, tell=tell)
+    size = FrameBytes(recording.streams).size
+    feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
     if page is not None:
         page.begin(recording, monitor.running, opened.save_map)

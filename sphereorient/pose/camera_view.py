@@ -64,6 +64,11 @@ class CameraView:
         mean = self.response.light(self.background.mean, self.background.full_scale)
         return replace(self.background, mean=mean)
 
+    @cached_property
+    def plain(self) -> bool:
+        """Whether pictures are their own light, and lines of sight those of a camera that is not a fisheye."""
+        return (self.response is None or self.response.linear) and not self.sight.wide
+
     def light(self, picture: Picture, window: tuple[int, int, int, int]) -> Picture:
         """Return the light of a picture (H, W) within left, top, right and bottom, included, px; 0 beyond."""
         if self.response is None or self.response.linear:

@@ -10,10 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import in_air, sphere_disk_px
@@ -23,10 +24,21 @@ from sphereorient.files.threads import cores
 from sphereorient.pose import fit
 from sphereorient.pose import residuals as in_torch
 from sphereorient.pose.camera_view import CameraView, FrameDisks
-from sphereorient.pose.fit import COVERED, FIRST_EVERY, LEAST_OF_WINDOW, MARGIN_PX, MORE, MOST_EACH, NEAR_RAD, WINDOW_PX
+from sphereorient.pose.fit import (
+    AGAIN,
+    COVERED,
+    FIRST_EVERY,
+    HOPELESS,
+    LEAST_OF_WINDOW,
+    MARGIN_PX,
+    MORE,
+    MOST_EACH,
+    NEAR_RAD,
+    WINDOW_PX,
+)
 from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel, SphereView
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
-from sphereorient.pose.poses import FittedPoses, PoseStart, pose_arrays
+from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart, pose_arrays
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUKEY, Residuals
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
 
@@ -37,6 +49,7 @@ SOURCE = Path(__file__).with_name("refine")
 _Table, _Task, _Stencil, _Scene, _Shot, Near = (
     record(SOURCE, name) for name in ("Table", "Task", "Stencil", "Scene", "Shot", "Near")
 )
+_RESULTS = [field[0] for field in _Task._fields_[-len(POSE_PARTS) :]]
 # What `linearise` tells of each place, in this order, with their numbers.
 TOLD = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
 TOLD |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
@@ -142,8 +155,8 @@ def _task_of(begin: PoseStart, model: SphereModel, instants: int) -> tuple[ctype
 def _into(task: ctypes.Structure, use: Tensor) -> FittedPoses:
     """Return poses that a task writes: its last fields, in the order of `FittedPoses`."""
     parts = pose_arrays(use.shape[1], len(use))
-    for field, part in zip(_Task._fields_[-len(parts) :], parts.values(), strict=True):
-        setattr(task, field[0], part.data_ptr())
+    for name, part in zip(_RESULTS, parts.values(), strict=True):
+        setattr(task, name, part.data_ptr())
     return FittedPoses(**parts)
 
 
@@ -205,6 +218,62 @@ def settle(
     fit = _into(near.task, begin.use)
     _run("settle", near, poses)
     return fit, far
+
+
+def settle_alone(
+    views: Sequence[CameraView],
+    frames: Sequence[NDArray[Any]],
+    begin: PoseStart,
+    model: SphereModel,
+    stencil: Stencil,
+    instants: int,
+    most_hidden: float,
+    radius_mm: float,
+) -> FittedPoses:
+    """Fit one pose to the frames of C cameras by one call, as `Fitter.settled` does."""
+    code, cameras = library(), len(views)
+    assert code is not None  # as `body_of` asked
+    near, _alive = _alone(tuple(views), model, stencil, instants, most_hidden, radius_mm)
+    near = Near.from_buffer_copy(near)
+    known = begin.place_precision, begin.moved if instants > 1 else None
+    position, rotation = begin.position_lab_mm.double().clone(), begin.R_lab_body.double().clone()
+    precision, moved = (None if part is None else part.double().contiguous() for part in known)
+    task, use, far = near.task, begin.use.contiguous(), ctypes.c_uint8()
+    task.start, task.start_rotation, task.use = position.data_ptr(), rotation.data_ptr(), use.data_ptr()
+    task.place_precision = None if precision is None else precision.data_ptr()
+    near.moved = None if moved is None else moved.data_ptr()
+    near.held, near.far = begin.held, ctypes.addressof(far)
+    shown = [part if part.dtype in READABLE else part.astype(np.float32) for part in frames]
+    shot = (_Shot * cameras)(*(_Shot(part.ctypes.data, *part.strides, part.itemsize, 0, 0) for part in shown))
+    near.shot = ctypes.addressof(shot)
+    fit = _into(task, begin.use)
+    X, R = ctypes.c_void_p(task.start), ctypes.c_void_p(task.start_rotation)
+    if code.settle_alone(ctypes.byref(near), X, R, shot):
+        raise MemoryError
+    return fit
+
+
+@lru_cache(maxsize=16)
+def _alone(
+    views: tuple[CameraView, ...],
+    model: SphereModel,
+    stencil: Stencil,
+    instants: int,
+    most_hidden: float,
+    radius_mm: float,
+) -> tuple[ctypes.Structure, tuple[object, ...]]:
+    """Return the record of `settle_alone` but for the pose and its frames, and what it points to."""
+    cameras = len(views)
+    nowhere = PoseStart(torch.zeros(1, 3), torch.zeros(1, 3, 3), torch.zeros(1, cameras, dtype=torch.bool))
+    task, at = _task_of(nowhere, model, instants)
+    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD)
+    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
+    near.most_hidden, near.radius_mm, near.hopeless, near.again = most_hidden, radius_mm, HOPELESS, AGAIN
+    known = [_of_view(view) for view in views]
+    scene = (_Scene * cameras)(*(one[0] for one in known))
+    near.scene = ctypes.addressof(scene)
+    near.axes = at(torch.stack([view.sight.axes for view in views])[None])
+    return near, (at, known, scene)
 
 
 class _Addresses:

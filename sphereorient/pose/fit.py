@@ -47,6 +47,8 @@ USUALLY_HIDDEN = 0.15
 NEAR_RAD = 0.006  # a step that is longer wants another one before more pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 MORE = 2, 3  # further iterations after a long step: of some pixels, of all
+AGAIN = 3  # times that a fit whose last step is long goes on
+HOPELESS = 0.2  # score of one that does not: far away from any pose
 
 
 def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, most: float) -> Tensor:

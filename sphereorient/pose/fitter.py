@@ -19,8 +19,8 @@ from sphereorient.pose.camera_view import (
     size_steps,
     widest_px,
 )
-from sphereorient.pose.compiled import body_of
-from sphereorient.pose.fit import MOST_HIDDEN, NEAR_RAD
+from sphereorient.pose.compiled import IN_TORCH, body_of, settle_alone
+from sphereorient.pose.fit import AGAIN, HOPELESS, MOST_HIDDEN, NEAR_RAD
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
@@ -33,8 +33,6 @@ from sphereorient.sphere.texture_table import TextureTable
 CPU = torch.device("cpu")
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
-AGAIN = 3  # times that a fit whose last step is long goes on
-HOPELESS = 0.2  # score of one that does not: far away from any pose
 
 Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
 
@@ -205,6 +203,8 @@ class Fitter:
         as long as steps are long. The position's precision counts where not all cameras see the sphere, and where it is
         held. `disks_px`: what the method of this name tells of the first positions, where that is known.
         """
+        if len(frames) == 1 and (alone := self._alone(frames[0], begin)) is not None:
+            return alone
         fit = self._settled(frames, begin, disks_px)
         for _ in range(AGAIN):
             hopeful = ((fit.score > HOPELESS) & begin.use).any(1).numpy()
@@ -214,6 +214,18 @@ class Fitter:
             on = begin.after(fit).of(torch.tensor(rows))
             fit = fit.with_rows(rows, self._settled([frames[k] for k in rows], on))
         return fit
+
+    def _alone(self, frames: Sequence[Shown], begin: PoseStart) -> FittedPoses | None:
+        """Fit one pose by one compiled call; None where that cannot be."""
+        plain = all(isinstance(one, np.ndarray) and view.plain for one, view in zip(frames, self.views, strict=True))
+        if not plain or begin.among is not None or self.device != CPU or body_of(begin.position_lab_mm) is IN_TORCH:
+            return None
+        stencil, shown = (
+            self.stencil(self.optics.fine, self.widest_px),
+            [one for one in frames if isinstance(one, np.ndarray)],
+        )
+        of_model = self.model(), stencil, self.instants, self.most_hidden, self.radius_mm
+        return settle_alone(self.views, shown, begin, *of_model)
 
     def _settled(
         self,

@@ -1162,6 +1162,9 @@ typedef struct {
     int64_t held;                /* whether each fit begins at the given position, with its precision */
     uint8_t *far; /* (poses), 1 where the first stage is left out; then where it moved the pose: nothing else is done */
     const uint8_t *some_hidden, *all_hidden; /* (poses, cameras, places), 1 where other spheres show; or none */
+    /* of `settle_alone` */
+    double radius_mm, hopeless; /* of a fit whose scores are less nothing more is expected */
+    int64_t again;              /* times that a fit whose last step is long goes on */
 } Near;
 
 /* One pose: its disks, cut out with one stencil, and its fits. */
@@ -1360,4 +1363,35 @@ int settle(const Near *n, int64_t begin, int64_t end) {
     }
     close_cut(&some), close_cut(&all);
     return without;
+}
+
+/* Let the frames of one pose be cut out about where it is. */
+static void look_at(const Near *n, Shot *shot) {
+    for (int64_t c = 0; c < n->task.cameras; c++) {
+        double at[3];
+        disks(n->scene + c, n->task.start, n->radius_mm, at, 1);
+        shot[c].u = isnan(at[0]) ? 0 : (int64_t)rint(at[0]), shot[c].v = isnan(at[1]) ? 0 : (int64_t)rint(at[1]);
+    }
+}
+
+/* Fit one pose as `Fitter.settled`: cut out anew where it moves far, and again as long as steps are long. Its start, of
+   which `position` and `rotation` are, is written over. Return 0, or 1 without memory. */
+int settle_alone(const Near *n, double *position, double *rotation, Shot *shot) {
+    const Task *t = &n->task;
+    for (int64_t round = 0; round <= n->again; round++) {
+        for (int cut = 0; cut < 2; cut++) {
+            look_at(n, shot);
+            *n->far = (uint8_t)cut;
+            if (settle(n, 0, 1)) return 1;
+            if (!*n->far) break;
+            if (!n->held) memcpy(position, t->position, 3 * sizeof *position);
+            memcpy(rotation, t->rotation, 9 * sizeof *rotation);
+        }
+        int hopeful = 0;
+        for (int64_t c = 0; c < t->cameras; c++) hopeful |= t->use[c] && t->score[c] > n->hopeless;
+        if (!(length(t->step) > n->near_rad) || !hopeful) break;
+        if (!n->held) memcpy(position, t->position, 3 * sizeof *position);
+        memcpy(rotation, t->rotation, 9 * sizeof *rotation);
+    }
+    return 0;
 }
