@@ -170,9 +170,11 @@ class BallTracker:
             disks_px = self._disks_px(start.position_lab_mm)
             if float(disks_px.largest_px) <= self.fitter.widest_px:
                 fit = self.fitter.settled(frames, start, disks_px)
-                if bool((fit.score < HOPELESS).all()):
+                score = fit.score.numpy()
+                if score.max() < HOPELESS:
                     return None
-                if bool(self._supported(fit, use)) and not bool(self._poor(fit, use)):
+                poor = 1.0 - score.min() > MORE_THAN_USUAL * (1.0 - self.usual_score)
+                if not poor and bool(self._supported(fit, use)):
                     return poses_of(fit, slice(1), expected.use, [Reason.OK] * len(shots))
         (poses,) = self.follow([expected], [shots])
         return poses
