@@ -23,7 +23,6 @@ from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
 
-
 MOST_WAITING, MOST_BYTES = 512, 64 << 20  # frames that wait
 
 
