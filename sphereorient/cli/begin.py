@@ -233,6 +233,8 @@ def _found(look: "FirstLook") -> str:
     where = (
         "one picture"
         if look.photograph
+        else "sways in its place"
+        if look.sways
         else "stays in its place"
         if look.stays
         else f"moves, found in {look.found} of {look.looked} frames"

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +64,11 @@ def look_at(
     `shown` (H, W) is False where something hides the ball of the only movie.
     """
     movies = [open_movie(path) for path in paths]
-    looks = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
-    return list(counted("look", looks, len(movies), progress))
+    each = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
+    looks = list(counted("look", each, len(movies), progress))
+    if any(one.stays is False for one in looks):  # it moves: in a short movie another camera may see little of that
+        looks = [replace(one, stays=False, sways=False) if one.sways else one for one in looks]
+    return looks
 
 
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
