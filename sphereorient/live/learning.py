@@ -53,6 +53,7 @@ class LearningTracker:
         self._known = _unknown(place, self._pass)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
         self._lasting, self._error = self._known.lasting, OUTLINE_ERROR  # of the place, radii in pictures
+        self._away_rad = 0.0  # farthest turn from the first frame
         self._drift_rad = 0.0  # of the frames that came while the map was adjusted
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
@@ -73,8 +74,8 @@ class LearningTracker:
         all turns are too long or too short by the same share.
         """
         covariance = torch.zeros(6, 6, dtype=torch.float64)
-        away = float(so3.log(poses.R_lab_body[0]).norm())
-        covariance[:3, :3] = ((self._error * away) ** 2 + self._drift_rad**2) * torch.eye(3, dtype=torch.float64)
+        self._away_rad = max(self._away_rad, float(so3.log(poses.R_lab_body[0]).norm()))
+        covariance[:3, :3] = ((self._error * self._away_rad) ** 2 + self._drift_rad**2) * torch.eye(3, dtype=torch.float64)
         return covariance
 
     def between(self) -> None:
