@@ -75,7 +75,9 @@ class LearningTracker:
         """
         covariance = torch.zeros(6, 6, dtype=torch.float64)
         self._away_rad = max(self._away_rad, float(so3.log(poses.R_lab_body[0]).norm()))
-        covariance[:3, :3] = ((self._error * self._away_rad) ** 2 + self._drift_rad**2) * torch.eye(3, dtype=torch.float64)
+        covariance[:3, :3] = ((self._error * self._away_rad) ** 2 + self._drift_rad**2) * torch.eye(
+            3, dtype=torch.float64
+        )
         return covariance
 
     def between(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -178,11 +179,15 @@ def test_frames_that_were_kept_since_an_adjustment_turn_with_it(ball):
     far = replace(first, R_lab_body=so3.exp(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)))
     frames.add([ball.shots[0]], far)
     assert (before.count, frames.count) == (late, late + 1)
-    turn = so3.exp(torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
-    corrected, since = frames.corrected(before, turn @ before.crops()[1])
-    torch.testing.assert_close(corrected, turn)
+    R = before.crops()[1]
+    right = [R[0]]  # all turns were 2 % too short
+    for one, other in pairwise(R):
+        right.append(so3.exp(1.02 * so3.log(other @ one.mT)) @ right[-1])
+    expected = so3.exp(1.02 * so3.log(far.R_lab_body[0] @ R[-1].mT)) @ right[-1]
+    corrected, since = frames.corrected(before, torch.stack(right))
+    torch.testing.assert_close(corrected @ far.R_lab_body[0], expected)
     assert len(since.crops()[1]) == 1
-    torch.testing.assert_close(frames.crops()[1][-1], turn @ far.R_lab_body[0])
+    torch.testing.assert_close(frames.crops()[1][-1], expected)
 
 
 @pytest.mark.parametrize("camera", [pinhole(), brown()], ids=["pinhole", "brown"])

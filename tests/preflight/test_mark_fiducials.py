@@ -189,7 +189,7 @@ def test_the_command_tells_the_files_apart(marking, name, kind, monkeypatch):
         self.token = "known"
 
     monkeypatch.setattr(kind, "__init__", begin)
-    monkeypatch.setattr("socketserver.TCPServer.__init__", lambda *_: (_ for _ in ()).throw(OSError("in use")))
+    monkeypatch.setattr("socket.create_server", lambda *_, **__: (_ for _ in ()).throw(OSError("in use")))
     path = marking.path.with_name(name)
     if kind is MaskMarking:
         path.write_text("schema: sphereorient-experiment/1\n")
