@@ -145,6 +145,21 @@ def test_a_fit_goes_on_while_its_steps_are_long(scene):
     assert float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).max()) < 0.5
 
 
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("off_deg", [0.0, 15.0])
+def test_a_pose_alone_by_one_call_is_that_among_others_to_the_last_bit(scene, held, off_deg):
+    fitter, pictures, X, R = scene
+    fitter, frames, begin = replace(fitter, instants=3), [list(row) for row in pictures], start(X, R, held=held)
+    if off_deg:
+        far = torch.cat([turned(R[k : k + 1], off_deg, k) for k in range(COUNT)])
+        begin = replace(begin, R_lab_body=far)
+    together = fitter.settled(frames, begin)
+    for k in range(COUNT):
+        alone = fitter.settled(frames[k : k + 1], begin.of(torch.tensor([k])))
+        for name, part in alone.parts().items():
+            assert torch.equal(part[0], getattr(together, name)[k]), (k, name)
+
+
 def test_the_shutter_is_open_while_the_ball_moves(scene, monkeypatch):
     fitter, pictures, X, R = scene
     frames, begin = [list(row) for row in pictures], start(X, R)
