@@ -118,7 +118,8 @@ class Feed:
                 if not self._waiting:
                     break
                 arrival, self._overrun = self._waiting.popleft(), False
-                most = min(len(self._waiting) + 1 - LATE, GROWS * self._step)
+                late = LATE if self._since else 0  # what came during a search is late as it is
+                most = min(len(self._waiting) + 1 - late, GROWS * self._step)
                 if not self._wait and most > 1:
                     self.dropped += most - 1
                     for _ in range(most - 1):
