@@ -442,5 +442,5 @@ def open_output(name: str, tell: Tell) -> tuple[Output, str]:
     named = "serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME", "shared:FILE"
     others = [*named, *(f"NAME{suffix}" for suffix in FILES)]
     expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others])
-    do = "choose one of these; another machine is tcp:HOST:PORT"
+    do = "choose one of these; another address is tcp:HOST:PORT"
     raise SettingsError(refusal("--to", expected=expected, got=name, do=do))
