@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import Event, Lock
+from threading import Event
 from typing import BinaryIO
 
 from sphereorient.errors import MovieError, SettingsError, refusal
@@ -77,7 +77,6 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
             expected = f"a device for each camera ({', '.join(one.name for one in opened.streams)})"
             do = "add --cameras with one name" + ("" if kind == "camera:" else ", or list serial numbers: A,B")
             raise SettingsError(refusal("--source", expected=expected, got=f"{len(serials)}", do=do))
-        opening = Lock()
         released.clear()
         try:
             with ExitStack() as drivers:
@@ -91,7 +90,6 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
                         keys=None if ends else opened.experiment.devices.get(stream.name),
                         flip=opened.experiment.flip.get(stream.name, "none"),
                         tell=None if ends else tell,
-                        opening=opening,
                     )
                     for serial, stream in zip(serials, opened.streams, strict=True)
                 ]
