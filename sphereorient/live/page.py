@@ -133,9 +133,8 @@ class Monitor:
         cause = next((words for reason, words in CAUSES.items() if reason in now.reason), "no picture can be used")
         if Reason.LOW_SCORE in now.reason and self.lost > MOSTLY * self.count:
             cause = NOT_EXPLAINED
-        self._tell(
-            f"frame {now.number}: {_called(now)} is not found for {LOST_S:g} s ({why}): {cause}; tracking goes on."
-        )
+        lost = f"{_called(now)} is not found for {LOST_S:g} s ({why})"
+        self._tell(f"frame {now.number}: {lost}: {cause}; tracking goes on.")
 
     def summary(self) -> list[str]:
         """Return the counts and latencies in words."""
@@ -219,9 +218,8 @@ class PageProcess(PageWriter):
         folder = Path(tempfile.mkdtemp(prefix="sphereorient-", dir=memory))
         spawn = multiprocessing.get_context("spawn")
         commands, theirs = spawn.Pipe()
-        self.process = spawn.Process(
-            target=_serve, args=(experiment, cameras, folder, token, door, theirs), name="page", daemon=True
-        )
+        given = experiment, cameras, folder, token, door, theirs
+        self.process = spawn.Process(target=_serve, args=given, name="page", daemon=True)
         self.process.start()
         self.address = address(door, token)
         door.close()
