@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,9 +44,14 @@ class SharedFrames:
         self._path, self._slots = path, slots
         try:
             with path.open("x+b") as file:
-                _reserve(file, path, length)
+                file.truncate(length)
+                if hasattr(os, "posix_fallocate"):  # a page that finds no room later would end the program
+                    os.posix_fallocate(file.fileno(), 0, length)
                 self._map = mmap.mmap(file.fileno(), length)
         except OSError as error:
+            if not isinstance(error, FileExistsError):
+                with suppress(OSError):
+                    path.unlink()
             do = "name a new file in a folder with room"
             raise OutputError(refusal(str(path), expected="a new file", got=error_words(error), do=do)) from None
         self._words = np.frombuffer(self._map, np.uint64, HEAD)
@@ -78,17 +83,6 @@ class SharedFrames:
 
     def __exit__(self, *fault: object) -> None:
         self.close()
-
-
-def _reserve(file: IO[bytes], path: Path, length: int) -> None:
-    """Give a new file its length, on the disk too where the system can: a page without room would end the program."""
-    try:
-        file.truncate(length)
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, length)
-    except OSError:
-        path.unlink()
-        raise
 
 
 Slot = tuple[int, float, bytes, float]  # number, time (s), content, when it was read by the clock of time.perf_counter

@@ -56,10 +56,6 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
         number += 1
 
 
-def _stdin(recording: Recording) -> Iterator[Arrival]:
-    return raw_frames(sys.stdin.buffer, recording.streams, 1 / recording.timeline.frame_s)
-
-
 def _devices(kind: str, where: str, tell: Tell) -> Source:
     """Return the cameras of a maker: a serial number for each camera of the experiment, in its order."""
     ends = kind == "camera:" and Path(where).is_file()  # a movie
@@ -104,7 +100,9 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
 SOURCES: Mapping[str, Callable[[str, Tell], Source]] = {
     "movie": lambda *_: Source(frames=partial(movie_frames, paced=True), even=True),
     "movie-fast": lambda *_: Source(frames=partial(movie_frames, paced=False), waits=True, even=True),
-    "-": lambda *_: Source(frames=_stdin, waits=True, even=True),
+    "-": lambda *_: Source(
+        frames=lambda all_: raw_frames(sys.stdin.buffer, all_.streams, 1 / all_.timeline.frame_s), waits=True, even=True
+    ),
     **{kind: partial(_devices, kind) for kind in MAKERS},
     "shared:": lambda where, _: Source(frames=lambda opened: shared_frames(Path(where), opened.streams)),
 }

@@ -471,7 +471,9 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch):
         install("pylon:", [first, second], monkeypatch)
         source = source_of("pylon:a,b", told.append)
         feed = Feed(source.frames(opened.recording), most=1000, wait=True)
-        found = list(islice(measured(opened.tracker, opened.tracker.appearance.fitter.views, feed), len(order) - 1))
+        found = list(
+            islice(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, feed), len(order) - 1)
+        )
         feed.close()
         source.close()
     truth = torch.from_numpy(true_track().orientation)
