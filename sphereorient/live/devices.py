@@ -171,7 +171,7 @@ def _vimba(serial: str) -> Iterator[Device]:
 @contextmanager
 def _opencv(where: str) -> Iterator[Device]:
     """What OpenCV opens, by its number or address; pictures are made grey and lie as they are stored."""
-    capture = cv2.VideoCapture(int(where) if where.isdigit() else where)
+    capture = cv2.VideoCapture(int(where) if where.isdecimal() else where)
     try:
         if not capture.isOpened():
             do = "connect it, or name another number"

@@ -63,7 +63,7 @@ def cameras_here(limit_s: float = 10.0) -> dict[str, list[str] | str]:
 def _asked(kind: str, limit_s: float) -> list[str] | str:
     command = [sys.executable, "-P", __file__, kind]  # -P: the modules beside this file hide no others
     try:
-        told = subprocess.run(command, capture_output=True, text=True, timeout=limit_s)
+        told = subprocess.run(command, capture_output=True, errors="replace", timeout=limit_s)
     except subprocess.TimeoutExpired:
         return f"no answer within {limit_s:g} s"
     if told.returncode:

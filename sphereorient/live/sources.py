@@ -18,6 +18,7 @@ from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.live.devices import MAKERS, RELEASE_S, Camera, device_frames, worded
 from sphereorient.live.feed import Arrival, FrameBytes, Tell
 from sphereorient.live.shared import shared_frames
+from sphereorient.movies import flipped_picture
 from sphereorient.movies.record import Recorder
 
 
@@ -118,13 +119,16 @@ def source_of(name: str, tell: Tell) -> Source:
 
 
 def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
-    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none."""
+    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none. Pictures lie
+    there as in the experiment's movies: `flip` mirrors them on reading.
+    """
 
     def frames(recording: Recording) -> Iterator[Arrival]:
+        how = [recording.experiment.flip.get(stream.name, "none") for stream in recording.streams]
         for arrival in source.frames(recording):
             room = all(one.room() for one in recorders)
-            for one, picture in zip(recorders, arrival.pictures, strict=True):
-                one.take(arrival.time_s, picture, room)
+            for one, picture, flip in zip(recorders, arrival.pictures, how, strict=True):
+                one.take(arrival.time_s, None if picture is None else flipped_picture(picture, flip), room)
             yield arrival
 
     return replace(source, frames=frames)

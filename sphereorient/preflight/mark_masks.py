@@ -62,7 +62,7 @@ class MaskMarking(Marking):
         match steps:
             case ["state"]:
                 return self.state()
-            case ["frame", name, number] if number.isdigit():
+            case ["frame", name, number] if number.isdecimal():
                 return self.frame(name, int(number[:9]))
             case ["mask", name]:
                 return self.mask(name)
