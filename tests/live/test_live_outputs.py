@@ -101,7 +101,7 @@ def test_a_host_that_nobody_knows_is_told():
 
 def test_an_empty_host_is_this_machine_alone():
     output, _ = open_output("tcp::0", pytest.fail)
-    with pytest.raises(OSError):  # noqa: PT011 -- each system has its own
+    with pytest.raises(OSError):
         socket.create_connection(("127.0.0.2", output.port), 0.5)
     output.close()
 
