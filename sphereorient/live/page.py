@@ -258,7 +258,8 @@ def _serve(
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     limit_cores(1)
-    with open_recording(experiment, cameras, textured=False) as recording:
+    # The loop opens the same files, and tells what is wrong with them.
+    with suppress(SphereOrientError), open_recording(experiment, cameras, textured=False) as recording:
         page = LivePage(recording, folder, commands)
         Thread(target=PageServer(page, door, token).serve_forever, name="page", daemon=True).start()
         page.follow()

@@ -102,7 +102,9 @@ SOURCES: Mapping[str, Callable[[str, Tell], Source]] = {
     "movie": lambda *_: Source(frames=partial(movie_frames, paced=True), even=True),
     "movie-fast": lambda *_: Source(frames=partial(movie_frames, paced=False), waits=True, even=True),
     "-": lambda *_: Source(
-        frames=lambda all_: raw_frames(sys.stdin.buffer, all_.streams, 1 / all_.timeline.frame_s), waits=True, even=True
+        frames=lambda opened: raw_frames(sys.stdin.buffer, opened.streams, 1 / opened.timeline.frame_s),
+        waits=True,
+        even=True,
     ),
     **{kind: partial(_devices, kind) for kind in MAKERS},
     "shared:": lambda where, _: Source(frames=lambda opened: shared_frames(Path(where), opened.streams)),
