@@ -18,7 +18,7 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.files.cache import cache_folder
 from sphereorient.files.compiled import WITHOUT, compiled_parts
 from sphereorient.files.hdf5 import UNNAMED
-from sphereorient.files.threads import cores
+from sphereorient.files.threads import cores, limited_cores
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.appearance.record import Studied
 from sphereorient.live.live import measured
@@ -37,6 +37,8 @@ from sphereorient.trajectory.rotations import distance_deg
 
 LIMITS_DEG = {40.0: 0.3, 90.0: 0.1, 160.0: 0.1}  # by the ball's diameter, px: error that no right pose has
 FRAMES, FIRST = 40, 10  # of a ball; those that do not count: caches fill
+STILL: dict[str, Any] = {"volume_mm": 1.0, "velocity_rms": 0.0, "exposure": 0.0, "exposure_samples": 1}
+TURNS = STILL | {"omega_rms": 3.0, "frame_rate": 200.0, "periodic": True}
 BUSY = 0.7  # share of the time in which the loop can compute: the rest is for lines and for what comes between
 
 
@@ -88,10 +90,8 @@ def fit_speed(diameter_px: float) -> dict[str, float]:
     clock, and the rates that can be held: by a core that is free, by one shared with another program, and now.
     """
     side = 2 * round(0.8 * diameter_px)
-    motion: dict[str, Any] = {"volume_mm": 1.0, "velocity_rms": 0.0, "omega_rms": 3.0, "frame_rate": 200.0}
-    motion |= {"exposure": 0.0, "exposure_samples": 1, "periodic": True}
-    scene = SynthSettings(frames=FRAMES, cameras=1, diameter_px=diameter_px, image_size=(side, side), **motion)
-    with TemporaryDirectory() as folder:
+    scene = SynthSettings(frames=FRAMES, cameras=1, diameter_px=diameter_px, image_size=(side, side), **TURNS)
+    with TemporaryDirectory() as folder, limited_cores(1):  # as `live`
         path, learnt = write_synthetic_experiment(Path(folder), scene), Path(folder) / "learnt.h5"
         save_learnt({UNNAMED: Learnt.of(_appearance(path, scene))}, learnt)
         R_true = orientations_at(path.parent / "truth.h5", np.arange(FRAMES))

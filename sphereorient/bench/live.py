@@ -1,19 +1,19 @@
 """Delay and error of live tracking: from a picture in memory to the line on a socket, through two programs."""
 
 import os
-import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from sphereorient.bench.score import orientations_at
@@ -40,8 +40,6 @@ picture = numpy.random.default_rng(0).integers(0, 255, (1024, 1280), "uint8")
 while os.getppid() == int(sys.argv[1]):
     cv2.imencode(".jpg", cv2.GaussianBlur(picture, (0, 0), 2))
 """
-
-
 Floats = NDArray[np.float64]
 
 
@@ -81,7 +79,7 @@ class Delays:
     delay_s: Floats  # (n,), of the lines that came, in order
     lost: int  # of these, lines without a pose
     error_deg: Floats  # (n,), of the rotation since the stretch began; NaN without pose or truth
-    memory_mb: Floats  # of the tracker, every so often; empty where the system does not tell
+    memory_mb: Floats  # of the tracker, every so often
     back_s: Floats  # (m,), from the end of each fault to the first pose that is right; inf: none came
     wrong: int  # poses that are not right
 
@@ -89,12 +87,6 @@ class Delays:
         """Return the delays that half of the lines keep, 99 and 99.9 % of them, ms, in words."""
         shares = (0.5, 0.99, 0.999)
         return [f"{1e3 * np.quantile(self.delay_s, share):.1f}" if len(self.delay_s) else "nan" for share in shares]
-
-    @property
-    def right_share(self) -> float:
-        """Share of the frames that were written whose rotation is right to a degree; NaN: no truth."""
-        known = np.isfinite(self.error_deg).any()
-        return float((self.error_deg < RIGHT_DEG).sum()) / max(self.written, 1) if known else float("nan")
 
     def row(self) -> list[str]:
         """Return what `COLUMNS` names."""
@@ -115,7 +107,8 @@ class Delays:
             worst = float(np.nanmax(self.error_deg))
             said = f"{first:.3f}° in the first tenth (median), {last:.3f}° in the last, {worst:.3f}° at most"
             words.append(f"error of the rotation since the first frame: {said}")
-            words.append(f"right to {RIGHT_DEG:g}°: {100 * self.right_share:.1f} % of the frames that were written")
+            right = 100 * float((self.error_deg < RIGHT_DEG).sum()) / max(self.written, 1)
+            words.append(f"right to {RIGHT_DEG:g}°: {right:.1f} % of the frames that were written")
             words.append(f"wrong: {self.wrong} poses")
         if len(self.back_s):
             back = f"{1e3 * np.median(self.back_s):.0f} ms (median), {1e3 * self.back_s.max():.0f} ms at most"
@@ -184,15 +177,17 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
         with SharedFrames(path, sum(picture.nbytes for picture in pictures[0])) as ring:
             command = timing.command(path, lines.getsockname()[1])
             tracker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+            process = psutil.Process(tracker.pid)
             writer = _Writer(ring, [pictures[k] for k in order], timing)
             writer.start()
 
             def saw(count: int) -> None:
                 writer.begun.set()
                 if count % EVERY == 0:
-                    memory_mb.extend(_memory_mb(tracker.pid))
+                    with suppress(psutil.Error):  # it has ended
+                        memory_mb.append(process.memory_info().rss / 2**20)
                 if timing.faults and count == timing.frames // 2:
-                    Thread(target=_stall, args=(tracker, ends_s), daemon=True).start()
+                    Thread(target=_stall, args=(process, ends_s), daemon=True).start()
                 progress("live", count, timing.frames)
 
             try:
@@ -222,12 +217,12 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
     )
 
 
-def _stall(tracker: "subprocess.Popen[str]", ends_s: list[float]) -> None:
+def _stall(tracker: psutil.Process, ends_s: list[float]) -> None:
     """Stop a process for a while, as a machine that does other things, and note the end."""
-    tracker.send_signal(signal.SIGSTOP)
+    tracker.suspend()
     time.sleep(STALL_S)
     ends_s.append(time.perf_counter())
-    tracker.send_signal(signal.SIGCONT)
+    tracker.resume()
 
 
 def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Callable[[int], None]) -> Floats:
@@ -257,12 +252,3 @@ def _errors_deg(table: Floats, order: Sequence[int], R_cam_lab: Floats, truth: P
     begins = np.maximum.accumulate(np.where(table[:, 5] == 1, np.arange(len(table)), 0))
     true = R_cam_lab @ R @ R[begins].transpose(0, 2, 1) @ R_cam_lab.T
     return distance_deg(rotations(table[:, 2:5]), true)
-
-
-def _memory_mb(process: int) -> list[float]:
-    """Return the memory of a process, as Linux tells it."""
-    try:
-        status = Path(f"/proc/{process}/status").read_text()
-    except OSError:
-        return []
-    return [float(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")]

@@ -32,9 +32,7 @@ class _InitOptions:
     ] = None
     out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
     plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
-    from_fictrac: Annotated[
-        Path | None, Option(help="FicTrac's config.txt: take over its movie, or that given, view, masks.")
-    ] = None
+    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: view, masks, movie or the given.")] = None
     set_: Annotated[
         list[str] | None,
         Option("--set", help="A key's value, e.g. --set sphere.diameter=18; else it is asked for at a terminal."),

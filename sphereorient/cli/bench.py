@@ -393,9 +393,7 @@ class _LiveDelayOptions:
     seconds: Annotated[float, Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0
     loop: Annotated[bool, Option("--loop", help="Show it from its begin again: it has no seam.")] = False
     load: Annotated[int, Option(min=0, max=64, help="Other programs, each of which keeps a core busy.")] = 0
-    faults: Annotated[
-        bool, Option("--faults", help="Black pictures for 0.5 s of each 5 s; the tracker stops once.")
-    ] = False
+    faults: Annotated[bool, Option("--faults", help="Black for 0.5 s of each 5 s; the tracker stops once.")] = False
     learnt: Annotated[Path | None, Option(help="As of `live`.")] = None
     cameras: Cameras = None
     quiet: Quiet = False

@@ -177,9 +177,7 @@ class _LiveOptions(CameraOptions):
     experiment: ExperimentPath
     source: Annotated[
         str,
-        Option(
-            help="movie: at its rate; movie-fast; -; shared:FILE; camera:0; genicam:X.cti#A,B; pylon:A,B; vimba:A,B."
-        ),
+        Option(help="movie: at its rate; movie-fast; -; shared:FILE; camera:0; genicam:X.cti#A; pylon:A,B; vimba:A"),
     ] = "movie"
     to: Annotated[
         list[str] | None,

@@ -55,9 +55,7 @@ class Experiment:
     spheres: tuple[Sphere, ...] = (Sphere(),)
     mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something static hides the sphere
     background_paths: dict[str, Path] = field(default_factory=dict)  # scene without the sphere
-    circles: dict[str, tuple[float, float, float]] = field(
-        default_factory=dict
-    )  # outline of a fixed ball: u, v, radius
+    circles: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # of a fixed ball: u, v, radius, px
     times: str | None = None  # path of a table, or "movies": their time stamps; None: constant frame rate
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
     start_given: bool = False  # whether the file has `start`; time stamps then begin there

@@ -49,11 +49,8 @@ class PageServer(ThreadingHTTPServer):
     """Serves a page on a socket of `listen`; call `serve_forever`."""
 
     def __init__(self, page: Page, door: socket.socket, token: str) -> None:
-        class Handler(_Handler):
-            pass
-
-        Handler.page, Handler.token = page, token
-        super().__init__(door.getsockname(), Handler, bind_and_activate=False)
+        handler = type("Handler", (_Handler,), {"page": page, "token": token})
+        super().__init__(door.getsockname(), handler, bind_and_activate=False)
         self.socket.close()
         self.socket = door
         self.address = address(door, token)
@@ -81,7 +78,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
-        if not length.isdigit() or int(length) > MOST_BYTES:
+        if not length.isdecimal() or int(length) > MOST_BYTES:
             self.close_connection = True
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
             return

@@ -19,7 +19,9 @@ IMPORTED_AS = {"opencv-python-headless": "cv2"}
 OF_EXTRA = {  # what it is for, where its name does not say it
     "table": "export to parquet and netcdf",
     "nwb": "export to nwb",
-    "live": "live --to zmq:PORT",
+    "live": "live --to zmq, serial, lsl or osc",
+    "pylon": "live --source pylon:SERIAL",
+    "vimba": "live --source vimba:ID",
     "genicam": "live --source genicam:PRODUCER.cti",
     "cluster": "track --cluster",
     "moon": "scripts/moon.py",

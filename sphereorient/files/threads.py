@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
 from itertools import islice
 from typing import TypeVar
 
@@ -15,7 +14,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[str, int, int], None]  # (stage, steps done, all steps); the command line draws a bar
 MOST = 8  # pieces in memory
-_limit: list[int] = []  # of this process: that of a worker, which shares the machine with others
+_limit = [os.cpu_count() or 1]  # of this process: less in a worker, which shares the machine with others
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -32,12 +31,7 @@ def counted(stage: str, items: Iterable[Item], total: int, progress: Progress) -
 
 def cores() -> int:
     """Return how many threads compute: one a core, or those that `limit_cores` set."""
-    return _limit[-1] if _limit else _all_cores()
-
-
-@cache
-def _all_cores() -> int:
-    return os.cpu_count() or 1  # asks the system: 0.2 ms
+    return _limit[0]
 
 
 def limit_cores(count: int) -> None:
@@ -48,12 +42,12 @@ def limit_cores(count: int) -> None:
 @contextmanager
 def limited_cores(count: int) -> Iterator[None]:
     """Limit the threads of this process for a while."""
-    before = _limit.copy()
+    before = cores()
     limit_cores(count)
     try:
         yield
     finally:
-        _limit[:] = before
+        limit_cores(before)
 
 
 def side_by_side(task: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:

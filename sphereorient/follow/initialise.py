@@ -278,15 +278,12 @@ class Initialiser:
         }
         rows = []
         for k, _, disk in disks:
-            own = next(found[id(self.proposers[self.fitter.views[k].name])])
-            rows.append((self._in_lab(k, disk) @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
+            view = self.fitter.views[k]
+            own = next(found[id(self.proposers[view.name])])
+            ray = view.camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
+            R_lab_view = view.camera.R_cam_lab.mT @ R_cam_view(view.camera.R_cam_lab @ ray)
+            rows.append((R_lab_view @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
         return rows
-
-    def _in_lab(self, k: int, disk: Outline) -> Tensor:
-        """Return R_lab_view (3, 3) of a disk of camera `k`."""
-        camera = self.fitter.views[k].camera
-        ray = camera.rays(torch.tensor([disk.u_px, disk.v_px], dtype=torch.float64)).direction_lab
-        return camera.R_cam_lab.mT @ R_cam_view(camera.R_cam_lab @ ray)
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
@@ -301,27 +298,23 @@ class Initialiser:
 
     def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
-        views, reason = self.fitter.views, [why for _, why in found]
+        fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():
             return no_pose(len(views), reason)
         if not len(R):
             return no_pose(len(views), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
-        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
-        return self._narrow(pictures, *self._begin(found), R, frame)
-
-    def _begin(self, found: Sequence[Found]) -> tuple[Tensor, Tensor]:
-        """Return the position (1, 3), mm, that outlines tell, and its precision (3, 3), 1/mm^2."""
         placed = self._placed(found)
         slack = torch.nan_to_num(placed.covariance_mm2[0])
-        slack = slack + (PLACE_SHARE * self.fitter.radius_mm) ** 2 * torch.eye(3).double()
-        seeing = [view for view, (outline, _) in zip(self.fitter.views, found, strict=True) if outline is not None]
-        if len(seeing) == 1:
+        slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
+        if int(use.sum()) == 1:
             # Arcs of a partly dark rim fit a smaller circle as well, with no greater residual.
-            sight = seeing[0].camera.rays(seeing[0].camera.project(placed.position_lab_mm))
+            (seeing,) = (view for view, used in zip(views, use.tolist(), strict=True) if used)
+            sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
             slack = slack + DEPTH_SHARE**2 * along[:, None] * along
-        return placed.position_lab_mm, torch.linalg.inv(slack)
+        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
+        return self._narrow(pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, frame)
 
     def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
         """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 import cv2
@@ -28,6 +28,7 @@ AGAIN_S = 1.0  # between attempts to open a camera
 WAIT_S = 0.2  # of one call of a driver; a camera that waits for its trigger is asked again
 RELEASE_S = 10.0  # until drivers have let their cameras go
 BUFFERS = 16  # pictures that a driver holds
+OPENING = Lock()  # one camera at a time: drivers look for their cameras meanwhile
 ALIKE = 0.02  # share by which a device may round what it is set to
 OLDER = {"ExposureTime": "ExposureTimeAbs", "AcquisitionFrameRate": "AcquisitionFrameRateAbs"}  # of older GigE cameras
 OPENCV = {
@@ -170,7 +171,7 @@ def _vimba(serial: str) -> Iterator[Device]:
 @contextmanager
 def _opencv(where: str) -> Iterator[Device]:
     """What OpenCV opens, by its number or address; pictures are made grey and lie as they are stored."""
-    capture = cv2.VideoCapture(int(where) if where.isdigit() else where)
+    capture = cv2.VideoCapture(int(where) if where.isdecimal() else where)
     try:
         if not capture.isOpened():
             do = "connect it, or name another number"
@@ -273,7 +274,6 @@ class Camera:
     keys: DeviceKeys | None  # None: the device is as it is
     flip: str  # of `movies.flipped`
     tell: Tell | None  # gets what is wrong, in one line; None: a movie, which ends
-    opening: AbstractContextManager[Any]  # one camera of a driver at a time
 
     def shots(self, stopped: Event) -> Iterator[Shot | None]:
         """Yield pictures until `stopped`; None whenever the device is opened: its clock begins anew. One that ends,
@@ -285,7 +285,7 @@ class Camera:
             found = f"{self.name}: no picture comes any more."
             try:
                 with worded(self.name), suppress(EOFError), ExitStack() as opened:
-                    with self.opening:
+                    with OPENING:
                         device = opened.enter_context(self.open())
                         self._set_up(device)
                         device.start()

@@ -73,12 +73,9 @@ class LearningTracker:
         """Return the covariance (6, 6) of an orientation since the first frame, at a place that is not quite right:
         all turns are too long or too short by the same share.
         """
-        covariance = torch.zeros(6, 6, dtype=torch.float64)
         self._away_rad = max(self._away_rad, float(so3.log(poses.R_lab_body[0]).norm()))
-        covariance[:3, :3] = ((self._error * self._away_rad) ** 2 + self._drift_rad**2) * torch.eye(
-            3, dtype=torch.float64
-        )
-        return covariance
+        variance = (self._error * self._away_rad) ** 2 + self._drift_rad**2
+        return torch.diag(torch.tensor([variance] * 3 + [0.0] * 3, dtype=torch.float64))
 
     def between(self) -> None:
         """Keep the frame, and go over to what was adjusted meanwhile."""

@@ -103,9 +103,9 @@ def run_live(
     size = FrameBytes(recording.streams).size
     feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, tell=tell)
     monitor = Monitor(feed, tell)
-    if page is not None:
-        page.begin(recording, monitor.running, opened.save_map)
     try:
+        if page is not None:
+            page.begin(recording, monitor.running, opened.save_map)
         # In one thread: a second one may wait for a core that another program has.
         with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):

@@ -113,7 +113,7 @@ class UdpOutput(Output):
     def __init__(self, host: str, port: int) -> None:
         try:
             self._to = socket.gethostbyname(host), port  # once: a name server may take its time
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a name that no host can have
             do = "correct the name of the host"
             raise OutputError(refusal(f"udp:{host}:{port}", expected="a host", got=error_words(error), do=do)) from None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -195,7 +195,6 @@ class SharedOutput(Output):
     """
 
     def __init__(self, address: str, tell: Tell) -> None:
-        check_new(Path(address))
         self._ring = SharedFrames(Path(address), POSE_BYTES, POSES)
 
     def send(self, numbers: dict[str, float]) -> None:
@@ -281,7 +280,7 @@ class TcpOutput(Output):
     def __init__(self, host: str, port: int) -> None:
         try:
             self._server = socket.create_server((host, port))
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise _taken(f"tcp:{host}:{port}", error) from None
         self.port = int(self._server.getsockname()[1])
         self._readers: list[tuple[socket.socket, Spool]] = []
@@ -429,10 +428,10 @@ FILES: Mapping[str, tuple[Callable[[Path, Tell], Output], str]] = {
 def open_output(name: str, tell: Tell) -> tuple[Output, str]:
     """Open an output by its name, and return what it takes of a frame too; raise SettingsError for an unknown one."""
     kind, _, address = name.partition(":")
-    host, between, port = address.rpartition(":")
+    host, _, port = address.rpartition(":")
     if kind in SOCKETS and port.isdecimal() and int(port) < 1 << 16:
         to_socket, form = SOCKETS[kind]
-        return to_socket(host if between else HOST, int(port)), form
+        return to_socket(host or HOST, int(port)), form
     if kind in NAMED and address:
         to_name, form = NAMED[kind]
         return to_name(address, tell), form

@@ -37,7 +37,7 @@ from sphereorient.files.threads import limit_cores
 from sphereorient.live.feed import Arrival, Feed, FrameBytes, Tell
 from sphereorient.live.lines import FicTracLines
 from sphereorient.live.live import Measured
-from sphereorient.live.shared import POSES, SharedFrames, SlotReader
+from sphereorient.live.shared import POSES, WORD, SharedFrames, SlotReader
 from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
 from sphereorient.trajectory.walk import FICTRAC
@@ -67,9 +67,8 @@ PAGE = Path(__file__).with_name("page.html")
 WIDEST = 640  # px, of a picture that is sent
 PICTURES_HZ = 30.0  # at most, that the page gets
 TAKE_S = 0.1  # between looks for new poses
-WORD, ROW = 8, 5 + 3 + 9  # of a frame: number, time (s), latency (ms), dropped, error (rad), position (mm), R_lab_body
+ROW = 5 + 3 + 9  # of a frame: number, time (s), latency (ms), dropped, error (rad), position (mm), R_lab_body
 REASONS = list(Reason)
-STOPPED = "Tracking is stopped: no frame is measured."
 
 
 @dataclass(eq=False)
@@ -95,11 +94,6 @@ class Monitor:
         self._absence: defaultdict[str, _Absence] = defaultdict(_Absence)  # of each ball
         self._counted = self._counted_lost = -1  # numbers of the last frames
         self.arrival: Arrival  # the last frame
-
-    @property
-    def dropped(self) -> int:
-        """Frames that came too late."""
-        return self._feed.dropped
 
     def __iter__(self) -> Iterator[Arrival]:
         for arrival in self._feed:
@@ -139,16 +133,15 @@ class Monitor:
         cause = next((words for reason, words in CAUSES.items() if reason in now.reason), "no picture can be used")
         if Reason.LOW_SCORE in now.reason and self.lost > MOSTLY * self.count:
             cause = NOT_EXPLAINED
-        self._tell(
-            f"frame {now.number}: {_called(now)} is not found for {LOST_S:g} s ({why}): {cause}; tracking goes on."
-        )
+        lost = f"{_called(now)} is not found for {LOST_S:g} s ({why})"
+        self._tell(f"frame {now.number}: {lost}: {cause}; tracking goes on.")
 
     def summary(self) -> list[str]:
         """Return the counts and latencies in words."""
         latency = np.array(self.latency_ms or [0.0])
         middle, slow = np.quantile(latency, (0.5, 0.99))
         return [
-            f"{self.count} frames, {self.lost} without a pose, {self.dropped} dropped",
+            f"{self.count} frames, {self.lost} without a pose, {self._feed.dropped} dropped",
             f"latency of the last {len(latency)}: {middle:.1f} ms (median), {slow:.1f} ms (99 %)",
         ]
 
@@ -172,8 +165,7 @@ class PageWriter:
         learnt meanwhile and says so; None: no button.
         """
         poses = SharedFrames(self.folder / "poses", WORD * ROW, POSES)
-        size = FrameBytes(recording.streams).size + WORD * (len(recording.streams) + 1 + ROW)
-        self._rings = poses, SharedFrames(self.folder / "pictures", size, 4)
+        self._rings = poses, SharedFrames(self.folder / "pictures", _shown_bytes(recording), 4)
         self._blank = [np.zeros(stream.movie.frame_shape, stream.movie.dtype) for stream in recording.streams]
         self._learns = save_map is not None
         Thread(target=self._listen, args=(running, save_map), name="page", daemon=True).start()
@@ -197,11 +189,7 @@ class PageWriter:
             while True:
                 word = self._commands.recv_bytes().decode()
                 try:
-                    if word == "save":
-                        said = {"said": _saved(save_map)}
-                    else:
-                        (running.set if word == "start" else running.clear)()
-                        said = {"said": "Tracking goes on." if word == "start" else STOPPED}
+                    said = {"said": _obeyed(word, running, save_map)}
                 except SphereOrientError as error:
                     said = {"error": str(error)}
                 self._commands.send_bytes(json.dumps(said).encode())
@@ -216,6 +204,11 @@ class PageWriter:
             ring.close()
 
 
+def _shown_bytes(recording: Recording) -> int:
+    """Return the bytes of a slot of pictures: these, the reason of each camera, whether a map is learnt, and a row."""
+    return FrameBytes(recording.streams).size + WORD * (len(recording.streams) + 1 + ROW)
+
+
 class PageProcess(PageWriter):
     """A page in the browser, served by a process of its own; port 0: any free one. Raise OutputError: it is in use."""
 
@@ -225,9 +218,8 @@ class PageProcess(PageWriter):
         folder = Path(tempfile.mkdtemp(prefix="sphereorient-", dir=memory))
         spawn = multiprocessing.get_context("spawn")
         commands, theirs = spawn.Pipe()
-        self.process = spawn.Process(
-            target=_serve, args=(experiment, cameras, folder, token, door, theirs), name="page", daemon=True
-        )
+        given = experiment, cameras, folder, token, door, theirs
+        self.process = spawn.Process(target=_serve, args=given, name="page", daemon=True)
         self.process.start()
         self.address = address(door, token)
         door.close()
@@ -243,7 +235,13 @@ class PageProcess(PageWriter):
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _saved(save_map: Callable[[], str] | None) -> str:
+def _obeyed(word: str, running: Event, save_map: Callable[[], str] | None) -> str:
+    if word == "start":
+        running.set()
+        return "Tracking goes on."
+    if word == "stop":
+        running.clear()
+        return "Tracking is stopped: no frame is measured."
     if save_map is None:
         do = "begin without a map"
         raise OutputError(refusal("map", expected="one that is learnt meanwhile", got="none", do=do))
@@ -260,7 +258,8 @@ def _serve(
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     limit_cores(1)
-    with open_recording(experiment, cameras, textured=False) as recording:
+    # The loop opens the same files, and tells what is wrong with them.
+    with suppress(SphereOrientError), open_recording(experiment, cameras, textured=False) as recording:
         page = LivePage(recording, folder, commands)
         Thread(target=PageServer(page, door, token).serve_forever, name="page", daemon=True).start()
         page.follow()
@@ -298,12 +297,11 @@ class LivePage:
     def take(self) -> None:
         """Take the poses that were written since."""
         if self._rings is None:
-            size = self._layout.size + WORD * (len(self._recording.streams) + 1 + ROW)
-            with suppress(MovieError):  # not begun yet
-                pictures = SlotReader(self._folder / "pictures", size)
+            try:
+                pictures = SlotReader(self._folder / "pictures", _shown_bytes(self._recording))
                 self._rings = SlotReader(self._folder / "poses", WORD * ROW), pictures
-        if self._rings is None:
-            return
+            except MovieError:  # not begun yet
+                return
         poses, _ = self._rings
         with self._lock:
             written = poses.written
@@ -395,9 +393,8 @@ class LivePage:
         if R is not None:
             radius_mm = self._recording.experiment.radius_mm
             here = Path3D(position_mm=X[None], R_lab_body=R[None], smoothed=np.zeros(1, bool), radius_mm=radius_mm)
-            tips, near = axes_px(stream.camera, here, 0)
-            drawn = {"outline": outline_px(stream.camera, here, 0), "tips": tips}
-            drawn["centre"] = stream.camera.project(torch.from_numpy(X)).numpy()
+            (tips, near), centre = axes_px(stream.camera, here, 0), stream.camera.project(torch.from_numpy(X)).numpy()
+            drawn = {"outline": outline_px(stream.camera, here, 0), "tips": tips, "centre": centre}
             found |= {name: without_nan(points.tolist()) for name, points in drawn.items()} | {"near": near.tolist()}
         return found
 

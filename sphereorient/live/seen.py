@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 
-def _opencv() -> Iterator[str]:
-    import cv2
-
+def _opencv(cv2: Any) -> Iterator[str]:
     for number in range(8):  # of each camera Linux lists two
         capture = cv2.VideoCapture(number)
         if capture.isOpened():
@@ -23,45 +23,39 @@ def _opencv() -> Iterator[str]:
         capture.release()
 
 
-def _genicam() -> Iterator[str]:
-    from harvesters.core import Harvester
-
+def _genicam(core: Any) -> Iterator[str]:
     for folder in filter(None, os.environ.get("GENICAM_GENTL64_PATH", "").split(os.pathsep)):
         for producer in sorted(Path(folder).glob("*.cti")):
-            with Harvester() as harvester:
+            with core.Harvester() as harvester:
                 harvester.add_file(str(producer))
                 harvester.update()
                 for one in harvester.device_info_list:
                     yield f"genicam:{producer}#{one.serial_number} ({one.model})"
 
 
-def _pylon() -> Iterator[str]:
-    from pypylon import pylon
-
+def _pylon(pylon: Any) -> Iterator[str]:
     for one in pylon.TlFactory.GetInstance().EnumerateDevices():
         yield f"pylon:{one.GetSerialNumber()} ({one.GetModelName()})"
 
 
-def _vimba() -> Iterator[str]:
-    from vmbpy import VmbSystem
-
-    with VmbSystem.get_instance() as system:
+def _vimba(vmbpy: Any) -> Iterator[str]:
+    with vmbpy.VmbSystem.get_instance() as system:
         for one in system.get_all_cameras():
             yield f"vimba:{one.get_id()} ({one.get_model()})"
 
 
-# By kind: its package, and who asks it.
-KINDS: Mapping[str, tuple[str, Callable[[], Iterator[str]]]] = {
+# By kind: the module of its driver, and who asks that.
+KINDS: Mapping[str, tuple[str, Callable[[Any], Iterator[str]]]] = {
     "opencv": ("cv2", _opencv),
-    "genicam": ("harvesters", _genicam),
-    "pylon": ("pypylon", _pylon),
+    "genicam": ("harvesters.core", _genicam),
+    "pylon": ("pypylon.pylon", _pylon),
     "vimba": ("vmbpy", _vimba),
 }
 
 
 def cameras_here(limit_s: float = 10.0) -> dict[str, list[str] | str]:
     """Return the cameras of each kind whose package is installed; in place of a list, in words, why there is none."""
-    kinds = [kind for kind, (package, _) in KINDS.items() if find_spec(package) is not None]
+    kinds = [kind for kind, (module, _) in KINDS.items() if find_spec(module.partition(".")[0]) is not None]
     with ThreadPoolExecutor() as pool:
         return dict(zip(kinds, pool.map(partial(_asked, limit_s=limit_s), kinds), strict=True))
 
@@ -69,7 +63,7 @@ def cameras_here(limit_s: float = 10.0) -> dict[str, list[str] | str]:
 def _asked(kind: str, limit_s: float) -> list[str] | str:
     command = [sys.executable, "-P", __file__, kind]  # -P: the modules beside this file hide no others
     try:
-        told = subprocess.run(command, capture_output=True, text=True, timeout=limit_s)
+        told = subprocess.run(command, capture_output=True, errors="replace", timeout=limit_s)
     except subprocess.TimeoutExpired:
         return f"no answer within {limit_s:g} s"
     if told.returncode:
@@ -78,5 +72,5 @@ def _asked(kind: str, limit_s: float) -> list[str] | str:
 
 
 if __name__ == "__main__":
-    for line in KINDS[sys.argv[1]][1]():
-        print(line)  # noqa: T201
+    module, cameras = KINDS[sys.argv[1]]
+    print(*cameras(import_module(module)), sep="\n", end="")  # noqa: T201

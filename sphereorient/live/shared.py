@@ -13,13 +13,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import MovieError, refusal
+from sphereorient.errors import MovieError, OutputError, error_words, refusal
 from sphereorient.experiment.recording import CameraStream
 from sphereorient.live.feed import Arrival, FrameBytes
 
@@ -36,15 +35,25 @@ POSES, POSE_BYTES = 4096, WORD * 33  # of a ring of poses: slots, and bytes of e
 
 
 class SharedFrames:
-    """Writes into a ring of `slots` of `size` bytes, and never waits; the file is removed at the end."""
+    """Writes into a ring of `slots` of `size` bytes, and never waits; the file is removed at the end.
+    Raise OutputError: there is such a file, or no room for it.
+    """
 
     def __init__(self, path: Path, size: int, slots: int = 16) -> None:
         length = WORD * (HEAD + slots) + slots * size
-        with path.open("xb") as file:
-            file.truncate(length)
-        self._path, self._slots, self._size = path, slots, size
-        self._file = path.open("r+b")
-        self._map = mmap.mmap(self._file.fileno(), length)
+        self._path, self._slots = path, slots
+        try:
+            with path.open("x+b") as file:
+                file.truncate(length)
+                if hasattr(os, "posix_fallocate"):  # a page that finds no room later would end the program
+                    os.posix_fallocate(file.fileno(), 0, length)
+                self._map = mmap.mmap(file.fileno(), length)
+        except OSError as error:
+            if not isinstance(error, FileExistsError):
+                with suppress(OSError):
+                    path.unlink()
+            do = "name a new file in a folder with room"
+            raise OutputError(refusal(str(path), expected="a new file", got=error_words(error), do=do)) from None
         self._words = np.frombuffer(self._map, np.uint64, HEAD)
         self._times = np.frombuffer(self._map, np.float64, slots, WORD * HEAD)
         self._content = np.frombuffer(self._map, np.uint8, slots * size, WORD * (HEAD + slots)).reshape(slots, size)
@@ -67,15 +76,12 @@ class SharedFrames:
         self._words[ENDED] = 1
         del self._words, self._times, self._content
         self._map.close()
-        self._file.close()
         self._path.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *fault: object) -> None:
         self.close()
 
 
@@ -89,7 +95,7 @@ class SlotReader:
         try:
             with path.open("rb") as file:
                 self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-                self.file_number = os.fstat(file.fileno()).st_ino
+                self._path, self._file_number = path, os.fstat(file.fileno()).st_ino
         except (OSError, ValueError):  # ValueError: an empty file
             do = "begin the program that writes it (docs/live.md)"
             raise MovieError(refusal(str(path), expected="a ring of frames", got="none", do=do)) from None
@@ -114,6 +120,13 @@ class SlotReader:
     def ended(self) -> bool:
         """Whether the writer has ended."""
         return bool(self._word(ENDED))
+
+    @property
+    def replaced(self) -> bool:
+        """Whether another ring, which can be read already, has the name of this one."""
+        with suppress(OSError), self._path.open("rb") as file:
+            return os.fstat(file.fileno()).st_ino != self._file_number and file.read(WORD) == MAGIC
+        return False
 
     def oldest(self, number: int) -> int:
         """Return the number, or that of the oldest slot that is not written over."""
@@ -146,36 +159,24 @@ def shared_slots(path: Path, size: int) -> Iterator[Slot]:
     read the numbers are left out. Where another ring of this name takes its place, the numbers go on with that.
     Raise MovieError: no such ring, or one of slots of another size.
     """
-    before, again = 0, True  # slots of former rings
-    while again:
-        again, number = False, -1
-        for found in _slots(SlotReader(path, size), path):
-            if again := found is None:
-                break
-            number, time_s, content, arrived_s = found
-            yield before + number, time_s, content, arrived_s
-        before += number + 1
-
-
-def _slots(ring: SlotReader, path: Path) -> Iterator[Slot | None]:
-    """Yield the slots of a ring, and None where another file of its name has taken its place."""
-    number, look_s = max(0, ring.written - 1), time.perf_counter()
-    arrived_s, usual_s = look_s, NEXT_S
+    before = 0  # slots of former rings
     while True:
-        if number >= ring.written:
-            if ring.ended:
-                return
-            if time.perf_counter() > look_s + REPLACED_S:
-                look_s = time.perf_counter()
-                with suppress(OSError):
-                    if path.stat().st_ino != ring.file_number and path.stat().st_size:
-                        yield None
-                        return
-            time.sleep(max(NEXT_S, arrived_s + NO_LOOK * usual_s - time.perf_counter()))
-            continue
-        before_s, arrived_s = arrived_s, time.perf_counter()
-        usual_s = min(max(arrived_s - before_s, SHRINKS * usual_s), GROWS * usual_s)
-        number = ring.oldest(number)
-        if (slot := ring.read(number)) is not None:
-            yield slot
-            number += 1
+        ring, look_s = SlotReader(path, size), time.perf_counter()
+        number, arrived_s, usual_s = max(0, ring.written - 1), look_s, NEXT_S
+        while not ring.ended or number < ring.written:  # in this order: at the end nothing is left out
+            if number >= ring.written:
+                if time.perf_counter() > look_s + REPLACED_S:
+                    look_s = time.perf_counter()
+                    if ring.replaced:
+                        break
+                time.sleep(max(NEXT_S, arrived_s + NO_LOOK * usual_s - time.perf_counter()))
+                continue
+            before_s, arrived_s = arrived_s, time.perf_counter()
+            usual_s = min(max(arrived_s - before_s, SHRINKS * usual_s), GROWS * usual_s)
+            number = ring.oldest(number)
+            if (slot := ring.read(number)) is not None:
+                yield before + number, *slot[1:]
+                number += 1
+        else:
+            return
+        before += number

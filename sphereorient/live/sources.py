@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import Event, Lock
+from threading import Event
 from typing import BinaryIO
 
 from sphereorient.errors import MovieError, SettingsError, refusal
@@ -18,6 +18,7 @@ from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.live.devices import MAKERS, RELEASE_S, Camera, device_frames, worded
 from sphereorient.live.feed import Arrival, FrameBytes, Tell
 from sphereorient.live.shared import shared_frames
+from sphereorient.movies import flipped_picture
 from sphereorient.movies.record import Recorder
 
 
@@ -56,10 +57,6 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
         number += 1
 
 
-def _stdin(recording: Recording) -> Iterator[Arrival]:
-    return raw_frames(sys.stdin.buffer, recording.streams, 1 / recording.timeline.frame_s)
-
-
 def _devices(kind: str, where: str, tell: Tell) -> Source:
     """Return the cameras of a maker: a serial number for each camera of the experiment, in its order."""
     ends = kind == "camera:" and Path(where).is_file()  # a movie
@@ -77,7 +74,6 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
             expected = f"a device for each camera ({', '.join(one.name for one in opened.streams)})"
             do = "add --cameras with one name" + ("" if kind == "camera:" else ", or list serial numbers: A,B")
             raise SettingsError(refusal("--source", expected=expected, got=f"{len(serials)}", do=do))
-        opening = Lock()
         released.clear()
         try:
             with ExitStack() as drivers:
@@ -91,7 +87,6 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
                         keys=None if ends else opened.experiment.devices.get(stream.name),
                         flip=opened.experiment.flip.get(stream.name, "none"),
                         tell=None if ends else tell,
-                        opening=opening,
                     )
                     for serial, stream in zip(serials, opened.streams, strict=True)
                 ]
@@ -106,7 +101,11 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
 SOURCES: Mapping[str, Callable[[str, Tell], Source]] = {
     "movie": lambda *_: Source(frames=partial(movie_frames, paced=True), even=True),
     "movie-fast": lambda *_: Source(frames=partial(movie_frames, paced=False), waits=True, even=True),
-    "-": lambda *_: Source(frames=_stdin, waits=True, even=True),
+    "-": lambda *_: Source(
+        frames=lambda opened: raw_frames(sys.stdin.buffer, opened.streams, 1 / opened.timeline.frame_s),
+        waits=True,
+        even=True,
+    ),
     **{kind: partial(_devices, kind) for kind in MAKERS},
     "shared:": lambda where, _: Source(frames=lambda opened: shared_frames(Path(where), opened.streams)),
 }
@@ -122,13 +121,16 @@ def source_of(name: str, tell: Tell) -> Source:
 
 
 def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
-    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none."""
+    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none. Pictures lie
+    there as in the experiment's movies: `flip` mirrors them on reading.
+    """
 
     def frames(recording: Recording) -> Iterator[Arrival]:
+        how = [recording.experiment.flip.get(stream.name, "none") for stream in recording.streams]
         for arrival in source.frames(recording):
             room = all(one.room() for one in recorders)
-            for one, picture in zip(recorders, arrival.pictures, strict=True):
-                one.take(arrival.time_s, picture, room)
+            for one, picture, flip in zip(recorders, arrival.pictures, how, strict=True):
+                one.take(arrival.time_s, None if picture is None else flipped_picture(picture, flip), room)
             yield arrival
 
     return replace(source, frames=frames)

@@ -10,10 +10,9 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.movies.movie import Grey, Movie
@@ -25,17 +24,8 @@ EVERY = 64  # frames from one look at the disk to the next
 BEGIN_S, ROOM_S, SHORTEST_S = 20.0, 0.001, 1e-6  # for the process to begin; between looks for room; of a frame
 
 
-class _Ring(NamedTuple):
-    """Memory of both processes."""
-
-    memory: Any
-    written: Any  # frames that are written
-    shape: tuple[int, ...]
-    dtype: "np.dtype[Any]"
-
-    def frames(self) -> NDArray[Any]:
-        """Return the memory as frames (K, H, W)."""
-        return np.frombuffer(self.memory, self.dtype).reshape(-1, *self.shape)
+# Memory of both processes: frames, how many of them are written, and shape and type of one.
+_Ring = tuple[Any, Any, tuple[int, int], "np.dtype[Any]"]
 
 
 class Recorder:
@@ -49,14 +39,17 @@ class Recorder:
     ) -> None:
         spawn, (height, width), dtype = multiprocessing.get_context("spawn"), like.frame_shape, like.dtype
         size = height * width * dtype.itemsize
-        memory = spawn.RawArray("B", max(2, min(RING_BYTES // size, MOST_WAIT)) * size)
-        ring = _Ring(memory, spawn.RawValue("Q"), (height, width), dtype)
+        memory, self._written = (
+            spawn.RawArray("B", max(2, min(RING_BYTES // size, MOST_WAIT)) * size),
+            spawn.RawValue("Q"),
+        )
+        self._frames = np.frombuffer(memory, dtype).reshape(-1, height, width)
         self._path, self._tell, self._wait = path, tell, wait
-        self._frames, self._written = ring.frames(), ring.written
         self._sent = self._lost = 0
         self._ended = False
         stamps, self._stamps = spawn.Pipe(duplex=False)
         self._told, tells = spawn.Pipe(duplex=False)
+        ring = memory, self._written, like.frame_shape, dtype
         arguments = path, ring, stamps, tells, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN: of a single frame
         self._process = spawn.Process(target=_record, args=arguments, name="recorder")
         self._process.start()
@@ -113,7 +106,8 @@ class Recorder:
 def _record(path: Path, ring: _Ring, stamps: Connection, tells: Connection, frame_s: float, left_bytes: int) -> None:
     """Write a movie of the frames whose times come, until their sender ends; tell in lines what goes wrong."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
-    times_s, frames = list[float](), ring.frames()
+    memory, written, shape, dtype = ring
+    times_s, frames = list[float](), np.frombuffer(memory, dtype).reshape(-1, *shape)
 
     def taken() -> Iterator[Grey]:
         shift_s = 0.0
@@ -128,8 +122,8 @@ def _record(path: Path, ring: _Ring, stamps: Connection, tells: Connection, fram
                     stamps.close()
                     return
                 times_s.append(time_s + shift_s)
-                yield frames[ring.written.value % len(frames)]
-                ring.written.value += 1
+                yield frames[written.value % len(frames)]
+                written.value += 1
 
     tells.send_bytes(b"")  # it has begun
     try:

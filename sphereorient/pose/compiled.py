@@ -195,20 +195,16 @@ def settle(
     disks: FrameDisks, begin: PoseStart, model: SphereModel, instants: int, most_hidden: float, first: bool
 ) -> tuple[FittedPoses, Tensor]:
     """Fit poses to whole frames, as `fit.settle`."""
-    (poses, cameras), stencil = begin.use.shape, disks.stencil
-    far = torch.full((poses,), not first)
-    task, at = _task_of(begin, model, instants)
-    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD)
-    near.most_hidden, near.held, near.far = most_hidden, begin.held, far.data_ptr()
-    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
-    known = [_of_view(view) for view in disks.views]
-    scene, shot = (_Scene * cameras)(*(one[0] for one in known)), (_Shot * (poses * cameras))()
+    poses, cameras = begin.use.shape
+    far, shot = torch.full((poses,), not first), (_Shot * (poses * cameras))()
+    near, at, _alive = _near(disks.views, begin, model, disks.stencil, instants, most_hidden)
+    near.held, near.far = begin.held, far.data_ptr()
     frames = [[part if part.dtype in READABLE else part.astype(np.float32) for part in row] for row in disks.frames]
     for c, middles in enumerate(disks.middle_px.nan_to_num().tolist()):
         for b, (u, v) in enumerate(middles):
             frame = frames[b][c]
             shot[b * cameras + c] = _Shot(frame.ctypes.data, *frame.strides, frame.itemsize, round(u), round(v))
-    near.scene, near.shot = ctypes.addressof(scene), ctypes.addressof(shot)
+    near.shot = ctypes.addressof(shot)
     axes = [view.sight.axes_at(middles) for view, middles in zip(disks.views, disks.middle_px, strict=True)]
     near.axes = at(torch.stack(axes, 1))
     near.moved = at(begin.moved, torch.float64) if instants > 1 else None
@@ -263,17 +259,24 @@ def _alone(
     radius_mm: float,
 ) -> tuple[ctypes.Structure, tuple[object, ...]]:
     """Return the record of `settle_alone` but for the pose and its frames, and what it points to."""
-    cameras = len(views)
-    nowhere = PoseStart(torch.zeros(1, 3), torch.zeros(1, 3, 3), torch.zeros(1, cameras, dtype=torch.bool))
-    task, at = _task_of(nowhere, model, instants)
-    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD)
-    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
-    near.most_hidden, near.radius_mm, near.hopeless, near.again = most_hidden, radius_mm, HOPELESS, AGAIN
-    known = [_of_view(view) for view in views]
-    scene = (_Scene * cameras)(*(one[0] for one in known))
-    near.scene = ctypes.addressof(scene)
+    nowhere = PoseStart(torch.zeros(1, 3), torch.zeros(1, 3, 3), torch.zeros(1, len(views), dtype=torch.bool))
+    near, at, alive = _near(views, nowhere, model, stencil, instants, most_hidden)
+    near.radius_mm, near.hopeless, near.again = radius_mm, HOPELESS, AGAIN
     near.axes = at(torch.stack([view.sight.axes for view in views])[None])
-    return near, (at, known, scene)
+    return near, (at, alive)
+
+
+def _near(
+    views: Sequence[CameraView], begin: PoseStart, model: SphereModel, stencil: Stencil, instants: int, hidden: float
+) -> tuple[Any, "_Addresses", object]:
+    """Return the record of fits but for their frames, with what gives further addresses and what else it points to."""
+    task, at = _task_of(begin, model, instants)
+    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD, most_hidden=hidden)
+    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
+    known = [_of_view(view) for view in views]
+    scene = (_Scene * len(views))(*(one[0] for one in known))
+    near.scene = ctypes.addressof(scene)
+    return near, at, (known, scene)
 
 
 class _Addresses:

@@ -220,10 +220,7 @@ class Fitter:
         plain = all(isinstance(one, np.ndarray) and view.plain for one, view in zip(frames, self.views, strict=True))
         if not plain or begin.among is not None or self.device != CPU or body_of(begin.position_lab_mm) is IN_TORCH:
             return None
-        stencil, shown = (
-            self.stencil(self.optics.fine, self.widest_px),
-            [one for one in frames if isinstance(one, np.ndarray)],
-        )
+        shown, stencil = [np.asarray(one) for one in frames], self.stencil(self.optics.fine, self.widest_px)
         of_model = self.model(), stencil, self.instants, self.most_hidden, self.radius_mm
         return settle_alone(self.views, shown, begin, *of_model)
 

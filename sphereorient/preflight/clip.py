@@ -49,14 +49,14 @@ class Clip:
             for name, lit in shown.items():
                 np.save(paths[name], np.array([flipped_picture(one, experiment.flip.get(name, "none")) for one in lit]))
             masks = {name: given_mask(experiment, name, lit[0].shape) for name, lit in shown.items()}
-            clip = replace(experiment, movie_paths=paths, frame_rate_hz=1 / self._frame_s, times=None, frames=None)
-            clip = replace(clip, start=dict.fromkeys(paths, 0), start_given=False, response={}, background_paths={})
             circles = {
-                one: clip.circles.get(one)
+                one: experiment.circles.get(one)
                 or fixed_ball(np.array(lit[::APART]), settings.locate, None, masks[one])[0].circle
                 for one, lit in shown.items()
             }
-            clip = replace(clip, circles=circles)
+            clip = replace(experiment, movie_paths=paths, frame_rate_hz=1 / self._frame_s, times=None, frames=None)
+            start = dict.fromkeys(paths, 0)
+            clip = replace(clip, circles=circles, start=start, start_given=False, response={}, background_paths={})
             with open_recording(clip, textured=False) as recording, one_thread():
                 place = held_place(recording, settings.paint, settings.locate)
                 coarse, count = CoarserPictures.of(place), len(recording.timeline)

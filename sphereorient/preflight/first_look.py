@@ -151,11 +151,7 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
         key("movies", f"frames: {counts}", movies),
         key("backgrounds", empty, example=each("empty_{}.png")),
         key("masks", hidden, masks or ..., each("mask_{}.png")),
-        key(
-            "circles",
-            "outline of a ball in its place, px: u, v, radius; found without",
-            example=each([320.0, 240.0, 90.0]),
-        ),
+        key("circles", "outline of a fixed ball, else found: u, v, radius, px", example=each([320.0, 240.0, 90.0])),
         key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
         key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
         key("flip", "mirrored movies: vertical, horizontal, both", example=each("vertical")),

@@ -39,9 +39,9 @@ class FiducialMarking(Marking):
         match steps:
             case ["state"]:
                 return self.state()
-            case ["picture", number] if number.isdigit():
+            case ["picture", number] if number.isdecimal():
                 return png(eight_bits(self._grey(self._picture(number))))
-            case ["view", number] if number.isdigit():
+            case ["view", number] if number.isdecimal():
                 picture = self._picture(number)
                 return self.view(picture, self.clicked.get(picture))
         return super().shown(steps)
@@ -49,7 +49,7 @@ class FiducialMarking(Marking):
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
         """Try or save the clicked `points` of a picture."""
         match steps:
-            case ["try" | "save" as what, number] if number.isdigit():
+            case ["try" | "save" as what, number] if number.isdecimal():
                 picture, points = self._picture(number), asked.get("points")
                 return (
                     self.save(picture, points) if what == "save" else self.view(picture, self._checked(picture, points))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.cameras import PinholeCamera, field_of_focal, load_cameras
+from sphereorient.cameras import Camera, PinholeCamera, field_of_focal, load_cameras
 from sphereorient.cameras.model import focal_of_field
 from sphereorient.errors import CameraError, ExperimentError, MovieError, refusal
 from sphereorient.experiment import load_experiment
@@ -62,7 +62,7 @@ class MaskMarking(Marking):
         match steps:
             case ["state"]:
                 return self.state()
-            case ["frame", name, number] if number.isdigit():
+            case ["frame", name, number] if number.isdecimal():
                 return self.frame(name, int(number[:9]))
             case ["mask", name]:
                 return self.mask(name)
@@ -88,19 +88,13 @@ class MaskMarking(Marking):
         return {
             "experiment": str(self.path),
             "cameras": [
-                {"name": name, "movie": Path(movie.path).name, "frames": len(movie), **self._tried(name)}
+                {"name": name, "movie": Path(movie.path).name, "frames": len(movie)}
                 | dict(zip(("height", "width"), movie.frame_shape, strict=True))
+                | {"circle": self.experiment.circles.get(name), "vfov_deg": _vfov_deg(self.experiment.cameras[name])}
                 for name, movie in self.movies.items()
             ],
             "tries": self.experiment.alone and self.experiment.fixed,
         }
-
-    def _tried(self, name: str) -> Json:
-        """Return what can be tried, as it is now: circle u, v, radius, px, and vertical field of view, degrees."""
-        camera, vfov_deg = self.experiment.cameras[name], None
-        if isinstance(camera, PinholeCamera):
-            vfov_deg = field_of_focal(camera.image_size[1], float(camera.f_px))
-        return {"circle": self.experiment.circles.get(name), "vfov_deg": vfov_deg}
 
     def track(self, name: str, asked: Mapping[str, Any]) -> Json:
         """Track the clip with the `shapes` of a mask, `keep`, and what else is given: `circle`, u, v, radius, px;
@@ -111,9 +105,8 @@ class MaskMarking(Marking):
 
     def _changed(self, name: str, asked: Mapping[str, Any], folder: Path) -> Experiment:
         shown = drawn_mask(self._movie(name).frame_shape, asked["shapes"], self.masks[name] if asked["keep"] else None)
-        tried = self.experiment
         write_picture(folder / "mask.png", self._as_filmed(name, shown))
-        tried = replace(tried, mask_paths=tried.mask_paths | {name: folder / "mask.png"})
+        tried = replace(self.experiment, mask_paths=self.experiment.mask_paths | {name: folder / "mask.png"})
         if asked.get("circle") is not None:
             tried = replace(tried, circles=tried.circles | {name: _circle(asked["circle"])})
         if asked.get("light") is not None:
@@ -135,7 +128,7 @@ class MaskMarking(Marking):
             old = self.read().get("response")
             each = old if isinstance(old, dict) and old.keys() != {"gamma"} else dict.fromkeys(self.movies, old)
             keys["response"] = {one: part for one, part in (each | {name: asked["light"]}).items() if part is not None}
-        files = [self.save(name, asked["shapes"], keep=bool(asked["keep"]))["file"]] if asked["shapes"] else []
+        files = []
         with self.lock:
             for key, value in keys.items():
                 self.write([key], value, f"write {key}: {flow(value)} there")
@@ -143,7 +136,9 @@ class MaskMarking(Marking):
                 with writing(force=True):
                     write_text(tried.cameras_path, self._cameras(name, asked["vfov_deg"]))
                 files.append(str(tried.cameras_path))
-            self.experiment = load_experiment(self.path)
+        if asked["shapes"]:  # last: it is least likely to be refused
+            files.append(self.save(name, asked["shapes"], keep=bool(asked["keep"]))["file"])
+        self.experiment = load_experiment(self.path)
         return {"files": [*files, str(self.path)]}
 
     def _as_filmed(self, name: str, shown: Bools) -> NDArray[np.uint8]:
@@ -252,6 +247,10 @@ class MaskMarking(Marking):
         if name not in self.movies:
             raise self.refused("camera", ", ".join(self.movies), repr(name)[:40], "choose one of these")
         return self.movies[name]
+
+
+def _vfov_deg(camera: Camera) -> float | None:
+    return field_of_focal(camera.image_size[1], float(camera.f_px)) if isinstance(camera, PinholeCamera) else None
 
 
 def drawn_mask(size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: Bools | None) -> Bools:

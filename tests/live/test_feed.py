@@ -20,7 +20,7 @@ from sphereorient.experiment.recording import open_recording
 from sphereorient.live import shared
 from sphereorient.live.feed import Arrival, Feed
 from sphereorient.live.shared import ENDED, SharedFrames, shared_frames
-from sphereorient.live.sources import movie_frames, raw_frames
+from sphereorient.live.sources import movie_frames, raw_frames, recorded, source_of
 
 
 def let(count: int, goes_on: Semaphore) -> Iterator[Arrival]:
@@ -180,6 +180,15 @@ def test_a_ring_is_not_looked_at_while_no_frame_is_due(recording, tmp_path, monk
     since = np.array([min(look - due for due in [0.0, *written_s] if due <= look + 1e-9) for look in looks[-20:]])
     assert ((since < 0.0003) | (since > 0.6 * step_s)).all()
     assert sum(look > written_s[39] for look in looks) < 0.4 * 40 * step_s / 0.0002
+
+
+def test_a_recording_lies_as_the_movies_do_that_flip_mirrors(recording):
+    took: list[np.ndarray] = []
+    recorders = [SimpleNamespace(room=lambda: True, take=lambda time_s, picture, room: took.append(picture))] * 2
+    mirrored = replace(recording, experiment=replace(recording.experiment, flip={"cam2": "vertical"}))
+    shown = next(recorded(source_of("movie-fast", pytest.fail), recorders).frames(mirrored)).pictures
+    np.testing.assert_array_equal(took[0], shown[0])
+    np.testing.assert_array_equal(took[1], shown[1][::-1])
 
 
 def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):

@@ -93,6 +93,17 @@ def test_udp_sends_a_datagram_a_line():
 def test_a_host_that_nobody_knows_is_told():
     with pytest.raises(OutputError, match="expected a host"):
         UdpOutput("no such host", 9)
+    with pytest.raises(OutputError, match="expected a host"):
+        UdpOutput("a..b", 9)
+    with pytest.raises(OutputError, match="expected a free port"):
+        TcpOutput("a..b", 9)
+
+
+def test_an_empty_host_is_this_machine_alone():
+    output, _ = open_output("tcp::0", pytest.fail)
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.2", output.port), 0.5)
+    output.close()
 
 
 def test_a_file_grows_line_by_line_and_replaces_none(tmp_path):

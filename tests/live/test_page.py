@@ -219,6 +219,15 @@ def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, a
     assert len(told) == 1
 
 
+@pytest.mark.slow  # a process of its own, which imports torch
+def test_what_is_wrong_with_the_files_is_told_by_the_loop_alone(tmp_path, capfd):
+    (tmp_path / "experiment.yaml").write_text((EXCERPT / "experiment.yaml").read_text())  # without movies
+    page = PageProcess(tmp_path / "experiment.yaml", None, 0, pytest.fail)
+    page.process.join()
+    page.close()
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.slow  # a browser
 def test_a_person_looks_and_stops(served, browser: Any, tmp_path: Path):
     seen, place = served

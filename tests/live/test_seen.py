@@ -27,8 +27,7 @@ class Harvester:
 PYLON = """
 from types import SimpleNamespace
 here = SimpleNamespace(GetSerialNumber=lambda: "21", GetModelName=lambda: "a2A")
-factory = SimpleNamespace(EnumerateDevices=lambda: [here])
-pylon = SimpleNamespace(TlFactory=SimpleNamespace(GetInstance=lambda: factory))
+TlFactory = SimpleNamespace(GetInstance=lambda: SimpleNamespace(EnumerateDevices=lambda: [here]))
 """
 VIMBA = """
 class VmbSystem:
@@ -40,6 +39,7 @@ class VmbSystem:
     def get_id(self): return "DEV_1"
     def get_model(self): return "Alvium"
 """
+PARTS = {"harvesters": "core.py", "pypylon": "pylon.py"}
 HANGS = "import time\ntime.sleep(60)"
 ENDS = "import os\nos.abort()"
 FAILS = "raise RuntimeError('no transport layer')"
@@ -52,7 +52,8 @@ def drivers(tmp_path, monkeypatch):
     def install(**texts: str) -> None:
         for name, text in {"cv2": CV2, **texts}.items():
             (tmp_path / name).mkdir()
-            (tmp_path / name / ("core.py" if name == "harvesters" else "__init__.py")).write_text(text)
+            (tmp_path / name / "__init__.py").touch()
+            (tmp_path / name / PARTS.get(name, "__init__.py")).write_text(text)
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 

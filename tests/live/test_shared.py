@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import subprocess
 import sys
@@ -73,6 +74,38 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path):
     with pytest.raises(OutputError, match="expected a new file"):
         open_output(f"shared:{path}", pytest.fail)
     assert path.read_text() == "mine"
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="of POSIX")
+def test_a_disk_without_room_for_a_ring_is_told_before_it_is_written(tmp_path, monkeypatch):
+    def full(*given: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OutputError, match="No space left"):
+        open_output(f"shared:{tmp_path / 'poses'}", pytest.fail)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_ring_in_the_making_does_not_end_the_reading_of_the_one_before(tmp_path, monkeypatch):
+    monkeypatch.setattr("sphereorient.live.shared.REPLACED_S", 0.0)
+    path, looks = tmp_path / "poses", []
+    killed, _ = open_output(f"shared:{path}", pytest.fail)
+    killed.send(numbers(0))
+    poses = shared_poses(path)
+    assert next(poses)[0] == 0
+    path.unlink()
+    path.write_bytes(bytes(4096))
+
+    def sleep(seconds: float) -> None:
+        looks.append(seconds)
+        if len(looks) == 3:
+            path.unlink()
+            open_output(f"shared:{path}", pytest.fail)[0].send(numbers(5))
+
+    monkeypatch.setattr("sphereorient.live.shared.time.sleep", sleep)
+    count, pose = next(poses)
+    assert (count, pose[0]) == (1, 5.0)
 
 
 @pytest.mark.slow  # ten seconds of poses
