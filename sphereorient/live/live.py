@@ -150,14 +150,15 @@ class LiveTracker(Protocol):
 def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
     """Yield the pose of each ball in each frame; frames of one source, in order."""
     before: Sequence[Frame] | None = None
-    number = -1
+    number: int | None = None  # of the frame before
     for arrival in frames:
+        dropped = 0 if number is None else arrival.number - number - 1
         shots = [
             _shot(picture, None if before is None else before[c], view)
             for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
         ]
         for ball, (poses, searched) in tracker.next(arrival.time_s, shots).items():
-            yield _told(arrival, ball, poses, searched, arrival.number - number - 1, tracker)
+            yield _told(arrival, ball, poses, searched, dropped, tracker)
         tracker.between()
         before, number = shots, arrival.number
 

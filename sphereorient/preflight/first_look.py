@@ -66,8 +66,8 @@ def look_at(
     movies = [open_movie(path) for path in paths]
     each = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
     looks = list(counted("look", each, len(movies), progress))
-    if any(one.stays is False for one in looks):  # it moves: in a short movie another camera may see little of that
-        looks = [replace(one, stays=False, sways=False) if one.sways else one for one in looks]
+    if not all(one.stays for one in looks):  # it moves: in a short movie another camera may see little of that
+        looks = [replace(one, stays=None, sways=False) if one.sways else one for one in looks]
     return looks
 
 
