@@ -166,30 +166,18 @@ class BallTracker:
         frames = [[shot.shown for shot in shots]]
         contradicted = Reason.CONTRADICTS in expected.reason
         if not contradicted and bool(expected.use.all()) and all(shot.readable for shot in shots):
-            start, use = self._start_of(expected, frames), expected.use[None]
-            disks_px = self._disks_px(start.position_lab_mm)
+            use = expected.use[None]
+            X, R, precision, moved = self._begun([expected], frames, use, None)
+            disks_px = self._disks_px(X)
             if float(disks_px.largest_px) <= self.fitter.widest_px:
+                start = PoseStart(X, R, use, precision, moved, held=self.centre is not None)
                 fit = self.fitter.settled(frames, start, disks_px)
-                score = fit.score.numpy()
-                if score.max() < HOPELESS:
+                if fit.score.numpy().max() < HOPELESS:
                     return None
-                poor = 1.0 - score.min() > MORE_THAN_USUAL * (1.0 - self.usual_score)
-                if not poor and bool(self._supported(fit, use)):
+                if not bool(self._poor(fit, use)) and bool(self._supported(fit, use)):
                     return poses_of(fit, slice(1), expected.use, [Reason.OK] * len(shots))
         (poses,) = self.follow([expected], [shots])
         return poses
-
-    def _start_of(self, one: Expected, frames: Sequence[Sequence[Shown]]) -> PoseStart:
-        """Return where the fit of one frame begins; a rough prediction is brought near first."""
-        X, turn, R, moved = (
-            torch.from_numpy(part)[None] for part in (one.position_lab_mm, one.turn, one.R_before, one.moved)
-        )
-        R, precision, use = so3.exp(turn) @ R, torch.from_numpy(np.linalg.inv(one.place_spread))[None], one.use[None]
-        if one.rough:
-            was, every = (X, R), torch.ones(1, dtype=torch.bool)
-            X, R = self._approached(frames, (X, R), use, precision, every, None)
-            moved = moved + one.open_share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
-        return PoseStart(X, R, use, precision, moved, held=self.centre is not None)
 
     def spotted(self, shots: Sequence[Frame]) -> Poses:
         """Find the pose of a frame without history by the ball's blob, in a quarter of the time of `searched`, which
@@ -215,21 +203,34 @@ class BallTracker:
             return poses
         return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in there.reason])
 
-    def _predicted(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> _Predicted:
-        """Return where the ball is expected; a rough prediction is brought near first."""
+    def _begun(
+        self,
+        expected: Sequence[Expected],
+        frames: Sequence[Sequence[Shown]],
+        use: Tensor,
+        among: Neighbours | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return where fits begin: position (B, 3), mm, rotation (B, 3, 3), precision of the position (B, 3, 3), mm^-2,
+        and motion while the shutter is open (B, 6); a rough prediction is brought near first.
+        """
         X, R_before, turn, spread, moved = (
             torch.from_numpy(np.stack([getattr(one, name) for one in expected]))
             for name in ("position_lab_mm", "R_before", "turn", "place_spread", "moved")
         )
         R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
+        if any(one.rough for one in expected):
+            was, rough = (X, R), torch.tensor([one.rough for one in expected])
+            X, R = self._approached(frames, (X, R), use, precision, rough, among)
+            share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
+            moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
+        return X, R, precision, moved
+
+    def _predicted(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> _Predicted:
+        """Return where the ball is expected, and the pictures that may show it."""
         known, among = torch.stack([one.use for one in expected]), joined([one.among for one in expected])
         frames = [[shot.shown for shot in row] for row in shots]
         readable = torch.tensor([[shot.readable for shot in row] for row in shots])
-        if any(one.rough for one in expected):
-            was, rough = (X, R), torch.tensor([one.rough for one in expected])
-            X, R = self._approached(frames, (X, R), known & readable, precision, rough, among)
-            share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
-            moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
+        X, R, precision, moved = self._begun(expected, frames, known & readable, among)
         disks_px = self._disks_px(X)
         if among is not None:
             disks_px = disks_px._replace(spoilt=self.fitter.spoilt(X, disks_px, moved, among))

@@ -52,7 +52,7 @@ class LearningTracker:
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
         self._known = _unknown(place, self._pass)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
-        self._lasting, self._error = self._known.lasting, OUTLINE_ERROR  # of the place, radii in pictures
+        self._error = OUTLINE_ERROR  # of the place, radii in pictures
         self._away_rad = 0.0  # farthest turn from the first frame
         self._drift_rad = 0.0  # of the frames that came while the map was adjusted
         self._now: tuple[Sequence[Frame], Poses] | None = None
@@ -66,7 +66,7 @@ class LearningTracker:
         poses, searched = self._pass.next(time_s, frames)
         self._now = (frames, poses) if supported(poses) else None
         if self._now is not None:
-            self.appearances = {"": replace(self._known, lasting=self._lasting.with_place(self._turned(poses)))}
+            self.appearances = {"": replace(self._known, lasting=self._known.lasting.with_place(self._turned(poses)))}
         return {"": (poses, searched)}
 
     def _turned(self, poses: Poses) -> Tensor:

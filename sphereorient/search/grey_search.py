@@ -92,8 +92,7 @@ class GreySearch(DiskSearch):
     def rough(self, disks: Tensor) -> Candidates:
         """Return the bank's peaks (F disks), best first; the score is 0: none is worked out."""
         check_disks(disks, self.size_px, self.size_px)
-        scores = torch._int_mm(to_int8(self._normalise(disks)), self.bank.T)
-        R = self.templates[best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)]
+        R = self.templates[self._best(to_int8(self._normalise(disks)))]  # few disks: not filled up
         peak = distinct(R, math.radians(self._settings.peak_deg))
         rows = (own[there][: self._settings.peaks].double() for own, there in zip(R, peak, strict=True))
         return Candidates.joined([Candidates.of_disk(own, own.new_zeros(len(own))) for own in rows])
@@ -104,12 +103,16 @@ class GreySearch(DiskSearch):
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best templates of the best groups (F, M), best first, and which are peaks, (F, M) bool."""
-        scores = torch._int_mm(self._normalised(disks), self.bank.T)
-        place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
+        place = self._best(self._normalised(disks))
         apart = math.radians(self._settings.peak_deg)
         looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
         peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
         return place, peak
+
+    def _best(self, steps: Tensor) -> Tensor:
+        """Return the best templates of the best groups (F, M) for normalised disks (F, P) int8, best first."""
+        scores = torch._int_mm(steps, self.bank.T)
+        return best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
 
     def _normalised(self, disks: Tensor) -> Tensor:
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
