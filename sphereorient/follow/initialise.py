@@ -146,7 +146,7 @@ class Initialiser:
         precision = precisions.sum(0)
         X = torch.linalg.solve(precision, (precisions @ X_k[..., None]).sum(0)).mT if place is None else place[None]
         level, count = fitter.optics.coarse, len(R)
-        pixels = fitter.pixels([[shot.picture for shot in shots]], X, level).thinned(2)
+        pixels = fitter.pixels([[shot.picture for shot in shots]], X, level).thinned(4)
         begin = PoseStart(X.expand(count, 3), R, use.expand(count, -1), precision.expand(count, 3, 3))
         fit = fitter.fit(pixels.where(torch.arange(len(pixels)).repeat(count)), begin, level, 4)
         chosen = distinct_indices(fit.R_lab_body, explaining_first(fit, use), 1)
@@ -165,13 +165,13 @@ class Initialiser:
         """
         proposer, camera, radius_mm = self.proposers[view.name], view.camera, self.fitter.radius_mm
         near = proposer.rough(torch.from_numpy(crop_disk(picture, *disk.circle, proposer.size_px))[None]).R_view_body
-        parts = view.sight.about(np.array([disk.circle[:2]]))
-        ray, origin, pitch_rad, _ = (torch.from_numpy(part) for part in parts)
-        distance = radius_mm / (disk.radius_px * pitch_rad)
+        sight = view.sight.of_size(np.array([disk.circle[:2]]), radius_mm / disk.radius_px)
+        ray, X, distance = (torch.from_numpy(part) for part in sight)
         along = ray.mT @ ray
-        precision = (torch.eye(3).double() - along) / (LOOSE * radius_mm) ** 2 + along / (DEPTH_SHARE * distance) ** 2
+        across, depth = LOOSE * radius_mm, LOOSE * radius_mm + DEPTH_SHARE * distance
+        precision = (torch.eye(3).double() - along) / across**2 + along / depth**2
         R_lab_view = camera.R_cam_lab.mT @ R_cam_view(camera.R_cam_lab @ ray[0])
-        return R_lab_view @ near, origin + distance * ray, precision[None]
+        return R_lab_view @ near, X, precision[None]
 
     def outline(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of the sphere in a camera's picture, or None and the reason; see `find_ball`."""

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from camera_examples import behind_port, fisheye, pinhole, telecentric
 from conftest import assert_close
 from refine_examples import LOOKS, camera_of, f64, scene_of
 
-from sphereorient.cameras import Camera
+from sphereorient.cameras import Camera, sphere_radius_px
 from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.locate import CameraScene
@@ -55,6 +56,25 @@ def test_every_pixel_looks_where_the_camera_says(model):
     # Half a pixel beside is another line.
     beside = camera(model).rays(uv + 0.5)
     assert (beside.direction_lab - rays.direction_lab).norm(dim=-1).min() > 1e-4 or model == "telecentric"
+
+
+@pytest.mark.parametrize("kind", ["pinhole", "fisheye", "port", "telecentric"])
+def test_a_balls_size_says_how_far_it_is_also_behind_a_port(kind):
+    lens = (
+        behind_port(pinhole())
+        if kind == "port"
+        else {"fisheye": fisheye, "telecentric": telecentric}.get(kind, pinhole)()
+    )
+    X, radius_mm = f64([4.0, -3.0, 6.0]), 2.0
+    middle_px, radius_px = lens.project(X), sphere_radius_px(lens, X, radius_mm)
+    direction, there, distance = LinesOfSight(lens).of_size(middle_px[None].numpy(), radius_mm / float(radius_px))
+    origin = f64(there[0] - distance[0] * direction[0])
+    away = float((X - f64(there[0])).norm())
+    if kind == "telecentric":  # its pictures do not say
+        assert distance[0] == 0.0
+        assert float(torch.linalg.cross(X - origin, f64(direction[0])).norm()) < 0.2
+    else:
+        assert away < 0.04 * float((X - origin).norm())
 
 
 @pytest.mark.parametrize(("model", "origins"), [("pinhole", 1), ("tsai", 1), ("telecentric", PLACES)])
