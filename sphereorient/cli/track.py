@@ -161,11 +161,14 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
 def _print_summary(result: "Trajectory", name: str) -> None:
     """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
     from sphereorient.calibration.self_calibration import contradiction_lines
+    from sphereorient.trajectory import span_words
 
     summary = result.summary()
     echo_lines(f"note: {remark}" for remark in result.provenance.get("remarks", []))
     valid = f"{summary['valid']} of {summary['frames']}"
     typer.echo(f"{ball_words(name)}{valid} frames valid (position and orientation measured)")
+    if summary["no_ball"]:
+        typer.echo(f"  no ball in view in {summary['no_ball']}: {span_words(result.without_ball)}")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")

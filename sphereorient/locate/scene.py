@@ -51,6 +51,7 @@ class CameraScene:
     diameter_px: float
     merit_min: float = 0.0  # of a blob that may be the sphere; 0: not known
     response: Response | None = None  # of the camera; None: not known, grey levels count as light
+    outline: Outline | None = None  # of a ball that stays in its place, if it was looked for
 
 
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
@@ -80,7 +81,7 @@ def find_scenes(
         raise camera_error(f"camera {stream.name}", expected, got, do)
     each = {name: recording.of(name) for name in recording.experiment.names}
     sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
-    empty, background = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None
+    empty, background, outline = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None, None
     photograph = stream.photograph and len(each) == 1
     in_place = photograph or all(one.experiment.sphere.in_place for one in each.values())
     if in_place and (empty is None or None in sizes.values()):
@@ -89,11 +90,11 @@ def find_scenes(
         find = still_ball if photograph else swaying_ball if sways else fixed
         outline, guess = find(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
-        background = guess if empty is None else None
+        background, outline = guess if empty is None else None, None if sways else outline
     known = {name: px for name, px in sizes.items() if px is not None}  # by now each is known
     if background is None:
         background = learn_background(stream.spread(count), tuple(known.values()), settings, empty, stream.shown)
-    scene = CameraScene(background=background, diameter_px=0.0, response=stream.response)
+    scene = CameraScene(background=background, diameter_px=0.0, response=stream.response, outline=outline)
     return {name: replace(scene, diameter_px=px) for name, px in known.items()}
 
 

@@ -15,6 +15,7 @@ from sphereorient.cameras import Camera, centre_lab_mm, holds_disk, sphere_radiu
 from sphereorient.cameras.response import Response
 from sphereorient.files.picture import OnDemand
 from sphereorient.locate import Background, CameraScene
+from sphereorient.locate.outline import Outline
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
@@ -41,6 +42,7 @@ class CameraView:
     sight: LinesOfSight
     merit_min: float = 0.0  # see `CameraScene`
     response: Response | None = None
+    outline: Outline | None = None  # of a ball that stays in its place, see `CameraScene`
 
     @classmethod
     def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":

@@ -35,9 +35,9 @@ SEE_BALL = "see the finding on the ball"
 TITLE = "cameras agree"
 
 
-def study(experiment: Experiment, settings: Settings) -> Learnt:
-    """Learn light, blur and noise of the movies as `track` does; raise SphereOrientError where that refuses."""
-    with opened(Request(experiment=experiment, settings=settings), MemoryStore()) as work:
+def study(experiment: Experiment, settings: Settings, cameras: tuple[str, ...] | None = None) -> Learnt:
+    """Learn light, blur and noise of the movies, None: of all, as `track` does; raise SphereOrientError as that does."""
+    with opened(Request(experiment=experiment, settings=settings, cameras=cameras), MemoryStore()) as work:
         assert work.follower is not None  # the precise method follows frames
         return Learnt.of(work.follower.appearance)
 
@@ -217,7 +217,7 @@ def ball_size_px(sample: MovieSample) -> Finding:
         return warning(title, "unknown: no ball was found", SEE_BALL)
     usual = float(seen.median())
     measured = f"{usual:.1f} px across ({float(seen.min()):.1f} .. {float(seen.max()):.1f})"
-    if sample.expected_px is None and sample.stream.photograph:
+    if sample.expected_px is None and (sample.stream.photograph or sample.in_place is not None):
         return judged(title, measured)
     if sample.expected_px is None:
         advice = f"set locate.diameter_px to {usual:.0f} (--set, or in the settings file)"

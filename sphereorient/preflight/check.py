@@ -1,17 +1,18 @@
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
 
-from sphereorient.errors import SettingsError
+from sphereorient.errors import SettingsError, SphereOrientError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Recording, given_scene, open_recording
+from sphereorient.experiment.recording import CameraStream, Recording, given_scene, open_recording
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.files.threads import Progress, silent
-from sphereorient.locate import expected_diameter_px
+from sphereorient.locate import expected_diameter_px, find_scenes
 from sphereorient.methods.proposers import as_near
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import cameras, movies, texture_map
@@ -40,6 +41,7 @@ class Preflight:
     similar: texture_map.ViewPair | None = None
     tracked: cameras.Tracked = cameras.NOT_TRACKED  # a short stretch; no findings with one camera or without a map
     matches: tuple[texture_map.TextureMatch, ...] = ()
+    fitted: tuple[str, ...] = ()  # cameras whose pictures a tracker fits the map to, though outlines show none of it
     scene: tuple[SceneView, ...] = ()  # of several balls: a picture of each camera
     findings: tuple[Finding, ...] = ()
 
@@ -78,9 +80,7 @@ def preflight(
         learning = pool.submit(cameras.study, experiment, planned) if both else None
         sampling = []
         for stream in recording.streams:
-            empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
-            size_px = sizes[stream.name]
-            sampling.append(pool.submit(sample_movie, stream, size_px, settings.locate, empty, experiment.sphere))
+            sampling.append(pool.submit(_sample, recording, stream, sizes[stream.name], settings))
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
         samples = tuple(one.result() for one in sampling)
@@ -89,6 +89,9 @@ def preflight(
         progress("frames", len(samples), len(samples))
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
+        matches = tuple(texture_map.match_texture(search.result(), samples) if search else ())
+        doubted = [match.name for match in matches if texture_map.doubts(match)]
+        studies = {name: pool.submit(cameras.study, experiment, planned, (name,)) for name in doubted}
         tracked = cameras.NOT_TRACKED
         if learning is not None and closer and any(sample.balls for sample in samples):
             first = int(recording.timeline.number[closer[0][0].frame[0]])
@@ -101,13 +104,22 @@ def preflight(
             scans=scans,
             texture=image,
             unseen=unseen,
-            matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
+            matches=matches,
+            fitted=tuple(name for name, one in studies.items() if one.exception() is None),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
             tracked=tracked,
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
+
+
+def _sample(recording: Recording, stream: CameraStream, size_px: float | None, settings: Settings) -> MovieSample:
+    """Return the sample of a camera, with the background and the place that `track` finds."""
+    scene, empty = None, given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
+    with suppress(SphereOrientError):  # what a tracker would refuse is reported by the findings
+        (scene,) = find_scenes(recording, stream, settings.refine.background_frames, settings.locate).values()
+    return sample_movie(stream, size_px, settings.locate, empty, scene)
 
 
 def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:
@@ -145,7 +157,7 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     yield texture_map.look_alikes(seen.similar)
     if seen.unseen is not None:
         yield texture_map.unknown_paint(seen.unseen)
-    yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
+    yield from (texture_map.map_fits(match, seen.matches, match.name in seen.fitted) for match in seen.matches)
 
 
 def _expected_sizes(recording: Recording, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:

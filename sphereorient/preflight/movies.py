@@ -16,6 +16,7 @@ from sphereorient.experiment.timeline import NONE, Timeline
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
+from sphereorient.trajectory import span_words
 
 MANY = 0.5  # share of bad frames above which a movie is a fault
 BALL_SEEN = 0.8  # share of the frames in which the ball should be found
@@ -88,16 +89,23 @@ def pictures(samples: Sequence[MovieSample]) -> Finding:
 
 
 def ball(sample: MovieSample) -> Finding:
-    """Count the frames with a ball, and the reasons for those without."""
+    """Count the frames with a ball, and the reasons for those without; name the frames that show none."""
+    title, none = f"ball {sample.name}", np.array([why is Reason.NOT_FOUND for _, why in sample.found])
     usable = [k for k, reason in enumerate(sample.screen) if reason in (Reason.OK, Reason.REPEATED)]
+    if sample.in_place is not None:
+        return judged(title, f"stays in its place: one outline for {len(usable)} frames")
     reasons = Counter(sample.found[k][1] for k in usable)
-    seen = reasons.pop(Reason.OK, 0)
-    measured = f"found in {seen} of {len(usable)} frames"
+    seen, absent = reasons.pop(Reason.OK, 0), 0
+    if seen:
+        absent = reasons.pop(Reason.NOT_FOUND, 0)
+    measured = f"found in {seen} of {len(usable) - absent} frames"
+    if absent:
+        measured += f"; no ball in view in {absent} more: {span_words(none, sample.frame)}"
     if reasons:
         measured += f" ({', '.join(f'{count} {reason}' for reason, count in reasons.most_common())})"
     remedy = REMEDY[reasons.most_common(1)[0][0] if reasons else Reason.NOT_FOUND]
-    few = seen < BALL_SEEN * len(usable)
-    return judged(f"ball {sample.name}", measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
+    few = seen < BALL_SEEN * (len(usable) - absent)
+    return judged(title, measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
 
 
 def background(sample: MovieSample, experiment: Experiment) -> Finding:

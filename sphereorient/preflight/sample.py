@@ -1,7 +1,6 @@
 """The sampled frames of the check, and the ball in them."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,26 +10,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk
-from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
-from sphereorient.experiment import Sphere
+from sphereorient.errors import MovieError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
+from sphereorient.follow.initialise import FAINT
 from sphereorient.locate import (
     Background,
     Found,
     LocateSettings,
     Sightings,
-    find_ball,
+    ball_at,
     learn_background,
     screened,
     sightings_of,
 )
 from sphereorient.locate.background import measure_background
-from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import SMALLEST_PX, measured_size_px, still_ball, swaying_ball
+from sphereorient.locate.outline import Outline, find_blobs
+from sphereorient.locate.scene import SMALLEST_PX, CameraScene, measured_size_px
 
 SPREAD = 25  # frames all over the movie: enough for a background
 EVERY = 3  # of these, each third one is read with the next frame, for motion and repeated frames
+MORE = (4, 16)  # times as many are read where none of them shows the ball
 FEW = 0.2  # share of the frames; if the ball is found in fewer, other sizes are tried
 LARGEST = 0.9  # of the picture's shorter side: the first diameter tried
 BALLS = 12  # frames in which a ball of unknown size is searched
@@ -48,6 +48,7 @@ class MovieSample:
     background: Background
     diameter_px: float  # searched
     expected_px: float | None  # by cameras and diameter; None: unknown
+    in_place: Outline | None = None  # of a ball that stays in its place
     screen: tuple[Reason, ...] = ()  # n, whether the picture as a whole can show a ball
     found: tuple[Found, ...] = ()  # n
 
@@ -83,14 +84,14 @@ class MovieSample:
         return [(picture, outline) for picture, (outline, _) in pairs if picture is not None and outline is not None]
 
 
-def pair_starts(count: int) -> list[int]:
+def pair_starts(count: int, spread: int = SPREAD) -> list[int]:
     """Return the frames of `frames_to_sample` that are read with the next frame."""
-    return [k for k in spread_frames(range(count), SPREAD)[::EVERY] if k + 1 < count]
+    return [k for k in spread_frames(range(count), spread)[::EVERY] if k + 1 < count]
 
 
-def frames_to_sample(count: int) -> list[int]:
+def frames_to_sample(count: int, spread: int = SPREAD) -> list[int]:
     """Return the frames of a timeline to read first: evenly spread ones, some with their next frame."""
-    return sorted({*spread_frames(range(count), SPREAD), *(k + 1 for k in pair_starts(count))})
+    return sorted({*spread_frames(range(count), spread), *(k + 1 for k in pair_starts(count, spread))})
 
 
 def sample_movie(
@@ -98,40 +99,53 @@ def sample_movie(
     diameter_px: float | None,
     settings: LocateSettings,
     empty: Grey | None = None,
-    sphere: Sphere | None = None,
+    scene: CameraScene | None = None,
 ) -> MovieSample:
-    """Sample one camera's frames, background and ball; measure its diameter if None; `empty`: a picture without it.
+    """Sample one camera's frames, background and ball; measure its diameter if None. `empty`: a picture without it;
+    `scene`: background and size as a tracker finds them, None where it finds none.
     Raises MovieError: no sampled frame can be decoded.
     """
-    frame = np.asarray(frames_to_sample(len(stream)), np.int64)
-    picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
-    known = [one for one in picture if one is not None]
+    read = _read(stream, SPREAD)
+    known = [one for one in read["picture"] if one is not None]
     shown = [one for one in known if not uniform(one)] or known
     if not shown:
         do = "check that it plays; export it again if not"
         raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
 
-    in_place = stream.photograph or (sphere is not None and sphere.in_place)
-    guessed = None if empty is not None or not in_place else replace(_surroundings(some), shown=stream.shown)
-    if guessed is not None and not (sphere is not None and sphere.fixed and not stream.photograph):
-        find = still_ball if stream.photograph else swaying_ball
-        with suppress(ExperimentError):  # no ball is reported by the checks
-            guessed = find(some, settings, shown=stream.shown)[1]
-
     def at_size(size_px: float) -> MovieSample:
-        background = guessed or learn_background(some, size_px, settings, empty, stream.shown)
-        look: dict[str, Any] = {"stream": stream, "frame": frame, "picture": picture, "background": background}
-        return _searched(MovieSample(**look, diameter_px=size_px, expected_px=diameter_px), settings)
+        around = stream.photograph and empty is None
+        background = _surroundings(some) if around else learn_background(some, size_px, settings, empty, stream.shown)
+        look = MovieSample(**read, stream=stream, background=background, diameter_px=size_px, expected_px=diameter_px)
+        return _searched(look, settings)
 
-    largest_px = LARGEST * min(stream.movie.frame_shape)
-    first = at_size(diameter_px if diameter_px is not None and diameter_px >= SMALLEST_PX else largest_px / 4)
-    if diameter_px is not None and len(first.balls) > FEW * len(shown):
+    if scene is None:
+        largest_px = LARGEST * min(stream.movie.frame_shape)
+        first = at_size(diameter_px if diameter_px is not None and diameter_px >= SMALLEST_PX else largest_px / 4)
+    else:
+        look: dict[str, Any] = {
+            "background": scene.background,
+            "diameter_px": scene.diameter_px,
+            "in_place": scene.outline,
+        }
+        first = _searched(MovieSample(**read, **look, stream=stream, expected_px=diameter_px), settings)
+        for times in MORE:  # it may pass by in a few frames
+            if first.balls or len(first.frame) >= len(stream):
+                break
+            first = _searched(replace(first, **_read(stream, times * SPREAD)), settings)
+    if (scene is not None or diameter_px is not None) and len(first.balls) > FEW * len(shown):
         return first
     # The size is unknown or wrong: take whatever is as round as a ball.
     chosen = [shown[k] for k in spread_frames(range(len(shown)), BALLS)]
     size_px = measured_size_px(chosen, first.background, settings, LARGEST)
-    return first if size_px is None else at_size(size_px)
+    other = first if size_px is None else at_size(size_px)
+    return other if len(other.balls) > len(first.balls) else first
+
+
+def _read(stream: CameraStream, count: int) -> dict[str, Any]:
+    """Return frames and pictures of a sample."""
+    frame = np.asarray(frames_to_sample(len(stream), count), np.int64)
+    return {"frame": frame, "picture": tuple(pictures_of(stream.movie, stream.rows[frame]))}
 
 
 def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSettings) -> MovieSample:
@@ -144,17 +158,28 @@ def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSett
 def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
     screen: list[Reason] = []
     found: list[Found] = []
-    rows = sample.row
+    merits = np.zeros(len(sample.row))  # of the best blobs
+    rows, scene, size = sample.row, sample.background, sample.diameter_px
     for k, (row, picture) in enumerate(zip(rows, sample.picture, strict=True)):
         reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
         ball: Found | None = None
         if picture is not None:  # a repeated picture is known only if its neighbour was read
             neighbour = sample.picture[k - 1] if k > 0 and row == rows[k - 1] + 1 else None
-            reason = screened(picture, neighbour, sample.background).reason
-            if reason in (Reason.OK, Reason.REPEATED):
-                ball = find_ball(picture, sample.background, sample.diameter_px, settings)
+            reason = screened(picture, neighbour, scene).reason
+            if reason in (Reason.OK, Reason.REPEATED) and sample.in_place is not None:
+                ball = sample.in_place, Reason.OK
+            elif reason in (Reason.OK, Reason.REPEATED):
+                difference = scene.difference(picture)
+                blobs = find_blobs(difference, scene.noise, size, settings)
+                merits[k] = max((blob.merit for blob in blobs), default=0.0)
+                ball = ball_at(blobs, difference, picture, scene, size, settings)
         screen.append(reason)
         found.append(ball or (None, reason))
+    seen = np.array([outline is not None for outline, _ in found])
+    if seen.any():  # fainter things are not the ball
+        least = FAINT * float(np.median(merits[seen]))
+        faint = (merits < least) & ~seen & np.isin(screen, (Reason.OK, Reason.REPEATED))
+        found = [(None, Reason.NOT_FOUND) if none else one for none, one in zip(faint, found, strict=True)]
     return replace(sample, screen=tuple(screen), found=tuple(found))
 
 

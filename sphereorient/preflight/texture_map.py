@@ -193,8 +193,13 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
     return TextureMatch(name=sample.name, score=score, mirrored=mirrored)
 
 
-def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
-    """Judge the match of the map with one camera's pictures."""
+def doubts(match: TextureMatch) -> bool:
+    """Return whether neither the pictures nor their mirror images show the map to a search by outlines."""
+    return bool(max(np.median(match.score), np.median(match.mirrored)) < POOR)
+
+
+def map_fits(match: TextureMatch, matches: Sequence[TextureMatch], fitted: bool) -> Finding:
+    """Judge the match of the map with one camera's pictures; `fitted`: a tracker can fit it all the same."""
     score, mirrored = np.median(match.score), np.median(match.mirrored)
     measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
     flip = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
@@ -205,6 +210,6 @@ def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
         f"map in {match.name}",
         measured,
         (mirrored > score + CLEARLY and mirrored > POOR, FAULT, flip),
-        (score < POOR, FAULT, "check sphere.texture: the movie does not show this map"),
+        (score < POOR and not fitted, FAULT, "check sphere.texture: the movie does not show this map"),
         (score < FITS or score < mirrored + CLEARLY, WARNING, unsure),
     )

@@ -48,8 +48,8 @@ APART_FRAMES = 3  # frames nearer than this show the same problem
 STRETCH_FRAMES = 10  # stretches with fewer frames between them are one
 MOST_BINS = 20_000  # frames of longer tracks are binned, so that a browser can show the page
 DIGITS = 4  # of the numbers on the page
-GOOD, DOUBTFUL, NOT_VALID = range(3)
-STATUS_WORDS = ("good", "doubtful", "not valid")
+GOOD, NO_BALL, DOUBTFUL, NOT_VALID = range(4)
+STATUS_WORDS = ("good", "no ball", "doubtful", "not valid")
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Ranked = Iterator[tuple[int, str]]  # rows with the reason, worst first
@@ -77,6 +77,8 @@ def lost_cameras(track: Trajectory, k: int) -> dict[str, str]:
 
 def frame_warnings(track: Trajectory, k: int) -> list[str]:
     """Return all warnings of frame k as text; empty for a good frame."""
+    if track.without_ball[k]:
+        return [STATUS_WORDS[NO_BALL]]
     found = [] if track.valid[k] else ["not valid"]
     return [*found, *flag_words(track, k), *(f"{name}: {why}" for name, why in lost_cameras(track, k).items())]
 
@@ -125,8 +127,9 @@ def _kinds(track: Trajectory) -> Iterator[Ranked]:
 
 
 def _gaps(track: Trajectory) -> Ranked:
-    """Yield the first frame of every gap, longest gap first, and the first one after it."""
-    for first, last in sorted(runs_of(~track.valid), key=lambda run: run[0] - run[1]):
+    """Yield the first frame of every gap with a ball in view, longest gap first, and the first one after it."""
+    gaps = ~track.valid & ~(track.without_ball & track.valid.any())  # of a track without any pose all of it
+    for first, last in sorted(runs_of(gaps), key=lambda run: run[0] - run[1]):
         lasts = "1 frame" if last - first == 1 else f"{last - first} frames"
         found = [words for words in frame_warnings(track, first) if words != "not valid"]
         yield first, f"gap of {lasts} begins" + (f": {', '.join(found)}" if found else "")
@@ -213,7 +216,7 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
         "name": track.experiment,
         "frames": len(track),
         "per_bin": size,  # the last bin may have fewer
-        "counts": np.bincount(status, minlength=3).tolist(),  # frames that are good, doubtful, not valid
+        "counts": np.bincount(status, minlength=len(STATUS_WORDS)).tolist(),  # frames by status
         "row": row.tolist(),  # (n), row of the track: the first of those of the bin's status
         "number": numbers[row].tolist(),  # the experiment's number of that frame
         "time_s": _short(track.time[row], 9),  # of that frame
@@ -250,21 +253,24 @@ def _cameras_apart_deg(track: Trajectory) -> Floats | None:
 def bad_stretches(track: Trajectory) -> list[BadStretch]:
     """Find runs of bad frames, joined over fewer than ten good ones, longest first."""
     doubts, status = _doubts(track), status_of(track)
-    bad, found = np.flatnonzero(status), []
+    bad, found = np.flatnonzero(status >= DOUBTFUL), []
     parts = np.split(bad, np.flatnonzero(np.diff(bad) > STRETCH_FRAMES) + 1) if len(bad) else []
     for first, last in ((int(part[0]), int(part[-1])) for part in parts):
         inside = slice(first, last + 1)
-        _, doubtful, not_valid = np.bincount(status[inside], minlength=3).tolist()
-        counted = Counter({words: int(there[inside].sum()) for words, there in doubts.items() if there[inside].any()})
+        *_, doubtful, not_valid = np.bincount(status[inside], minlength=len(STATUS_WORDS)).tolist()
+        shown = status[inside] != NO_BALL
+        counts = {words: int(there[inside][shown].sum()) for words, there in doubts.items()}
+        counted = Counter({words: count for words, count in counts.items() if count})
         reasons = tuple(counted.most_common())
         found.append(BadStretch(first=first, last=last, doubtful=doubtful, not_valid=not_valid, reasons=reasons))
     return sorted(found, key=lambda stretch: (-stretch.frames, -stretch.not_valid, stretch.first))
 
 
 def status_of(track: Trajectory) -> Ints:
-    """Return the status of every frame, GOOD, DOUBTFUL or NOT_VALID, (N,)."""
+    """Return the status of every frame, GOOD, NO_BALL, DOUBTFUL or NOT_VALID, (N,)."""
     doubtful = np.any([np.zeros(len(track), bool), *_doubts(track).values()], axis=0)
-    return np.where(track.valid, np.where(doubtful, DOUBTFUL, GOOD), NOT_VALID)
+    measured = np.where(doubtful, DOUBTFUL, GOOD)
+    return np.where(track.valid, measured, np.where(track.without_ball, NO_BALL, NOT_VALID))
 
 
 def _doubts(track: Trajectory) -> dict[str, NDArray[np.bool_]]:

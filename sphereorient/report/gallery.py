@@ -92,7 +92,7 @@ def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     evenly, serve to compare.
     """
     status = quality.status_of(track)
-    good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status)
+    good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status >= quality.DOUBTFUL)
     room = min(count, len(track))
     bad_room = room - min(len(good), room - round(BAD_SHARE * room))
     worst = quality.choose_worst(track, max(bad_room, min(room, 1)))

@@ -182,6 +182,8 @@ class Ball:
     def state(self, k: int) -> tuple[str, Colour]:
         """Return the state of a frame as text, with a mark for colour-blind readers, and its colour."""
         flags = ", ".join(flag_words(self.track, k))
+        if self.track.without_ball[k]:
+            return "no ball in view", FAINT
         if not self.track.valid[k]:
             return f"\u2716 not valid{': ' + flags if flags else ''}", LOST
         return (f"\u25b2 doubt: {flags}", DOUBT) if flags else ("\u25cf valid", GOOD)

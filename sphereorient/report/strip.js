@@ -114,8 +114,11 @@
 
     /** Where the camera measured nothing the row is dark; the line is its score. */
     cameraRow({ camera, top, height }) {
+      const { status } = this.owner.strip;
       this.cells((x, width, from, to) => {
-        this.ink.fillStyle = this.owner.colours[camera.reason.slice(from, to).some((code) => code) ? 2 : 0];
+        const noBall = status.slice(from, to).every((one) => one === 1);
+        const lost = camera.reason.slice(from, to).some((code) => code);
+        this.ink.fillStyle = this.owner.colours[noBall ? 1 : lost ? 3 : 0];
         this.ink.fillRect(x, top, width, height);
       });
       const low = this.owner.lowScore;
@@ -246,7 +249,7 @@
     readStyle() {
       const style = getComputedStyle(this.section);
       this.colours = {};
-      for (const name of [0, 1, 2, "ink", "faint", "line", "paper"])
+      for (const name of [0, 1, 2, 3, "ink", "faint", "line", "paper"])
         this.colours[name] = style.getPropertyValue(`--strip-${name}`).trim();
     }
 

@@ -11,7 +11,7 @@ from sphereorient.statistics import Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.isotropy import anisotropic_frame
 from sphereorient.statistics.summary import Distributions
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Trajectory, span_words
 
 FEW_SEGMENTS = 20  # below, intervals and tests say little
 LOST_SHARE = 0.05  # of the frames: worth a look
@@ -46,13 +46,20 @@ def _say(title: str, words: str, do: str = "", *, good: bool = False) -> Verdict
 
 
 def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
-    frames = sum(len(track) for track in tracks.values())
+    absent = {name: track.without_ball for name, track in tracks.items()}
+    frames = sum(int((~none).sum()) for none in absent.values())
     valid = sum(int(track.valid.sum()) for track in tracks.values())
     share = valid / max(frames, 1)
-    words = f"{valid:,} of {frames:,} frames valid ({100 * share:.4g} %)"
-    worst = min(tracks, key=lambda name: float(tracks[name].valid.mean()) if len(tracks[name]) else 0.0)
+    each = {name: float(tracks[name].valid[~none].mean()) if not none.all() else 0.0 for name, none in absent.items()}
+    elsewhere = sum(int(none.sum()) for none in absent.values())
+    shown = " with a ball" if elsewhere else ""
+    words = f"{valid:,} of {frames:,} frames{shown} valid ({100 * share:.4g} %)"
+    worst = min(each, key=lambda name: each[name])
     if len(tracks) > 1 and valid < frames:
-        words += f"; fewest in {worst}, {100 * float(tracks[worst].valid.mean()):.4g} %"
+        words += f"; fewest in {worst}, {100 * each[worst]:.4g} %"
+    if elsewhere:
+        where = "" if len(tracks) > 1 else f": {span_words(absent[worst])}"
+        words += f"; no ball in view in {elsewhere:,} more{where}"
     do = "see the reasons under Frame by frame, and run `sphereorient check` on the experiment"
     yield _say("Measured", words, do if share < 1 - LOST_SHARE else "", good=True)
     if all(track.held for track in tracks.values()):

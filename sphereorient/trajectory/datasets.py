@@ -14,6 +14,7 @@ from sphereorient.errors import Reason, ShapeError, TrackError, refusal
 from sphereorient.files.whole_file import LARGEST_RATIO
 
 KEY = "column"
+SPANS = 4  # stretches of frames that are named
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,17 @@ def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return first and last + 1 of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def span_words(mask: NDArray[np.bool_], number: NDArray[np.int64] | None = None) -> str:
+    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319", the longest `SPANS` stretches; `number`: of each
+    frame, None: its index.
+    """
+    number = np.arange(len(mask)) if number is None else number
+    runs = runs_of(mask)
+    longest = sorted(sorted(runs, key=lambda run: run[0] - run[1])[:SPANS])
+    words = [f"{number[a]} to {number[b - 1]}" if b > a + 1 else f"{number[a]}" for a, b in longest]
+    return ", ".join(words) + (f" and {len(runs) - SPANS} stretches more" if len(runs) > SPANS else "")
 
 
 def reasons_of(texts: Any) -> tuple[str, ...]:

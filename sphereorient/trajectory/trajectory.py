@@ -42,6 +42,8 @@ PLOTTED = (
 )
 COLOURS = {"w": "#666666", "x": "#D55E00", "y": "#009E73", "z": "#0072B2"}  # of the axes, in every figure
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+NO_PICTURE = (Reason.MISSING, Reason.UNDECODABLE, Reason.REPEATED)  # say nothing of the ball
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +100,7 @@ class Trajectory:
     """
 
     time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
-    valid: NDArray[np.bool_] = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
+    valid: Bools = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
     position: Floats = stored("mm", "centre of the sphere, lab", 3)
     position_cov: Floats = stored("mm^2", "covariance of position", 3, 3)
     orientation: Floats = stored("1", "R_lab_body: columns are the body axes in the lab", 3, 3)
@@ -160,7 +162,7 @@ class Trajectory:
         return len(self.time)
 
     @property
-    def believed(self) -> NDArray[np.bool_]:
+    def believed(self) -> Bools:
         """(N, C): in which frames which cameras measured the pose."""
         return np.stack([np.array([why == Reason.OK for why in one.reason], bool) for one in self.cameras.values()], 1)
 
@@ -295,13 +297,25 @@ class Trajectory:
         figure.suptitle(f"{self.title or 'trajectory'}: {len(self)} frames, {self.method}")
         return figure
 
+    @property
+    def without_ball(self) -> Bools:
+        """Frames in which no camera that has a picture shows a ball, (N,) bool."""
+        if not self.cameras:
+            return np.zeros(len(self), bool)
+        reasons = np.array([camera.reason for camera in self.cameras.values()], object)
+        none, unknown = reasons == Reason.NOT_FOUND, np.isin(reasons, NO_PICTURE)
+        return np.asarray(~self.valid & none.any(0) & (none | unknown).all(0))
+
     def summary(self) -> dict[str, Any]:
-        """Return `frames`, `valid`, and `lost`: lost frames of each camera by reason, most frequent first."""
-        lost = {}
+        """Return numbers of frames: all `frames`, those `valid`, those with `no_ball`, and `lost`: of those with a ball,
+        the ones that each camera lost, by reason, most frequent first.
+        """
+        lost, none = {}, self.without_ball
         for name, camera in self.cameras.items():
-            counts = Counter(str(reason) for reason in camera.reason if reason != Reason.OK)
+            reasons = (why for why, absent in zip(camera.reason, none, strict=True) if not absent)
+            counts = Counter(str(why) for why in reasons if why != Reason.OK)
             lost[name] = dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
-        return {"frames": len(self), "valid": int(np.sum(self.valid)), "lost": lost}
+        return {"frames": len(self), "valid": int(np.sum(self.valid)), "no_ball": int(none.sum()), "lost": lost}
 
 
 class Tracks(Mapping[str, Trajectory]):

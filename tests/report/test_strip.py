@@ -15,7 +15,17 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import SphereOrientError
-from sphereorient.report.frame_warnings import bad_stretches, frame_numbers, status_of, strip_of
+from sphereorient.report.frame_warnings import (
+    DOUBTFUL,
+    GOOD,
+    NO_BALL,
+    NOT_VALID,
+    bad_stretches,
+    choose_worst,
+    frame_numbers,
+    status_of,
+    strip_of,
+)
 from sphereorient.report.gallery import GAP, TILE, chosen_frames, gallery
 from sphereorient.report.page import strip_assets, strip_html
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -74,15 +84,29 @@ def test_of_equally_long_stretches_the_one_that_is_not_valid_is_first():
     assert [one.first for one in bad_stretches(track)] == [40, 10]
 
 
+def test_frames_without_a_ball_are_neither_doubtful_nor_lost():
+    track, away = good_track(60), slice(0, 20)
+    for name in ("cam1", "cam2"):
+        track = camera_changed(track, name, away, reason=Reason.NOT_FOUND, score=np.nan)
+    track = camera_changed(track, "cam1", slice(20, 23), reason=Reason.NOT_FOUND, score=np.nan)  # cam2 sees it
+    track = changed(track, away, valid=False)
+    assert status_of(track)[away].tolist() == [NO_BALL] * 20
+    assert status_of(track)[20:23].tolist() == [DOUBTFUL] * 3
+    assert [(one.first, one.last) for one in bad_stretches(track)] == [(20, 22)]
+    assert 0 not in choose_worst(track, 20)
+    assert track.summary()["no_ball"] == 20
+    assert track.summary()["lost"] == {"cam1": {"not_found": 3}, "cam2": {}}
+
+
 def test_the_strip_says_of_every_frame_what_was_planted():
     track = camera_changed(troubled(), "cam1", 5, score=0.6)
     track = camera_changed(track, "cam1", 7, orientation=TURN)
     strip = strip_of(track)
     status = np.zeros(300, int)
-    status[[85, 120, 121, 122, 200]] = 1
-    status[60:80] = 2
+    status[[85, 120, 121, 122, 200]] = DOUBTFUL
+    status[60:80] = NOT_VALID
     assert strip["status"] == status.tolist()
-    assert strip["counts"] == [275, 5, 20]
+    assert strip["counts"] == [275, 0, 5, 20]
     assert strip["number"] == strip["row"] == list(range(300))
     told = strip["reason_words"]
     words = {camera["name"]: [told[code] for code in camera["reason"]] for camera in strip["cameras"]}
@@ -134,7 +158,8 @@ def test_the_last_bin_may_be_shorter_and_a_gap_in_a_bin_hides_no_error():
     track = changed(good_track(20_001), 20_000, valid=False)
     track = changed(track, 4, orientation_cov=np.nan)
     strip = strip_of(track)
-    assert (strip["per_bin"], len(strip["status"]), strip["status"][-1], strip["row"][-1]) == (2, 10_001, 2, 20_000)
+    assert (strip["per_bin"], len(strip["status"])) == (2, 10_001)
+    assert (strip["status"][-1], strip["row"][-1]) == (NOT_VALID, 20_000)
     assert strip["orientation_error_deg"][2] == 0.1
 
 
@@ -162,7 +187,7 @@ def test_a_reason_of_a_newer_file_is_shown_as_it_is():
 def test_nothing_measured_is_json_and_a_page(frames):
     track = Trajectory.empty(np.arange(frames) / 600.0, cameras=("cam1",))
     text = json.dumps(strip_of(track), allow_nan=False)
-    assert json.loads(text)["counts"] == [0, 0, frames]
+    assert json.loads(text)["counts"] == [0, frames, 0, 0]  # no ball was found
     assert "Quality of every frame" in strip_html("empty", track, None)
 
 
@@ -255,7 +280,7 @@ def test_the_pictures_show_the_ball_within_its_outline():
     assert any(20 <= k < 28 for k in rows)
     assert sum(track.valid[k] and k != 5 for k in rows) >= 2
     assert told == [(done, 6) for done in range(1, 7)]
-    assert set(status_of(track)[rows]) == {0, 1, 2}
+    assert set(status_of(track)[rows]) == {GOOD, DOUBTFUL, NOT_VALID}
     assert shown.numbers.tolist() == list(range(len(track)))
     assert rows == list(chosen_frames(track, 6))
     for frame in shown.frames:
