@@ -33,7 +33,6 @@ from sphereorient.pose.fit import (
     MARGIN_PX,
     MORE,
     MOST_EACH,
-    NEAR_RAD,
     WINDOW_PX,
 )
 from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel, SphereView
@@ -271,7 +270,7 @@ def _near(
 ) -> tuple[Any, "_Addresses", object]:
     """Return the record of fits but for their frames, with what gives further addresses and what else it points to."""
     task, at = _task_of(begin, model, instants)
-    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=NEAR_RAD, most_hidden=hidden)
+    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=model.near_rad, most_hidden=hidden)
     near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
     known = [_of_view(view) for view in views]
     scene = (_Scene * len(views))(*(one[0] for one in known))

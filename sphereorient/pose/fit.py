@@ -44,7 +44,7 @@ MARGIN_PX = 3  # about such windows' middles: the occluder's blurred border
 MOST_HIDDEN = 0.5  # of a disk; where more differs, its pose or light is wrong, and all pixels count
 # In half of the pictures: bubbles 0.03, a rod 0.07, a map warped by 3 degrees 0.22. Then the model is wrong in all.
 USUALLY_HIDDEN = 0.15
-NEAR_RAD = 0.006  # a step that is longer wants another one before more pixels are looked at
+NEAR_RAD, NEAR_BLURS = 0.006, 0.4  # rad, and of the blur at the disk's middle: the longest steps that are not long
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 MORE = 2, 3  # further iterations after a long step: of some pixels, of all
 AGAIN = 3  # times that a fit whose last step is long goes on
@@ -283,7 +283,7 @@ def _step(
     fit = refine(pixels, begin, model, 1, most_hidden)
     turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
     # One camera's distances scatter; a change of its picture shows in the rotation as well.
-    far = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * model.radius_mm))
+    far = (turn > model.near_rad) | ((use.sum(1) > 1) & (move > model.near_rad * model.radius_mm))
     if bool(far.any()):
         fit = refine(pixels, begin.after(fit), model, more, most_hidden).where(far, fit)
     return fit, far

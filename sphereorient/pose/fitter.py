@@ -20,7 +20,7 @@ from sphereorient.pose.camera_view import (
     widest_px,
 )
 from sphereorient.pose.compiled import IN_TORCH, body_of, settle_alone
-from sphereorient.pose.fit import AGAIN, HOPELESS, MOST_HIDDEN, NEAR_RAD
+from sphereorient.pose.fit import AGAIN, HOPELESS, MOST_HIDDEN, NEAR_BLURS, NEAR_RAD
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
@@ -72,6 +72,7 @@ class Fitter:
                 light=self.light,
                 shading=FIRST if first else LATER,
                 limb_px=self.limb_px,
+                near_rad=min(NEAR_RAD, NEAR_BLURS * level.blur_px / max(self.widest_px, 1.0)),
             )
         return self._models[level]
 
@@ -205,10 +206,10 @@ class Fitter:
         """
         if len(frames) == 1 and (alone := self._alone(frames[0], begin)) is not None:
             return alone
-        fit = self._settled(frames, begin, disks_px)
+        fit, near_rad = self._settled(frames, begin, disks_px), self.model().near_rad
         for _ in range(AGAIN):
             hopeful = ((fit.score > HOPELESS) & begin.use).any(1).numpy()
-            rows = np.flatnonzero((np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) > NEAR_RAD) & hopeful).tolist()
+            rows = np.flatnonzero((np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) > near_rad) & hopeful).tolist()
             if not rows:
                 break
             on = begin.after(fit).of(torch.tensor(rows))

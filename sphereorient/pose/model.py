@@ -155,6 +155,7 @@ class SphereModel:
     light: Light  # of the C cameras
     shading: Shading = LATER  # how far a frame's light may differ from it
     limb_px: Tensor | None = None  # (C,), how far the limb lies outside of its place by all cameras: an error; None: 0
+    near_rad: float = math.inf  # a step that is longer wants another one: beyond the blur grey levels are not linear
 
 
 def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:

@@ -119,7 +119,7 @@ def _sample(recording: Recording, stream: CameraStream, size_px: float | None, s
     scene, empty = None, given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     with suppress(SphereOrientError):  # what a tracker would refuse is reported by the findings
         (scene,) = find_scenes(recording, stream, settings.refine.background_frames, settings.locate).values()
-    return sample_movie(stream, size_px, settings.locate, empty, scene)
+    return sample_movie(stream, size_px, settings.locate, empty, scene, recording.experiment.sphere.in_place)
 
 
 def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:

@@ -100,9 +100,10 @@ def sample_movie(
     settings: LocateSettings,
     empty: Grey | None = None,
     scene: CameraScene | None = None,
+    stays: bool = False,
 ) -> MovieSample:
     """Sample one camera's frames, background and ball; measure its diameter if None. `empty`: a picture without it;
-    `scene`: background and size as a tracker finds them, None where it finds none.
+    `scene`: background and size as a tracker finds them, None where it finds none; `stays`: the ball is in its place.
     Raises MovieError: no sampled frame can be decoded.
     """
     read = _read(stream, SPREAD)
@@ -114,7 +115,7 @@ def sample_movie(
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
 
     def at_size(size_px: float) -> MovieSample:
-        around = stream.photograph and empty is None
+        around = (stream.photograph or stays) and empty is None
         background = _surroundings(some) if around else learn_background(some, size_px, settings, empty, stream.shown)
         look = MovieSample(**read, stream=stream, background=background, diameter_px=size_px, expected_px=diameter_px)
         return _searched(look, settings)

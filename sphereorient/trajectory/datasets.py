@@ -139,8 +139,8 @@ def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def span_words(mask: NDArray[np.bool_], number: NDArray[np.int64] | None = None) -> str:
-    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319", the longest `SPANS` stretches; `number`: of each
-    frame, None: its index.
+    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319": the longest `SPANS` stretches. `number`: that
+    of each frame, None: its index.
     """
     number = np.arange(len(mask)) if number is None else number
     runs = runs_of(mask)

@@ -307,8 +307,8 @@ class Trajectory:
         return np.asarray(~self.valid & none.any(0) & (none | unknown).all(0))
 
     def summary(self) -> dict[str, Any]:
-        """Return numbers of frames: all `frames`, those `valid`, those with `no_ball`, and `lost`: of those with a ball,
-        the ones that each camera lost, by reason, most frequent first.
+        """Return numbers of frames: all `frames`, those `valid`, those with `no_ball`, and `lost`: the other ones that
+        each camera lost, by reason, most frequent first.
         """
         lost, none = {}, self.without_ball
         for name, camera in self.cameras.items():

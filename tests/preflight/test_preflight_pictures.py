@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -62,6 +63,35 @@ def test_of_movies_without_a_ball_one_line_a_camera_is_told(clean, tmp_path):
     result = checked(clean.spoilt(empty), tmp_path, sphere=PAINTED)
     assert {one.title for one in result.findings if one.severity is not OK} == {"ball cam1", "ball cam2"}
     assert "found in 0 of" in of(result, "ball cam1").measured
+
+
+def scene_alone(movie: np.ndarray, frames: int) -> np.ndarray:
+    """Frames of the scene without the ball."""
+    noise = np.random.default_rng(2).normal(0.0, 1.5, (frames, *movie.shape[1:]))
+    return np.clip(np.median(movie, axis=0) + noise, 0, 255).round()
+
+
+@pytest.mark.slow
+def test_frames_without_a_ball_are_named_and_are_not_dark(clean, tmp_path):
+    late = clean.spoilt(lambda movie: np.concatenate([scene_alone(movie, 30), movie, scene_alone(movie, 10)]))
+    result = checked(late, tmp_path, sphere=PAINTED)
+    assert complaints(result) == []
+    assert "no ball in view" in (measured := of(result, "ball cam1").measured)
+    count, ends = len(clean.pictures["cam1"]), [int(word) for word in re.findall(r"(\d+) to (\d+)", measured)[0]]
+    assert ends[0] == 0
+    assert 25 <= ends[1] < 30
+    assert f"to {count + 39}" in measured
+
+
+@pytest.mark.slow
+def test_a_ball_that_passes_by_in_few_frames_is_found(clean, tmp_path):
+    def passage(movie: np.ndarray) -> np.ndarray:
+        return np.concatenate([scene_alone(movie, 310), movie[:12], scene_alone(movie, 300)])
+
+    one = replace(clean, pictures={"cam1": passage(clean.pictures["cam1"])})
+    result = checked(one, tmp_path, sphere=PAINTED, backgrounds={"cam1": "empty_cam1.png"})
+    assert result.severity is not FAULT, complaints(result)
+    assert of(result, "ball cam1").severity is OK
 
 
 @pytest.mark.slow
