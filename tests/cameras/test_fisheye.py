@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import ROTVEC, T_MM, behind_port, f64, fisheye, pinhole, whole_picture
+from camera_examples import ROTVEC, T_MM, behind_port, f64, fisheye, load_opencv, pinhole, whole_picture
 from conftest import assert_close
 
 from sphereorient.cameras import load_cameras, sphere_disk_px
 from sphereorient.cameras.fisheye import FisheyeCamera
-from sphereorient.cameras.io.opencv import load_opencv, save_opencv
+from sphereorient.cameras.io.opencv import save_opencv
 from sphereorient.cameras.io.openptv import save_openptv
 from sphereorient.errors import CameraError
 

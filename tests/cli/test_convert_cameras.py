@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from camera_examples import load_opencv
 from typer.testing import CliRunner
 
 from sphereorient.cameras import PortCamera, load_cameras
 from sphereorient.cameras.fisheye import FisheyeCamera
-from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 from sphereorient.cli import app
 from sphereorient.errors import CameraError, OutputError
@@ -25,6 +25,8 @@ def folder(tmp_path):
         storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
         storage.write("camera_matrix", np.array([[f, 0, 331], [0, 715, 228.5], [0, 0, 1]]))
         storage.write("distortion_coefficients", np.array([-0.2, 0.1, 2e-3, -1e-3, 0.0]))
+        storage.write("rvec", np.array([0.0, f / 1000, 0.0]))
+        storage.write("tvec", np.array([f, 0.0, 0.0]))
         storage.release()
     (tmp_path / "cam1.tif.ori").write_text(ORI)
     (tmp_path / "cam1.tif.addpar").write_text("-0.00001 0 0 0 0 1 0.002\n")
@@ -77,10 +79,16 @@ def test_an_openptv_camera_keeps_its_wall_and_its_distortion(folder):
         (("left.yml",), "image_width, image_height: expected two whole numbers, got none"),
         (("left.yml", "--image-size", "wide"), "--image-size: expected width and height in pixels, got 'wide'"),
         (("cam1.tif.ori",), "--par: expected OpenPTV's ptv.par, got none"),
-        (("ptv.par",), r"ptv\.par: expected a file ending in \.yml, .* or \.ori"),
+        (("ptv.par",), r"ptv\.par: expected a file ending in \.yml, .* all in \.ori"),
         (("none.yml",), "none.yml: expected .*, got no such file"),
-        (("left.yml", "right.xml", "--names", "cam1"), "--names: expected one name a file, got 1 for 2 files"),
-        (("left.yml", "right.xml", "--names", "a,a"), "--names: expected different names, got a, a"),
+        (
+            ("left.yml", "right.xml", "--image-size", "650,480", "--names", "cam1"),
+            "--names: expected one name a camera, got 1 for 2 cameras; name all of left, right",
+        ),
+        (
+            ("left.yml", "right.xml", "--image-size", "650,480", "--names", "a,a"),
+            "--names: expected different names, got a, a",
+        ),
     ],
 )
 def test_refusals_are_one_line(folder, monkeypatch, arguments, message):

@@ -20,12 +20,14 @@ from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera, in_air
 from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text
-from sphereorient.files.yaml_file import short
+from sphereorient.files.yaml_file import read_yaml, short
 
 # How many numbers each file has, and which.
 ORI = 21, "centre, angles, matrix, xh yh cc, glass vector"
 ADDPAR = 7, "k1 k2 k3 p1 p2 scx she"
 PAR = 12, "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
+YAML_KEYS = ("imx", "imy", "pix_x", "pix_y", "chfield", "mmp_n1", "mmp_n2", "mmp_n3", "mmp_d")
+MOST_NAMES = 4  # cameras whose names older programs write, however many there are
 NO_ADDPAR = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]  # OpenPTV's defaults where there is no file
 AXES = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenPTV's camera components to ours
 
@@ -92,13 +94,25 @@ def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
 
 
 def load_ptv_par(path: Path | str) -> PtvPar:
-    """Read the sensor and the media from ptv.par; CameraError if missing, malformed or interlaced."""
+    """Read the sensor and the media from ptv.par, also one with more names than cameras, as older programs write, or
+    from the key ptv of OpenPTV's YAML; CameraError if missing, malformed or interlaced.
+    """
     path = Path(path)
-    words = _words(path, "\n")
-    count = words[0].strip() if words else ""
-    if not (count.isascii() and count.isdigit() and len(count) < 4):
-        raise camera_error(str(path), "the number of cameras first", short(count[:20]), "name OpenPTV's ptv.par")
-    imx, imy, pix_x, pix_y, chfield, *media = _numbers(path, words[1 + 2 * int(count) :], *PAR)[3:]
+    parts = PAR
+    if path.suffix in (".yaml", ".yml"):
+        document = read_yaml(path, CameraError)
+        ptv = document.get("ptv") if isinstance(document, dict) else None
+        parts = len(YAML_KEYS), " ".join(YAML_KEYS)
+        words = [str(ptv[key]) for key in YAML_KEYS if key in ptv] if isinstance(ptv, dict) else []
+    else:
+        words = _words(path, "\n")
+        count = words[0].strip() if words else ""
+        if not (count.isascii() and count.isdigit() and len(count) < 4):
+            do = "name OpenPTV's ptv.par, or its YAML with the key ptv"
+            raise camera_error(str(path), "the number of cameras first", short(count[:20]), do)
+        names = max(2 * int(count), min(len(words) - 1 - PAR[0], 2 * MOST_NAMES))
+        words = words[1 + names :]
+    imx, imy, pix_x, pix_y, chfield, *media = _numbers(path, words, *parts)[-len(YAML_KEYS) :]
     if chfield != 0:
         got, do = f"chfield {chfield:g}", "make whole frames of the fields first"
         raise camera_error(str(path), "whole frames (chfield 0)", got, do)
