@@ -33,6 +33,7 @@ SQUARES = {
     "yz": ((0, -0.5, -0.5), (0, 0.5, -0.5), (0, 0.5, 0.5), (0, -0.5, 0.5)),
     "xz": ((0.5, 0, -0.5), (-0.5, 0, -0.5), (-0.5, 0, 0.5), (0.5, 0, 0.5)),
 }
+SURE = 4.5  # half of 3^2: a square's tilt is sure at three sigmas of corners that are right to a pixel
 Array = NDArray[np.float64]
 
 
@@ -51,7 +52,9 @@ class FicTracConfig:
     unread: tuple[str, ...]  # keys of the file that change nothing here
 
     def R_animal_cam(self, image_size: tuple[int, int]) -> Tensor:
-        """Return the rotation (3, 3) to the animal's axes: x ahead, y to the right, z down."""
+        """Return the rotation (3, 3) to the animal's axes: x ahead, y to the right, z down; ExperimentError where the
+        corners do not show it.
+        """
         if self.plane is None:
             return so3.exp(torch.from_numpy(self.turn))
         width, height = image_size
@@ -59,7 +62,8 @@ class FicTracConfig:
         away = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
         focal = height / math.radians(self.vfov_deg) if self.fisheye else focal_of_field(height, self.vfov_deg)
         angle = away / focal if self.fisheye else np.arctan(away / focal)
-        return _R_of_square(np.array(SQUARES[self.plane]), np.hstack([aside / away * np.sin(angle), np.cos(angle)]))
+        seen = np.hstack([aside / away * np.sin(angle), np.cos(angle)])
+        return _R_of_square(np.array(SQUARES[self.plane]), seen, 1 / focal)
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
@@ -103,24 +107,31 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     )
 
 
-def _R_of_square(square: Array, seen: Array) -> Tensor:
+def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
     """Return the rotation (3, 3) from camera to animal where the corners (4, 3) of a square are seen along unit vectors
-    (4, 3). Source: FicTrac's SquareRT: the least sum of squared differences between unit vectors.
+    (4, 3). Source: FicTrac's SquareRT: the least sum of squared differences between unit vectors. ExperimentError where
+    corners that are off by a pixel could be those of the square's mirror image, tilted the other way.
     """
 
     def off(pose: Array) -> Array:
         there = square @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
         return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True) - seen).ravel()
 
-    slopes = seen[:, :2] / np.maximum(seen[:, 2:], 0.05)
+    slopes, do = seen[:, :2] / np.maximum(seen[:, 2:], 0.05), "mark another square in FicTrac's configGui, or add c2a_r"
     try:
         _, turns, places, _ = cv2.solvePnPGeneric(square, slopes, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
         starts = (np.concatenate(pose).ravel() for pose in zip(turns, places, strict=True))
-        best = min((least_squares(off, start, xtol=1e-12) for start in starts), key=lambda fit: float(fit.cost))
+        best, other = sorted(
+            (least_squares(off, start, xtol=1e-12) for start in starts), key=lambda fit: float(fit.cost)
+        )
     except (cv2.error, ValueError):
-        do = "mark them again in FicTrac's configGui"
         raise refused("config.txt, c2a_src", "the corners of a square", "others", do) from None
-    return so3.exp(torch.from_numpy(best.x[:3])).mT
+    R, mirrored = so3.exp(torch.from_numpy(np.stack([best.x[:3], other.x[:3]]))).mT.unbind()
+    apart_deg = math.degrees(float(so3.log(R.mT @ mirrored).norm()))
+    if apart_deg > 1 and other.cost - best.cost < SURE * pixel_rad**2:
+        got = f"corners that fit two rotations {apart_deg:.0f} degrees apart"
+        raise refused("config.txt, c2a_src", "a square whose perspective shows", got, do)
+    return R
 
 
 def _numbers(text: str) -> list[float]:

@@ -112,6 +112,44 @@ def test_project_undoes_rays_over_the_whole_picture(k, p, f_mm, scx, she, distan
     assert_close(camera.project(rays.origin_lab_mm + distance_mm * rays.direction_lab), uv_px, atol=1e-6)
 
 
+YAML = "num_cams: 1\nptv:\n  splitter: false\n  img_name: [a, b]\n  imx: 1280\n  imy: 1024\n  pix_x: 0.012\n  pix_y: 0.011\n"
+YAML += "  chfield: 0\n  mmp_n1: 1.0\n  mmp_n2: 1.49\n  mmp_n3: 1.33\n  mmp_d: 6.0\n  hp_flag: true\n"
+
+
+def test_openptvs_yaml_and_lists_of_four_names_say_the_same_as_ptv_par(tmp_path):
+    _, _, par = files(tmp_path, par=PAR + TANK)
+    (tmp_path / "parameters_Run1.yaml").write_text(YAML)
+    (tmp_path / "padded.par").write_text(PAR.replace("cal/cam2.tif\n", "cal/cam2.tif\n\n\n---\n---\n") + TANK)
+    expected = load_ptv_par(par)
+    assert expected == PtvPar((1280, 1024), (0.012, 0.011), 1.0, 1.49, 1.33, 6.0)
+    assert load_ptv_par(tmp_path / "parameters_Run1.yaml") == expected
+    assert load_ptv_par(tmp_path / "padded.par") == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (YAML.replace("pix_x", "pixel"), r"expected 9 numbers \(imx .*\), got 8"),
+        (YAML.replace("1024", "tall"), "number 2 of 9: expected a finite number, got 'tall'"),
+        (YAML.replace("chfield: 0", "chfield: 1"), "expected whole frames"),
+        (YAML.replace("ptv:", "par:"), "expected 9 numbers .*, got 0"),
+        ("- 1\n", "expected 9 numbers .*, got 0"),
+    ],
+)
+def test_a_yaml_of_openptv_that_lacks_something_is_refused(tmp_path, text, message):
+    (tmp_path / "run.yaml").write_text(text)
+    with pytest.raises(CameraError, match=message):
+        load_ptv_par(tmp_path / "run.yaml")
+
+
+def test_a_list_of_four_names_that_is_cut_off_is_refused(tmp_path):
+    whole = (PAR.replace("cal/cam2.tif\n", "cal/cam2.tif\na\nb\nc\nd\n") + TANK).splitlines()
+    for count in range(1, len(whole)):
+        (tmp_path / "ptv.par").write_text("\n".join(whole[:count]))
+        with pytest.raises(CameraError):
+            load_ptv_par(tmp_path / "ptv.par")
+
+
 def test_the_glass_vector_and_the_media_become_a_port(tmp_path):
     ori, addpar, par = files(tmp_path, par=PAR + "1.25\n1.5\n1.5\n6\n")
     camera = load_openptv(ori, load_ptv_par(par), addpar)
