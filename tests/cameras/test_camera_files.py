@@ -175,9 +175,10 @@ REFUSED = {
     "too few of COLMAP": ("cameras.txt", "1 PINHOLE 640 480 600 320 240", "4 parameters of PINHOLE, got 5 numbers"),
     "another text": ("config.txt", "src_fn : a.mp4\n", "expected one of SIMPLE_PINHOLE, .*, got ':'"),
     "a lens of ROS": ("c.yaml", ROS.replace("plumb_bob", "thin_prism"), "distortion_model: .*, got 'thin_prism'"),
-    "no camera": ("c.toml", "[metadata]\nadjusted = false\n", "got keys metadata; name the matrix camera_matrix"),
+    "no camera": ("c.toml", "[metadata]\nadjusted = false\n", "got keys .'metadata'.; name the matrix camera_matrix"),
     "no TOML": ("c.toml", "[cam", "can be parsed, got"),
     "one place": ("c.toml", ANIPOSE.replace("translation", "shift"), "c.toml, A, R, T: expected both or none"),
+    "numbers as keys": ("c.yaml", "1: {2: 3}\n", "camera_matrix: expected 3 x 3 numbers for each camera, got keys"),
     "half a pixel wide": ("c.yaml", ROS.replace("640", "640.5"), "image_size: expected two whole numbers"),
 }
 

@@ -86,7 +86,7 @@ def with_coefficient(place: int, count: int) -> np.ndarray:
 
 
 FAULTS = {
-    "no matrix": ({"camera_matrix": None}, "camera_matrix: expected 3 x 3 .*, got keys image_width, "),
+    "no matrix": ({"camera_matrix": None}, "camera_matrix: expected 3 x 3 .*, got keys .'image_width', "),
     "number for a matrix": ({"camera_matrix": 3.0}, "camera_matrix: expected 3 x 3 numbers, got 1 numbers"),
     "text for a matrix": ({"camera_matrix": "abc"}, "camera_matrix: expected 3 x 3 numbers, got 'abc'"),
     "matrix of another shape": ({"camera_matrix": K[:2]}, "camera_matrix: expected 3 x 3 numbers, got 6 numbers"),

@@ -112,8 +112,8 @@ def test_project_undoes_rays_over_the_whole_picture(k, p, f_mm, scx, she, distan
     assert_close(camera.project(rays.origin_lab_mm + distance_mm * rays.direction_lab), uv_px, atol=1e-6)
 
 
-YAML = "num_cams: 1\nptv:\n  splitter: false\n  img_name: [a, b]\n  imx: 1280\n  imy: 1024\n  pix_x: 0.012\n  pix_y: 0.011\n"
-YAML += "  chfield: 0\n  mmp_n1: 1.0\n  mmp_n2: 1.49\n  mmp_n3: 1.33\n  mmp_d: 6.0\n  hp_flag: true\n"
+YAML = "num_cams: 1\nptv:\n  splitter: false\n  img_name: [a, b]\n  imx: 1280\n  imy: 1024\n  pix_x: 0.012\n"
+YAML += "  pix_y: 0.011\n  chfield: 0\n  mmp_n1: 1.0\n  mmp_n2: 1.49\n  mmp_n3: 1.33\n  mmp_d: 6.0\n  hp_flag: true\n"
 
 
 def test_openptvs_yaml_and_lists_of_four_names_say_the_same_as_ptv_par(tmp_path):

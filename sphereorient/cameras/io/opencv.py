@@ -82,8 +82,8 @@ def load_camera_files(paths: Sequence[Path | str], image_size: tuple[int, int] |
     for path, tree in trees:
         parts = _parts(path, tree)
         if not parts:
-            got, do = f"keys {', '.join(map(str, tree))}"[:80], "name the matrix camera_matrix in the file"
-            raise camera_error(f"{path}, camera_matrix", "3 x 3 numbers for each camera", got, do)
+            do = "name the matrix camera_matrix in the file"
+            raise camera_error(f"{path}, camera_matrix", "3 x 3 numbers for each camera", f"keys {short([*tree])}", do)
         for name, said, unread in parts:
             with named(str(path) if len(parts) == 1 else f"{path}, {name}"):
                 camera = _camera(said, image_size)
@@ -134,7 +134,7 @@ def _tree(path: Path) -> Tree:
         raise camera_error(str(path), "a file that can be parsed", yaml_words(fault), "correct it there") from None
     if not isinstance(tree, dict):
         raise camera_error(str(path), "keys and values", short(tree), "name a camera file")
-    return {str(key): value for key, value in tree.items()}
+    return tree
 
 
 def _xml(element: ElementTree.Element) -> Any:
@@ -209,11 +209,11 @@ def _said(tree: Tree) -> Said:
 
 def _unread(tree: Tree, *said: Said) -> list[str]:
     used = {key for one in said for key, _ in one.values()}
-    return [key for key in tree if key not in used]
+    return [str(key) for key in tree if key not in used]
 
 
-def _folded(key: str) -> str:
-    return key.lower().replace("_", "")
+def _folded(key: object) -> str:
+    return str(key).lower().replace("_", "")
 
 
 def _camera(said: Said, image_size: tuple[int, int] | None) -> Camera:
