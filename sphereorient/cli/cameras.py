@@ -96,13 +96,7 @@ def check_cameras_command(
 
 @app.command("convert-cameras")
 def convert_cameras(
-    sources: Annotated[
-        list[Path],
-        Argument(
-            metavar="SOURCE...",
-            help="OpenCV's or ROS' .yml, .yaml, .xml, .json; anipose's .toml; COLMAP's cameras.txt; or OpenPTV's .ori",
-        ),
-    ],
+    sources: Annotated[list[Path], Argument(metavar="SOURCE...", help="Of OpenCV, ROS, anipose, COLMAP, or OpenPTV")],
     out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write.")],
     names: Annotated[str | None, Option(help="Names of the cameras, e.g. cam1,cam2; else those of the files.")] = None,
     image_size: Annotated[str | None, Option(metavar="W,H", help="Size, px, for files without it.")] = None,

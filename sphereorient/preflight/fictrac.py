@@ -121,9 +121,7 @@ def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
     try:
         _, turns, places, _ = cv2.solvePnPGeneric(square, slopes, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
         starts = (np.concatenate(pose).ravel() for pose in zip(turns, places, strict=True))
-        best, other = sorted(
-            (least_squares(off, start, xtol=1e-12) for start in starts), key=lambda fit: float(fit.cost)
-        )
+        best, other = sorted((least_squares(off, start) for start in starts), key=lambda fit: float(fit.cost))
     except (cv2.error, ValueError):
         raise refused("config.txt, c2a_src", "the corners of a square", "others", do) from None
     R, mirrored = so3.exp(torch.from_numpy(np.stack([best.x[:3], other.x[:3]]))).mT.unbind()

@@ -1,4 +1,4 @@
-"""OpenCV's files: read as OpenCV wrote them, written as it reads them, and every fault in one line."""
+"""OpenCV's files: read as OpenCV wrote them, and every fault in one line."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import ROTVEC, SIZE, T_MM, brown, f64, load_opencv, turned
+from camera_examples import ROTVEC, SIZE, T_MM, load_opencv, turned
 from conftest import assert_close
 
-from sphereorient.cameras.io.opencv import save_opencv
-from sphereorient.errors import CameraError, OutputError
+from sphereorient.errors import CameraError
 
 K = np.array([[700.0, 0, 331], [0, 715, 228.5], [0, 0, 1]])
 D = np.array([-0.21, 0.12, 2e-3, -1.5e-3, -0.03])
@@ -29,21 +28,16 @@ def opencv_file(path: Path, **nodes: object) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".json"])
-def test_a_camera_comes_back_to_the_last_bit(tmp_path, suffix):
-    camera = brown(f_px=f64((2100.0, 2144.0)) / 3)
-    save_opencv(tmp_path / f"cam{suffix}", camera)
-    back = load_opencv(tmp_path / f"cam{suffix}")
-    assert back.image_size == camera.image_size
-    for name in ("f_px", "centre_px", "k", "p", "R_cam_lab", "T_cam_lab_mm"):
-        assert torch.equal(getattr(back, name), getattr(camera, name)), name
-
-
-def test_opencv_reads_what_is_written(tmp_path):
-    save_opencv(tmp_path / "cam.yml", brown())
-    storage = cv2.FileStorage(str(tmp_path / "cam.yml"), cv2.FILE_STORAGE_READ)
-    np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), K)
-    np.testing.assert_array_equal(storage.getNode("distortion_coefficients").mat()[:, 0], D)
-    assert storage.getNode("image_height").real() == 480
+def test_numbers_are_read_to_the_last_bit(tmp_path, suffix):
+    wider = K * np.array([[7 / 3], [7 / 3], [1]])
+    nodes = {"camera_matrix": wider, "R": turned().numpy(), "T": np.array(T_MM)[:, None] / 7}
+    camera = load_opencv(opencv_file(tmp_path / f"cam{suffix}", distortion_coefficients=D[:, None] / 3, **nodes))
+    assert camera.image_size == SIZE
+    assert camera.f_px.tolist() == [700 * (7 / 3), 715 * (7 / 3)]
+    assert camera.centre_px.tolist() == [331 * (7 / 3), 228.5 * (7 / 3)]
+    assert [*camera.k[:2].tolist(), *camera.p.tolist(), float(camera.k[2])] == (D / 3).tolist()
+    assert torch.equal(camera.R_cam_lab, turned())
+    assert camera.T_cam_lab_mm.tolist() == [each / 7 for each in T_MM]
 
 
 @pytest.mark.parametrize(
@@ -125,11 +119,3 @@ def test_files_that_are_not_opencvs_are_refused(tmp_path):
     (tmp_path / "cam.yml").write_text("a: [1, 2\n}")
     with pytest.raises(CameraError, match=r"can be parsed, got .* in line 2"):
         load_opencv(tmp_path / "cam.yml")
-
-
-def test_a_place_that_cannot_be_written_is_refused(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="Not a directory"):
-        save_opencv(tmp_path / "file" / "cam.yml", brown())
-    with pytest.raises(OutputError, match=r"expected \.yml .*, got '\.txt'"):
-        save_opencv(tmp_path / "cam.txt", brown())

@@ -9,16 +9,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import behind_port, f64, openptv, port, tsai, turned, whole_picture
+from camera_examples import f64, openptv, whole_picture
 from conftest import assert_close
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from sphereorient.cameras import PortCamera
 from sphereorient.cameras.brown import OpenPTVCamera
-from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par, par_of, save_openptv, save_ptv_par
-from sphereorient.errors import CameraError, OutputError
+from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par
+from sphereorient.errors import CameraError
 
 # The layout that OpenPTV writes: centre, angles, matrix (which nobody reads), shift and distance, glass vector.
 ORI = """  105.26320000 102.74580000 403.88220000
@@ -169,29 +168,6 @@ def test_without_addpar_there_is_no_distortion(tmp_path):
     assert_close(camera.undistort(whole_picture()), whole_picture(), atol=1e-10)
 
 
-@pytest.mark.parametrize("wall", [False, True], ids=["air", "port"])
-def test_a_camera_comes_back(tmp_path, wall):
-    camera = behind_port(openptv(scx=f64(1.0))) if wall else openptv(scx=f64(1.0))
-    ori, addpar, par = tmp_path / "cam.ori", tmp_path / "cam.addpar", tmp_path / "ptv.par"
-    save_openptv(ori, addpar, camera)
-    save_ptv_par(par, par_of(camera), ["cam1", "cam2", "cam3"])
-    assert load_ptv_par(par) == par_of(camera)
-    back = load_openptv(ori, load_ptv_par(par), addpar)
-    assert type(back) is type(camera)
-    uv_px = whole_picture()
-    assert_close(back.rays(uv_px).origin_lab_mm, camera.rays(uv_px).origin_lab_mm, atol=1e-9)
-    assert_close(back.rays(uv_px).direction_lab, camera.rays(uv_px).direction_lab, atol=1e-13)
-
-
-def test_the_matrix_that_is_written_is_the_one_of_the_angles(tmp_path):
-    save_openptv(tmp_path / "cam.ori", tmp_path / "cam.addpar", openptv())
-    numbers = np.array((tmp_path / "cam.ori").read_text().split(), float)
-    assert len(numbers) == 21
-    dm = Rotation.from_euler("XYZ", numbers[3:6]).as_matrix()
-    np.testing.assert_allclose(numbers[6:15].reshape(3, 3), dm, atol=1e-12)
-    np.testing.assert_allclose(np.diag([1, -1, -1]) @ dm.T, turned().numpy(), atol=1e-12)
-
-
 def test_a_scale_of_unknown_origin_is_read_with_a_warning(tmp_path):
     ori, addpar, par = files(tmp_path, addpar="0 0 0 0 0 1.01 0")
     with pytest.warns(UserWarning, match=r"scx = 1.01 is read as x' = scx x, y' = y"):
@@ -268,20 +244,6 @@ def test_files_that_are_not_there_and_addpars_that_are_short_are_refused(tmp_pat
         load_openptv(ori, load_ptv_par(par), tmp_path / "none")
     with pytest.raises(CameraError, match="got a folder"):
         load_openptv(tmp_path, load_ptv_par(par))
-
-
-def test_what_openptv_cannot_hold_is_refused(tmp_path):
-    paths = tmp_path / "cam.ori", tmp_path / "cam.addpar"
-    with pytest.raises(CameraError, match="expected a camera of model openptv, got TsaiCamera"):
-        save_openptv(*paths, tsai())
-    behind = PortCamera(camera=openptv(), port=port(offset_mm=-3.0))
-    with pytest.raises(
-        CameraError, match=r"expected a wall with the lab's origin on its liquid side .*, got offset -3"
-    ):
-        save_openptv(*paths, behind)
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="Not a directory"):
-        save_openptv(tmp_path / "file" / "cam.ori", paths[1], openptv())
 
 
 def test_media_that_are_all_alike_make_no_wall():

@@ -18,11 +18,10 @@ from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.errors import CameraError
-from sphereorient.files.whole_file import TEXT_BYTES, check_ending, put_aside, read_whole
+from sphereorient.files.whole_file import TEXT_BYTES, read_whole
 from sphereorient.files.yaml_file import FAULTS, parse_yaml, short, yaml_words
 
-SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # OpenCV chooses the format by them
-READ = (*SUFFIXES, ".toml", ".txt")
+SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".toml", ".txt")
 MOST_NODES = 200_000  # OpenCV's sample adds the corners of all pictures
 # Names of lens models; True: the coefficients are k1 to k4 of cv2.fisheye.
 FISHEYE = {"": False, "plumb_bob": False, "radtan": False, "rational_polynomial": False}
@@ -91,32 +90,12 @@ def load_camera_files(paths: Sequence[Path | str], image_size: tuple[int, int] |
     return found
 
 
-def save_opencv(path: Path | str, camera: BrownCamera | FisheyeCamera) -> None:
-    """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
-    Raises OutputError (an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written).
-    """
-    path = Path(path)
-    check_ending(path, "OpenCV file", SUFFIXES)
-    (fx, fy), (cx, cy) = camera.f_px.tolist(), camera.centre_px.tolist()
-    coefficients = camera.k if isinstance(camera, FisheyeCamera) else torch.cat([camera.k[:2], camera.p, camera.k[2:]])
-    with put_aside(path) as aside:
-        storage = cv2.FileStorage(str(aside), cv2.FILE_STORAGE_WRITE)
-        storage.write("image_width", camera.image_size[0])
-        storage.write("image_height", camera.image_size[1])
-        storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-        storage.write("fisheye_model", int(isinstance(camera, FisheyeCamera)))
-        storage.write("distortion_coefficients", coefficients.detach().numpy()[:, None])
-        storage.write("R", camera.R_cam_lab.detach().numpy())
-        storage.write("T", camera.T_cam_lab_mm.detach().numpy()[:, None])
-        storage.release()
-
-
 def _tree(path: Path) -> Tree:
     """Parse a file into mappings, lists, numbers and texts; numbers may be texts still."""
     content = read_whole(path, TEXT_BYTES, "a camera file", CameraError, "correct the path")
     suffix = path.suffix.lower()
-    if suffix not in READ:
-        expected = f"a file ending in {', '.join(READ)}, or all in .ori"
+    if suffix not in SUFFIXES:
+        expected = f"a file ending in {', '.join(SUFFIXES)}, or all in .ori"
         do = "name camera files of OpenCV, ROS, anipose, COLMAP (cameras.txt) or OpenPTV"
         raise camera_error(str(path), expected, f"'{path.name}'", do)
     text = content.decode("utf-8-sig", errors="replace")
