@@ -48,7 +48,7 @@ def blocks(page: str, language: str) -> list[str]:
 @pytest.mark.parametrize("page", ["conventions.md", "cameras.md"])
 def test_the_examples_of_a_page_run(page):
     failed, tried = doctest.testfile(str(REPO / "docs" / page), module_relative=False)
-    assert tried >= 40
+    assert tried >= 30
     assert failed == 0
 
 

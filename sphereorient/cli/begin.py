@@ -137,6 +137,8 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     look = _looked([movie], target, quiet, shown)[0]
     diameter_px = 2 * said.circle_px[2] if said.circle_px else look.diameter_px
     look = replace(look, stays=True, diameter_px=diameter_px)  # FicTrac follows no other balls
+    height, width = look.movie.frame_shape
+    R_cam_lab = said.R_animal_cam((width, height)).mT.tolist()  # the lab is the animal's frame
     made = [cameras]
     if hidden:
         write_picture(mask, shown.astype("uint8") * 255)
@@ -144,11 +146,12 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     rate_hz = said.rate_hz or (None if look.rate_hz else look.movie.played_hz)  # its cameras are ordinary ones
     known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
     missing = _write_experiment([look], target, [*known, *changes], {look.name: mask.name} if hidden else None)
-    R_cam_lab = said.R_animal_cam.mT.tolist()  # the lab is the animal's frame
     model = "fisheye" if said.fisheye else "pinhole"
     _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab, model))
     if not quiet:
         typer.echo(_found(look))
+        if said.unread:
+            typer.echo(f"{config}, not read: {', '.join(said.unread)}")
         live = [] if isinstance(said.source, Path) else [f"sphereorient live {target} --source camera:{said.source}"]
         _end(target, missing, [*_next(target, cameras), *live], made)
 

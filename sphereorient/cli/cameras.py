@@ -14,7 +14,7 @@ from sphereorient.errors import CameraError, ExperimentError, refusal
 from sphereorient.files.whole_file import check_ending, put_aside
 
 if TYPE_CHECKING:
-    from sphereorient.cameras import Camera
+    from sphereorient.cameras.io.opencv import FoundCamera
 
 MADE_BY = "X_cam = R X_lab + T, mm; made by"
 
@@ -96,47 +96,56 @@ def check_cameras_command(
 
 @app.command("convert-cameras")
 def convert_cameras(
-    sources: Annotated[
-        list[Path],
-        Argument(metavar="SOURCE...", help="A file a camera: OpenCV's .yml, .yaml, .xml, .json or OpenPTV's .ori"),
-    ],
+    sources: Annotated[list[Path], Argument(metavar="SOURCE...", help="Of OpenCV, ROS, anipose, COLMAP, or OpenPTV")],
     out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write.")],
     names: Annotated[str | None, Option(help="Names of the cameras, e.g. cam1,cam2; else those of the files.")] = None,
-    image_size: Annotated[str | None, Option(metavar="W,H", help="Size, px, for OpenCV files without it.")] = None,
-    par: Annotated[Path | None, Option(help="OpenPTV's ptv.par (sensor, indices, wall), needed for .ori.")] = None,
+    image_size: Annotated[str | None, Option(metavar="W,H", help="Size, px, for files without it.")] = None,
+    par: Annotated[Path | None, Option(help="OpenPTV's ptv.par or YAML (sensor, indices, wall), for .ori.")] = None,
 ) -> None:
-    """Convert cameras of OpenCV or OpenPTV to cameras.yaml. A .addpar beside its .ori is read too."""
+    """Convert cameras of other programs to cameras.yaml. A .addpar beside its .ori is read too."""
     check_ending(out, "--out", YAML)
     check_writable(out)
-    known = _names(sources, names)
     size = _size(image_size)
-    from sphereorient.cameras import save_cameras
+    from sphereorient.cameras import centre_lab_mm, save_cameras
 
-    cameras = {name: _load(source, size, par) for name, source in zip(known, sources, strict=True)}
-    save_cameras(out, cameras, f"{MADE_BY} {command_line()}")
-    typer.echo(f"Wrote {out}: {', '.join(cameras)}")
+    found = _found(sources, size, par)
+    cameras = dict(zip(_names([one.name for one in found], names), (one.camera for one in found), strict=True))
+    unplaced = [name for name, one in zip(cameras, found, strict=True) if not one.placed]
+    save_cameras(out, cameras, f"{MADE_BY} {command_line()}", unplaced=unplaced)
+    lines = [f"Wrote {out}: {', '.join(cameras)}"]
+    if unread := dict.fromkeys(key for one in found for key in one.unread):
+        lines.append(f"not read: {', '.join(unread)}")
+    if unplaced:
+        what = "the lab is the camera's frame" if len(found) == 1 else f"write them into {out}"
+        where = " (COLMAP has them in images.txt)" if any(source.suffix == ".txt" for source in sources) else ""
+        lines.append(f"no R and T in the files{where}: {', '.join(unplaced)}; {what}")
+    elif len(found) > 1:
+        apart = centre_lab_mm(found[0].camera) - centre_lab_mm(found[-1].camera)
+        lines.append(f"T taken as mm: the first and the last camera are {float(apart.norm()):.4g} mm apart")
+    echo_lines(lines)
 
 
-def _load(source: Path, image_size: tuple[int, int] | None, par: Path | None) -> "Camera":
-    from sphereorient.cameras.io.opencv import SUFFIXES, load_opencv
+def _found(sources: Sequence[Path], size: tuple[int, int] | None, par: Path | None) -> "list[FoundCamera]":
+    from sphereorient.cameras.io.opencv import FoundCamera, load_camera_files
     from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 
-    if source.suffix in SUFFIXES:
-        return load_opencv(source, image_size)
-    if source.suffix != ".ori":
-        expected, do = f"a file ending in {', '.join(SUFFIXES)} or .ori", "name a calibration file of OpenCV or OpenPTV"
-        raise CameraError(refusal(str(source), expected=expected, got=f"'{source.name}'", do=do))
+    if any(source.suffix != ".ori" for source in sources):
+        return load_camera_files(sources, size)
     if par is None:
         raise CameraError(refusal("--par", expected="OpenPTV's ptv.par", got="none", do="add --par parameters/ptv.par"))
-    addpar = source.with_suffix(".addpar")
-    return load_openptv(source, load_ptv_par(par), addpar if addpar.exists() else None)
+    common, found = load_ptv_par(par), []
+    for source in sources:
+        addpar = source.with_suffix(".addpar")
+        camera = load_openptv(source, common, addpar if addpar.exists() else None)
+        found.append(FoundCamera(name=source.name.partition(".")[0], camera=camera))
+    return found
 
 
-def _names(sources: list[Path], text: str | None) -> Sequence[str]:
-    names = [source.name.partition(".")[0] for source in sources] if text is None else names_in(text)
-    if len(names) != len(sources):
-        got, do = f"{len(names)} for {len(sources)} files", "name every camera once, in the order of the files"
-        raise CameraError(refusal("--names", expected="one name a file", got=got, do=do))
+def _names(usual: Sequence[str], text: str | None) -> Sequence[str]:
+    names = usual if text is None else names_in(text)
+    if len(names) != len(usual):
+        got, do = f"{len(names)} for {len(usual)} cameras", f"name all of {', '.join(usual)}, in this order"
+        raise CameraError(refusal("--names", expected="one name a camera", got=got, do=do))
     if len(set(names)) < len(names):
         got, do = ", ".join(names), "give each camera its own name, such as --names cam1,cam2"
         raise CameraError(refusal("--names", expected="different names", got=got, do=do))

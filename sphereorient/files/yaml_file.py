@@ -119,13 +119,13 @@ def yaml_words(fault: Exception) -> str:
     return f"'{problem}'" + (f" in line {mark.line + 1}" if mark else "")
 
 
-def parse_yaml(text: str) -> Any:
+def parse_yaml(text: str, most_nodes: int = MAX_NODES) -> Any:
     """Parse one bounded YAML document of plain values; aliases are allowed, tags and repeated keys are not.
     Raises yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above;
     ValueError: an impossible value, such as a date that does not exist; OverflowError: a number to the base 60 that is
     too large.
     """
-    return _BoundedLoader(text).get_single_data()
+    return _BoundedLoader(text, most_nodes).get_single_data()
 
 
 def with_value(text: str, place: Sequence[str | int], value: Any) -> str | None:
@@ -187,8 +187,9 @@ def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
 class _BoundedLoader(yaml.SafeLoader):
     """PyYAML's safe loader with bounds, checked before any value is built; an alias counts with its size."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, most_nodes: int = MAX_NODES) -> None:
         super().__init__(text)
+        self._most = most_nodes
         self._depth = 0
         self._nodes = 0
         self._size: dict[yaml.Node, int] = {}  # nodes of each finished node, itself included
@@ -204,7 +205,7 @@ class _BoundedLoader(yaml.SafeLoader):
             self._nodes += self._size.get(node, 0) if node is not None else 0
         elif node is not None:
             self._size[node] = self._nodes - before
-        self._check(self._nodes <= MAX_NODES, f"more than {MAX_NODES} values", event)
+        self._check(self._nodes <= self._most, f"more than {self._most} values", event)
         self._depth -= 1
         return node
 

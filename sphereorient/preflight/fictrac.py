@@ -1,15 +1,19 @@
 """config.txt of FicTrac, whose users film an animal on a ball."""
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.cameras.model import focal_of_field
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment.experiment import refused
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
@@ -18,10 +22,19 @@ from sphereorient.sphere.view import fitted_circle
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 DO = "name the config.txt with which FicTrac ran"
 # Keys that change the picture: values that are taken over, what is expected, and what to do.
-NOT_READ = {
-    "fisheye": (("n", "y", ""), "y or n", "correct it"),
+CHOICES = {
+    "fisheye": (("n", "y", "0", "1", ""), "y or n", "correct it"),
     "thr_rgb_tfrm": (("grey", "gray", ""), "grey, all colours", "write a movie of this colour alone, in grey"),
 }
+USED = {"src_fn", "src_fps", "vfov", "roi_circ", "roi_ignr", "c2a_r", *CHOICES}
+# Corners of a square along two axes of the animal, in FicTrac's order, by the end of c2a_src. Source: its geometry.h.
+SQUARES = {
+    "xy": ((0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0), (-0.5, -0.5, 0)),
+    "yz": ((0, -0.5, -0.5), (0, 0.5, -0.5), (0, 0.5, 0.5), (0, -0.5, 0.5)),
+    "xz": ((0.5, 0, -0.5), (-0.5, 0, -0.5), (-0.5, 0, 0.5), (0.5, 0, 0.5)),
+}
+SURE = 4.5  # half of 3^2: a square's tilt is sure at three sigmas of corners that are right to a pixel
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,53 +47,101 @@ class FicTracConfig:
     fisheye: bool  # equidistant: vfov_deg / height is the angle of every pixel
     ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
     circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
-    R_animal_cam: Tensor  # (3, 3): x ahead, y to the right, z down, of the animal
+    turn: Array  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
+    plane: str | None  # of the square: xy, yz or xz of the animal; None: `turn` is a rotation
+    unread: tuple[str, ...]  # keys of the file that change nothing here
+
+    def R_animal_cam(self, image_size: tuple[int, int]) -> Tensor:
+        """Return the rotation (3, 3) to the animal's axes: x ahead, y to the right, z down; ExperimentError where the
+        corners do not show it.
+        """
+        if self.plane is None:
+            return so3.exp(torch.from_numpy(self.turn))
+        width, height = image_size
+        aside = self.turn - (width / 2, height / 2)  # FicTrac's middle of the picture
+        away = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+        focal = height / math.radians(self.vfov_deg) if self.fisheye else focal_of_field(height, self.vfov_deg)
+        angle = away / focal if self.fisheye else np.arctan(away / focal)
+        seen = np.hstack([aside / away * np.sin(angle), np.cos(angle)])
+        return _R_of_square(np.array(SQUARES[self.plane]), seen, 1 / focal)
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
     """Read config.txt; ExperimentError for another file, one that lacks movie, field of view or the animal's frame, or
-    one of a lens or a colour that is not taken over.
+    one of a colour that is not taken over.
     """
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
-    pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith("#"))
+    pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith(("#", "%")))
     values = {key.strip(): value.strip() for key, _, value in pairs}
     needed = {"src_fn": "the movie", "vfov": "the camera's field of view, degrees"}
     for name, what in needed.items():
         if not values.get(name):
             raise refused(f"{path}, {name}", what, "none", DO)
+    for name, (usual, what, do) in CHOICES.items():
+        if values.get(name, "").lower() not in usual:
+            raise refused(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
     vfov = _numbers(values["vfov"])
-    fisheye = values.get("fisheye", "").lower() == "y"
+    fisheye = values.get("fisheye", "").lower() in ("y", "1")
     widest = 360 if fisheye else 180
     if len(vfov) != 1 or not 0 < vfov[0] < widest:
         raise refused(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
-    for name, (usual, what, do) in NOT_READ.items():
-        if values.get(name, usual[0]).lower() not in usual:
-            raise refused(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
-    if not values.get("c2a_r"):
-        do = "run FicTrac's configGui, or write c2a_r : { 0, 0, 0 } for the camera's own frame"
-        raise refused(f"{path}, c2a_r", "the turn to the animal, rad", "none", do)
-    rate, turn = _numbers(values.get("src_fps", "")), _numbers(values["c2a_r"])
-    if len(turn) != 3:
-        raise refused(f"{path}, c2a_r", "three numbers, rad", f"{len(turn)}", "correct it")
-    limb = np.array(_numbers(values.get("roi_circ", "")))
+    used, turn, plane = USED, np.array(_numbers(values.get("c2a_r", ""))), None
+    if len(turn) != 3:  # FicTrac then takes the corners
+        corners = values.get("c2a_src", "")
+        turn, plane = np.array(_numbers(values.get(corners, ""))), corners[-2:]
+        if len(turn) != 8 or plane not in SQUARES:
+            got, do = f"'{values.get('c2a_r', '')[:40]}'", "run FicTrac's configGui; { 0, 0, 0 } is the camera's frame"
+            raise refused(f"{path}, c2a_r", "three numbers, rad, or four corners by c2a_src", got, do)
+        turn, used = turn.reshape(4, 2), USED | {"c2a_src", corners}
+    rate, limb = _numbers(values.get("src_fps", "")), _points(values.get("roi_circ", ""))
     return FicTracConfig(
         source=int(values["src_fn"]) if values["src_fn"].isdecimal() else path.parent / values["src_fn"],
         rate_hz=rate[0] if len(rate) == 1 and rate[0] > 0 else None,
         vfov_deg=vfov[0],
         fisheye=fisheye,
-        ignored=tuple(_polygons(path, values.get("roi_ignr", ""))),
-        circle_px=fitted_circle(limb.reshape(-1, 2)) if len(limb) >= 6 and len(limb) % 2 == 0 else None,
-        R_animal_cam=so3.exp(torch.tensor(turn, dtype=torch.float64)),
+        ignored=tuple(np.rint(one).astype(np.int32) for one in _polygons(values.get("roi_ignr", ""))),
+        circle_px=fitted_circle(limb) if len(limb) >= 3 else None,
+        turn=turn,
+        plane=plane,
+        unread=tuple(key for key in values if key not in used),
     )
+
+
+def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
+    """Return the rotation (3, 3) from camera to animal where the corners (4, 3) of a square are seen along unit vectors
+    (4, 3). Source: FicTrac's SquareRT: the least sum of squared differences between unit vectors. ExperimentError where
+    corners that are off by a pixel could be those of the square's mirror image, tilted the other way.
+    """
+
+    def off(pose: Array) -> Array:
+        there = square @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
+        return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True) - seen).ravel()
+
+    slopes, do = seen[:, :2] / np.maximum(seen[:, 2:], 0.05), "mark another square in FicTrac's configGui, or add c2a_r"
+    try:
+        _, turns, places, _ = cv2.solvePnPGeneric(square, slopes, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        starts = (np.concatenate(pose).ravel() for pose in zip(turns, places, strict=True))
+        best, other = sorted((least_squares(off, start) for start in starts), key=lambda fit: float(fit.cost))
+    except (cv2.error, ValueError):
+        raise refused("config.txt, c2a_src", "the corners of a square", "others", do) from None
+    R, mirrored = so3.exp(torch.from_numpy(np.stack([best.x[:3], other.x[:3]]))).mT.unbind()
+    apart_deg = math.degrees(float(so3.log(R.mT @ mirrored).norm()))
+    if apart_deg > 1 and other.cost - best.cost < SURE * pixel_rad**2:
+        got = f"corners that fit two rotations {apart_deg:.0f} degrees apart"
+        raise refused("config.txt, c2a_src", "a square whose perspective shows", got, do)
+    return R
 
 
 def _numbers(text: str) -> list[float]:
     return [float(number) for number in re.findall(NUMBER, text)]
 
 
-def _polygons(path: Path, text: str) -> list[NDArray[np.int32]]:
-    """Return the innermost { ... } of a text as polygons (n, 2)."""
-    polygons = [np.array(_numbers(group)) for group in re.findall(r"\{([^{}]+)\}", text)]
-    if any(len(one) < 6 or len(one) % 2 for one in polygons):
-        raise refused(f"{path}, roi_ignr", "u, v of three points or more", "another count of numbers", "correct it")
-    return [np.rint(one).astype(np.int32).reshape(-1, 2) for one in polygons]
+def _points(text: str) -> Array:
+    """Return numbers as points (n, 2); an odd last one is left out, as FicTrac does."""
+    numbers = _numbers(text)
+    return np.array(numbers[: len(numbers) // 2 * 2]).reshape(-1, 2)
+
+
+def _polygons(text: str) -> list[Array]:
+    """Return the innermost { ... } of a text as polygons (n, 2); those of less than three points hide nothing."""
+    return [points for group in re.findall(r"\{([^{}]+)\}", text) if len(points := _points(group)) >= 3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -9,6 +11,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
 from sphereorient.cameras.fisheye import FisheyeCamera
+from sphereorient.cameras.io.opencv import load_camera_files
 from sphereorient.cameras.model import TelecentricCamera
 
 SIZE = (650, 480)
@@ -18,6 +21,12 @@ T_MM = (4.0, -3.0, 520.0)
 
 def f64(value: object) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
+
+
+def load_opencv(path: Path, image_size: tuple[int, int] | None = None) -> Camera:
+    """Read a file of one camera."""
+    (found,) = load_camera_files([path], image_size)
+    return found.camera
 
 
 def turned(rotvec: tuple[float, float, float] = ROTVEC) -> Tensor:

@@ -9,13 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import ROTVEC, T_MM, behind_port, f64, fisheye, pinhole, whole_picture
+from camera_examples import ROTVEC, T_MM, behind_port, f64, fisheye, load_opencv, pinhole, whole_picture
 from conftest import assert_close
 
 from sphereorient.cameras import load_cameras, sphere_disk_px
 from sphereorient.cameras.fisheye import FisheyeCamera
-from sphereorient.cameras.io.opencv import load_opencv, save_opencv
-from sphereorient.cameras.io.openptv import save_openptv
 from sphereorient.errors import CameraError
 
 K = np.array([[210.0, 0, 331], [0, 214, 228.5], [0, 0, 1]])
@@ -212,19 +210,6 @@ def test_a_model_that_is_not_known_is_refused_by_its_name(tmp_path):
     (tmp_path / "cam.yml").write_text(five)
     with pytest.raises(CameraError, match=r"distortion_coefficients: expected k1 to k4 .*, got 5 numbers"):
         load_opencv(tmp_path / "cam.yml")
-
-
-def test_opencvs_file_comes_back_to_the_last_bit(tmp_path):
-    save_opencv(tmp_path / "cam.yml", wide())
-    back = load_opencv(tmp_path / "cam.yml")
-    assert isinstance(back, FisheyeCamera)
-    for name in ("f_px", "centre_px", "k", "R_cam_lab", "T_cam_lab_mm"):
-        assert torch.equal(getattr(back, name), getattr(wide(), name)), name
-
-
-def test_openptv_has_no_such_lens(tmp_path):
-    with pytest.raises(CameraError, match="got FisheyeCamera"):
-        save_openptv(tmp_path / "cam.ori", tmp_path / "cam.addpar", wide())
 
 
 def test_both_float_types_and_every_shape(rng, dtype, batch):

@@ -1,4 +1,4 @@
-"""OpenCV's files: read as OpenCV wrote them, written as it reads them, and every fault in one line."""
+"""OpenCV's files: read as OpenCV wrote them, and every fault in one line."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import ROTVEC, SIZE, T_MM, brown, f64, turned
+from camera_examples import ROTVEC, SIZE, T_MM, load_opencv, turned
 from conftest import assert_close
 
-from sphereorient.cameras.io.opencv import load_opencv, save_opencv
-from sphereorient.errors import CameraError, OutputError
+from sphereorient.errors import CameraError
 
 K = np.array([[700.0, 0, 331], [0, 715, 228.5], [0, 0, 1]])
 D = np.array([-0.21, 0.12, 2e-3, -1.5e-3, -0.03])
@@ -29,21 +28,16 @@ def opencv_file(path: Path, **nodes: object) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".json"])
-def test_a_camera_comes_back_to_the_last_bit(tmp_path, suffix):
-    camera = brown(f_px=f64((2100.0, 2144.0)) / 3)
-    save_opencv(tmp_path / f"cam{suffix}", camera)
-    back = load_opencv(tmp_path / f"cam{suffix}")
-    assert back.image_size == camera.image_size
-    for name in ("f_px", "centre_px", "k", "p", "R_cam_lab", "T_cam_lab_mm"):
-        assert torch.equal(getattr(back, name), getattr(camera, name)), name
-
-
-def test_opencv_reads_what_is_written(tmp_path):
-    save_opencv(tmp_path / "cam.yml", brown())
-    storage = cv2.FileStorage(str(tmp_path / "cam.yml"), cv2.FILE_STORAGE_READ)
-    np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), K)
-    np.testing.assert_array_equal(storage.getNode("distortion_coefficients").mat()[:, 0], D)
-    assert storage.getNode("image_height").real() == 480
+def test_numbers_are_read_to_the_last_bit(tmp_path, suffix):
+    wider = K * np.array([[7 / 3], [7 / 3], [1]])
+    nodes = {"camera_matrix": wider, "R": turned().numpy(), "T": np.array(T_MM)[:, None] / 7}
+    camera = load_opencv(opencv_file(tmp_path / f"cam{suffix}", distortion_coefficients=D[:, None] / 3, **nodes))
+    assert camera.image_size == SIZE
+    assert camera.f_px.tolist() == [700 * (7 / 3), 715 * (7 / 3)]
+    assert camera.centre_px.tolist() == [331 * (7 / 3), 228.5 * (7 / 3)]
+    assert [*camera.k[:2].tolist(), *camera.p.tolist(), float(camera.k[2])] == (D / 3).tolist()
+    assert torch.equal(camera.R_cam_lab, turned())
+    assert camera.T_cam_lab_mm.tolist() == [each / 7 for each in T_MM]
 
 
 @pytest.mark.parametrize(
@@ -81,27 +75,30 @@ def test_a_size_that_the_file_does_not_say_is_given(tmp_path):
         load_opencv(opencv_file(tmp_path / "cam.yml"), image_size=(9, 9))
 
 
+def with_coefficient(place: int, count: int) -> np.ndarray:
+    return np.append(D, np.zeros(count - 5)) + 0.1 * np.eye(count)[place]
+
+
 FAULTS = {
-    "no matrix": (
-        {"camera_matrix": None},
-        "camera_matrix: expected an OpenCV matrix, got none; name a file with",
-    ),
-    "number for a matrix": ({"camera_matrix": 3.0}, "camera_matrix: expected an OpenCV matrix, got none"),
-    "matrix of another shape": ({"camera_matrix": K[:2]}, r"camera_matrix: expected 3 x 3 numbers, got \(2, 3\)"),
+    "no matrix": ({"camera_matrix": None}, "camera_matrix: expected 3 x 3 .*, got keys .'image_width', "),
+    "number for a matrix": ({"camera_matrix": 3.0}, "camera_matrix: expected 3 x 3 numbers, got 1 numbers"),
+    "text for a matrix": ({"camera_matrix": "abc"}, "camera_matrix: expected 3 x 3 numbers, got 'abc'"),
+    "matrix of another shape": ({"camera_matrix": K[:2]}, "camera_matrix: expected 3 x 3 numbers, got 6 numbers"),
     "shear": ({"camera_matrix": K + np.eye(3, k=1)}, "camera_matrix: expected fx and fy on the diagonal"),
-    "stereo of OpenCV's sample": ({"camera_matrix": None, "M1": K}, r"got a stereo pair \(M1, D1, \.\.\.\); split"),
-    "stereo": ({"camera_matrix": None, "K1": K}, r"got a stereo pair \(K1, D1, \.\.\.\); split"),
-    "no distortion": (
-        {"distortion_coefficients": None},
-        "distortion_coefficients: expected an OpenCV matrix, got none; write five zeros",
-    ),
+    "one of a stereo pair": ({"camera_matrix": None, "M1": K}, "camera_matrix: expected 3 x 3 numbers for each"),
+    "no distortion": ({"distortion_coefficients": None}, "distortion_coefficients: .* add distortion_coefficients"),
     "three": ({"distortion_coefficients": D[:3]}, "expected 4, 5, 8, 12 or 14 numbers, got 3"),
-    "rational": ({"distortion_coefficients": np.append(D, [0, 0.1, 0])}, "expected k1, k2, p1, p2, k3 and nothing"),
-    "not a number": ({"T": np.array([0.0, np.nan, 0.0])}, "T_cam_lab_mm: expected finite numbers"),
-    "short T": ({"T": np.zeros(2)}, "T: expected 3 numbers"),
-    "odd R": ({"R": np.zeros((2, 2))}, "R: expected a matrix of 3 x 3 or a vector of 3"),
-    "no rotation": ({"R": 2 * np.eye(3)}, "R_cam_lab: expected a rotation"),
+    "rational": ({"distortion_coefficients": with_coefficient(6, 8)}, "got OpenCV's rational model"),
+    "thin prism": ({"distortion_coefficients": with_coefficient(9, 12)}, "got OpenCV's thin prism model"),
+    "tilted": ({"distortion_coefficients": with_coefficient(12, 14)}, "got OpenCV's tilted model"),
+    "not a number": ({"R": np.eye(3), "T": np.array([0.0, np.nan, 0.0])}, "T: expected 3 numbers, got .*Nan"),
+    "short T": ({"R": np.eye(3), "T": np.zeros(2)}, "T: expected 3 numbers"),
+    "odd R": ({"R": np.zeros((2, 2)), "T": np.zeros(3)}, "R: expected a matrix of 3 x 3 or a vector of 3"),
+    "no rotation": ({"R": 2 * np.eye(3), "T": np.zeros(3)}, "R_cam_lab: expected a rotation"),
+    "R without T": ({"R": np.eye(3)}, "R, T: expected both or none"),
+    "T without R": ({"tvec": np.zeros(3)}, "R, T: expected both or none"),
     "fold": ({"distortion_coefficients": np.array([-1.5, 0, 0, 0, 0])}, "k, p: expected a distortion that can be"),
+    "flag": ({"fisheye_model": "maybe"}, "fisheye_model: expected 0 or 1"),
 }
 
 
@@ -120,13 +117,5 @@ def test_files_that_are_not_opencvs_are_refused(tmp_path):
     with pytest.raises(CameraError, match="got a folder"):
         load_opencv(tmp_path)
     (tmp_path / "cam.yml").write_text("a: [1, 2\n}")
-    with pytest.raises(CameraError, match="expected a file of OpenCV's FileStorage, got another"):
+    with pytest.raises(CameraError, match=r"can be parsed, got .* in line 2"):
         load_opencv(tmp_path / "cam.yml")
-
-
-def test_a_place_that_cannot_be_written_is_refused(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="Not a directory"):
-        save_opencv(tmp_path / "file" / "cam.yml", brown())
-    with pytest.raises(OutputError, match=r"expected \.yml .*, got '\.txt'"):
-        save_opencv(tmp_path / "cam.txt", brown())

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from camera_examples import load_opencv
 from typer.testing import CliRunner
 
 from sphereorient.cameras import PortCamera, load_cameras
 from sphereorient.cameras.fisheye import FisheyeCamera
-from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 from sphereorient.cli import app
 from sphereorient.errors import CameraError, OutputError
@@ -25,6 +25,8 @@ def folder(tmp_path):
         storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
         storage.write("camera_matrix", np.array([[f, 0, 331], [0, 715, 228.5], [0, 0, 1]]))
         storage.write("distortion_coefficients", np.array([-0.2, 0.1, 2e-3, -1e-3, 0.0]))
+        storage.write("rvec", np.array([0.0, f / 1000, 0.0]))
+        storage.write("tvec", np.array([f, 0.0, 0.0]))
         storage.release()
     (tmp_path / "cam1.tif.ori").write_text(ORI)
     (tmp_path / "cam1.tif.addpar").write_text("-0.00001 0 0 0 0 1 0.002\n")
@@ -77,10 +79,16 @@ def test_an_openptv_camera_keeps_its_wall_and_its_distortion(folder):
         (("left.yml",), "image_width, image_height: expected two whole numbers, got none"),
         (("left.yml", "--image-size", "wide"), "--image-size: expected width and height in pixels, got 'wide'"),
         (("cam1.tif.ori",), "--par: expected OpenPTV's ptv.par, got none"),
-        (("ptv.par",), r"ptv\.par: expected a file ending in \.yml, .* or \.ori"),
+        (("ptv.par",), r"ptv\.par: expected a file ending in \.yml, .* all in \.ori"),
         (("none.yml",), "none.yml: expected .*, got no such file"),
-        (("left.yml", "right.xml", "--names", "cam1"), "--names: expected one name a file, got 1 for 2 files"),
-        (("left.yml", "right.xml", "--names", "a,a"), "--names: expected different names, got a, a"),
+        (
+            ("left.yml", "right.xml", "--image-size", "650,480", "--names", "cam1"),
+            "--names: expected one name a camera, got 1 for 2 cameras; name all of left, right",
+        ),
+        (
+            ("left.yml", "right.xml", "--image-size", "650,480", "--names", "a,a"),
+            "--names: expected different names, got a, a",
+        ),
     ],
 )
 def test_refusals_are_one_line(folder, monkeypatch, arguments, message):
@@ -97,3 +105,25 @@ def test_a_source_is_not_overwritten(folder):
     source = (folder / "left.yml").rename(folder / "left.yaml")
     refused = convert(source, "--out", source)
     assert isinstance(refused.exception, OutputError)
+
+
+def test_cameras_of_unknown_place_are_written_without_one_and_unread_keys_are_named(tmp_path):
+    text = "K: [[700, 0, 331], [0, 715, 228.5], [0, 0, 1]]\nD: [0, 0, 0, 0, 0]\nimage_size: [650, 480]\n"
+    (tmp_path / "a.yaml").write_text(text + "rms: 0.2\n")
+    (tmp_path / "b.yaml").write_text(text + "rms: 0.3\nflags: 10\n")
+    out = tmp_path / "cameras.yaml"
+    said = convert(tmp_path / "a.yaml", tmp_path / "b.yaml", "--out", out).output
+    assert "not read: rms, flags\n" in said
+    assert "no R and T in the files: a, b; write them into" in said
+    with pytest.raises(CameraError, match="a, R and T: expected the camera's pose in the lab, got none"):
+        load_cameras(out)
+    said = convert(tmp_path / "a.yaml", "--out", out, "--force").output
+    assert "no R and T in the files: a; the lab is the camera's frame" in said
+    assert torch.equal(load_cameras(out)["a"].R_cam_lab, torch.eye(3, dtype=torch.float64))
+
+
+def test_the_distance_of_two_cameras_shows_the_unit(folder):
+    sizes = ("--image-size", "650,480")
+    said = convert(folder / "left.yml", folder / "right.xml", "--out", folder / "cameras.yaml", *sizes).output
+    centres = [-cv2.Rodrigues(np.array([0, f / 1000, 0]))[0].T @ (f, 0, 0) for f in (700.0, 710.0)]
+    assert f"T taken as mm: the first and the last camera are {np.linalg.norm(centres[1] - centres[0]):.4g} mm" in said

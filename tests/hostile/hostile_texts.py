@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 import yaml
+from camera_examples import load_opencv
 from hostile_judge import Case, Load, Tally
 from hostile_kinds import bombs, garbage, no_files, no_text, spoilt_bytes, spoilt_document
 from hypothesis import HealthCheck, Phase, given, settings
@@ -22,7 +23,6 @@ from pydantic import BaseModel
 
 from sphereorient.calibration.document import load_calibration, read_points
 from sphereorient.cameras import load_cameras, load_covariance
-from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import load_settings, read_model

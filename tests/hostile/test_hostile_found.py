@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from camera_examples import load_opencv
 from hostile_files import bomb_png, encoded, pattern, png, tiff
 from hostile_kinds import BOMBS
 from hostile_texts import OPENCV, ORI, PAR, PINHOLE, calibration_documents, camera, cameras_documents, points_family
 
 from sphereorient.calibration.document import load_calibration, read_points
 from sphereorient.cameras import Camera, load_cameras
-from sphereorient.cameras.io.opencv import load_opencv
 from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, TextureError
 from sphereorient.experiment.recording import load_background
@@ -210,8 +210,8 @@ def test_a_table_as_large_as_a_movie_is_refused_unread(tmp_path):
 @pytest.mark.parametrize(
     ("suffix", "nested"), [("yml", "a: " + "[" * 100_000), ("yml", "a: " + "- " * 100_000), ("xml", "<a>" * 100_000)]
 )
-def test_nesting_on_which_opencvs_parser_crashes_is_refused_before_it_sees_it(tmp_path, suffix, nested):
-    with pytest.raises(CameraError, match="thousands of lists"):
+def test_nesting_on_which_opencvs_parser_crashes_is_refused(tmp_path, suffix, nested):
+    with pytest.raises(CameraError, match="can be parsed"):
         load_opencv(written(tmp_path / f"cam.{suffix}", OPENCV[suffix] + nested))
 
 
@@ -224,9 +224,9 @@ def test_a_matrix_that_claims_much_is_not_made_room_for(tmp_path, claim):
 
 def test_an_opencv_file_without_keys_and_sizes_that_are_no_numbers_are_refused(tmp_path):
     for text, words in (
-        ("%YAML:1.0\n---\n- 1\n", "expected a file of OpenCV's FileStorage"),  # once a cv2.error
-        (OPENCV["yml"].replace("640", ".Inf"), "image_width, image_height"),  # once an OverflowError
-        (OPENCV["yml"].replace("640", ".Nan"), "image_width, image_height"),  # once a ValueError
+        ("%YAML:1.0\n---\n- 1\n", "expected keys and values"),  # once a cv2.error
+        (OPENCV["yml"].replace("640", ".Inf"), "two whole numbers"),  # once an OverflowError
+        (OPENCV["yml"].replace("640", ".Nan"), "two whole numbers"),  # once a ValueError
     ):
         with pytest.raises(CameraError, match=words):
             load_opencv(written(tmp_path / "cam.yml", text))

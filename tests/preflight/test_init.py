@@ -292,14 +292,14 @@ def test_a_camera_of_fictrac_wants_a_movie_of_the_set_up_and_is_the_source_of_li
         ("src_fn           :", "src_fn: expected the movie"),
         ("vfov             : 190", "vfov: expected degrees"),
         ("c2a_r            : { 1, 2 }", "c2a_r: expected three numbers"),
-        ("roi_ignr         : { { 1, 2, 3 } }", "roi_ignr: expected u, v"),
-        ("c2a_r            :", "c2a_r: expected the turn to the animal"),
+        ("c2a_r            :", "c2a_r: expected three numbers, rad, or four corners"),
+        ("c2a_src          : ext\nc2a_r : ", "c2a_r: expected three numbers, rad, or four corners"),
         ("fisheye          : 2", "fisheye: expected y or n"),
         ("thr_rgb_tfrm     : red", "thr_rgb_tfrm: expected grey"),
     ],
 )
 def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
-    key = line.partition(":")[0]
+    key = "c2a_r" if "c2a_r" in line else line.partition(":")[0]
     others = [each for each in CONFIG.splitlines() if not each.startswith(key)]
     (tmp_path / "config.txt").write_text("\n".join([*others, line]))
     with pytest.raises(ExperimentError, match=message):
@@ -309,6 +309,81 @@ def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
 def test_keys_of_fictrac_that_change_nothing_are_taken(tmp_path):
     (tmp_path / "config.txt").write_text(CONFIG + "fisheye          : n\nthr_rgb_tfrm     : grey\n")
     assert read_fictrac_config(tmp_path / "config.txt").vfov_deg == 45.0
+
+
+def test_fictracs_own_rotation_comes_from_its_corners(tmp_path):
+    """The sample's config holds both: corners in a picture of 384 x 288 px, and what configGui made of them."""
+    text = CONFIG.replace("c2a_r            : { 0.72, -0.13, -0.46 }", "c2a_src : c2a_cnrs_xy")
+    text += "c2a_cnrs_xy      : { 191, 171, 128, 272, 20, 212, 99, 132 }\nc2a_t : { -0.67, 0.39, 2.89 }\n"
+    (tmp_path / "config.txt").write_text(text)
+    said = read_fictrac_config(tmp_path / "config.txt")
+    theirs = so3.exp(torch.tensor([0.722445, -0.131314, -0.460878], dtype=torch.float64))
+    assert math.degrees(float(so3.log(theirs.mT @ said.R_animal_cam((384, 288))).norm())) < 0.001
+    assert said.unread == ("c2a_t",)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+@pytest.mark.parametrize(
+    ("plane", "corners"),  # FicTrac's geometry.h
+    [
+        ("xy", [(0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0), (-0.5, -0.5, 0)]),
+        ("yz", [(0, -0.5, -0.5), (0, 0.5, -0.5), (0, 0.5, 0.5), (0, -0.5, 0.5)]),
+        ("xz", [(0.5, 0, -0.5), (-0.5, 0, -0.5), (-0.5, 0, 0.5), (0.5, 0, 0.5)]),
+    ],
+)
+def test_corners_of_any_plane_and_lens_show_the_rotation(tmp_path, plane, corners, fisheye):
+    R = so3.exp(torch.tensor([0.6, -0.5, 0.4], dtype=torch.float64))  # animal to camera
+    x, y, z = (np.array(corners) @ R.numpy().T + (0.2, -0.1, 1.5)).T
+    away = np.hypot(x, y)
+    radius = 288 / math.radians(60) * np.arctan2(away, z) if fisheye else 144 / math.tan(math.radians(30)) * away / z
+    uv = np.column_stack([x, y]) / away[:, None] * radius[:, None] + (192, 144)  # FicTrac's middle of 384 x 288 px
+    lines = CONFIG.replace("c2a_r  ", "old  ").replace(": 45", ": 60")
+    lines += f"c2a_src : c2a_cnrs_{plane}\nc2a_cnrs_{plane} : {{ {', '.join(map(str, uv.ravel()))} }}\n"
+    (tmp_path / "config.txt").write_text(lines + f"fisheye : {'1' if fisheye else '0'}\n")
+    found = read_fictrac_config(tmp_path / "config.txt").R_animal_cam((384, 288))
+    torch.testing.assert_close(found, R.mT, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "corners", ["130, 60, 130, 100, 80, 100, 80, 60", "0, 0, 0, 0, 0, 0, 0, 0", "1, 1, 2, 2, 3, 3, 4, 4"]
+)
+def test_corners_that_do_not_show_a_rotation_are_refused(tmp_path, corners):
+    text = CONFIG.replace("c2a_r  ", "old  ") + f"c2a_src : c2a_cnrs_xy\nc2a_cnrs_xy : {{ {corners} }}\n"
+    (tmp_path / "config.txt").write_text(text)
+    with pytest.raises(ExperimentError, match=r"c2a_src: .* add c2a_r"):
+        read_fictrac_config(tmp_path / "config.txt").R_animal_cam((200, 160))
+
+
+@pytest.mark.parametrize(
+    ("text", "points"),
+    [
+        ("{  }", []),
+        ("", []),
+        ("{ {  }, { 1, 2, 3, 4 } }", []),
+        ("{ { 1, 2, 3, 4, 5, 6, 7 } }", [[[1, 2], [3, 4], [5, 6]]]),
+    ],
+)
+def test_polygons_are_those_that_fictrac_fills(tmp_path, text, points):
+    lines = [line for line in CONFIG.splitlines() if not line.startswith("roi_ignr")]
+    (tmp_path / "config.txt").write_text("\n".join([*lines, f"roi_ignr : {text}"]))
+    assert [one.tolist() for one in read_fictrac_config(tmp_path / "config.txt").ignored] == points
+
+
+def test_every_key_of_fictrac_is_used_or_named(clean, tmp_path):
+    """Those of its doc/params.md."""
+    two_movies(clean, tmp_path)
+    used = {"src_fn", "vfov", "fisheye", "src_fps", "c2a_r", "roi_circ", "roi_ignr"}
+    others = (
+        "do_display save_debug save_raw sock_host sock_port com_port com_baud q_factor max_bad_frames opt_do_global"
+    )
+    others += " opt_max_err thr_ratio thr_win_pc vid_codec sphere_map_fn opt_max_evals opt_bound opt_tol c2a_cnrs_xy"
+    others += " c2a_cnrs_yz c2a_cnrs_xz c2a_src c2a_t roi_c roi_r"
+    text = CONFIG + "fisheye : n\n% vfov : 90\n" + "".join(f"{key} : 1\n" for key in others.split())
+    (tmp_path / "config.txt").write_text(text)
+    said = init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
+    (line,) = [line for line in said.splitlines() if "not read: " in line]
+    assert line.partition("not read: ")[2].split(", ") == others.split()
+    assert not used & set(others.split())
 
 
 def test_fictracs_fisheye_has_one_angle_for_every_pixel(clean, tmp_path):

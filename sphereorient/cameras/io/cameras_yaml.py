@@ -1,4 +1,4 @@
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -127,13 +127,19 @@ def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> Paramete
 
 
 def save_cameras(
-    path: Path | str, cameras: Mapping[str, Camera], comment: str = "", covariance: ParameterCovariance | None = None
+    path: Path | str,
+    cameras: Mapping[str, Camera],
+    comment: str = "",
+    covariance: ParameterCovariance | None = None,
+    unplaced: Collection[str] = (),
 ) -> None:
     """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
-    `comment` stands at its top; `covariance` is that of a joint fit.
+    `comment` stands at its top; `covariance` is that of a joint fit; cameras named in `unplaced` get no R and T.
     Raises CameraError (a model that is not in MODELS), OutputError (a file that cannot be written).
     """
     document: dict[str, Any] = {"cameras": {name: _described(camera) for name, camera in cameras.items()}}
+    for name in unplaced:
+        del document["cameras"][name]["R"], document["cameras"][name]["T"]
     write_document(Path(path), SCHEMA, document | _covariance_keys(covariance), comment)
 
 

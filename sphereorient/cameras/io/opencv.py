@@ -1,7 +1,12 @@
-import math
+"""Camera files with OpenCV's lens: those of OpenCV, ROS, anipose and COLMAP, and of scripts with OpenCV's names."""
+
 import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -9,180 +14,258 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras.brown import BrownCamera
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.errors import CameraError
-from sphereorient.files.whole_file import TEXT_BYTES, check_ending, put_aside, read_whole
-from sphereorient.files.yaml_file import short
+from sphereorient.files.whole_file import TEXT_BYTES, read_whole
+from sphereorient.files.yaml_file import FAULTS, parse_yaml, short, yaml_words
 
-SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # OpenCV chooses the format by them
-MOST = 64  # numbers of a matrix: OpenCV allocates what the file claims before it counts
-# OpenCV's parser recurses at each level and can crash. Each level needs one of these; usual files have dozens.
-OPENER = re.compile(rb"[\[{]|-\s|<[^/?!]")
-MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels by indentation
-LENGTHS = (4, 5, 8, 12, 14)  # of distortion_coefficients, in OpenCV's order k1 k2 p1 p2 k3 ...
-ROS_MODELS = {"": False, "plumb_bob": False, "rational_polynomial": False, "equidistant": True}  # fisheye or not
+SUFFIXES = (".yml", ".yaml", ".xml", ".json", ".toml", ".txt")
+MOST_NODES = 200_000  # OpenCV's sample adds the corners of all pictures
+# Names of lens models; True: the coefficients are k1 to k4 of cv2.fisheye.
+FISHEYE = {"": False, "plumb_bob": False, "radtan": False, "rational_polynomial": False}
+FISHEYE |= {"fisheye": True, "equidistant": True}
+# What keys mean, without case and underscores.
+KEYS = {
+    "camera_matrix": "cameramatrix intrinsicmatrix matrix mtx k m",
+    "distortion_coefficients": "distortioncoefficients distortions distortion distcoeffs distcoeff dist d",
+    "R": "r rvec rotation",
+    "T": "t tvec translation",
+    "image_size": "imagesize size",
+    "image_width": "imagewidth width",
+    "image_height": "imageheight height",
+    "distortion_model": "distortionmodel",
+    "fisheye_model": "fisheyemodel fisheye",
+    "name": "name cameraname",
+}
+MEANING = {name: meaning for meaning, names in KEYS.items() for name in names.split()}
+SIDE = re.compile(r"(.+?)(?:(1|left|l)|(2|right|r))")  # keys of a stereo pair, likewise
+RECTIFIED = {"p", "projectionmatrix"}  # beside one of them ROS' R turns the rectified picture, and is no pose
+# COLMAP's models and their numbers of parameters. Source: its sensor/models.h.
+COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
+COLMAP |= {"SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8}
 
 Array = NDArray[np.float64]
+Tree = dict[str, Any]  # a file, or a part of it
+Said = dict[str, tuple[str, Any]]  # key and value in a file, by what the key means
+Part = tuple[str, Said, list[str]]  # a camera's name, what the file says of it, and the keys that are not used
 
 
-def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera | FisheyeCamera:
-    """Read a camera that OpenCV's calibration has written; the first pixel's centre is (0, 0).
-    The file has `camera_matrix`, `distortion_coefficients`, optional `R` or `rvec`, `T` or `tvec` (mm; without them the
-    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px). Raises
-    CameraError (no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3).
-    With `fisheye_model: 1`, or ROS' `distortion_model: equidistant`, the coefficients are k1 to k4 of cv2.fisheye.
+@dataclass(frozen=True, kw_only=True)
+class FoundCamera:
+    """A camera in a file of another program."""
+
+    name: str  # that of the file where it has no other camera
+    camera: Camera
+    placed: bool = True  # False: the file has no R and T, and the camera's frame is the lab
+    unread: tuple[str, ...] = ()  # keys of the file that were not used
+
+
+def load_camera_files(paths: Sequence[Path | str], image_size: tuple[int, int] | None = None) -> list[FoundCamera]:
+    """Read cameras whose lens is OpenCV's; the first pixel's centre is (0, 0), T is taken as mm.
+    A file is OpenCV's YAML, XML or JSON, ROS' camera_info, anipose's TOML, COLMAP's cameras.txt, or any YAML, JSON or
+    TOML with keys of `KEYS`: of one camera, of several by name, or of a stereo pair (M1, D1, M2, D2, R, T). A file of R
+    and T alone belongs to the one before. `image_size` (W, H), px, is for files without it.
+    Raises CameraError: another file, a missing or impossible key, shear, a lens other than k1, k2, p1, p2, k3 or
+    cv2.fisheye's k1 to k4.
     """
-    storage = _opened(Path(path))
+    trees: list[tuple[Path, Tree]] = []
+    for path in map(Path, paths):
+        tree = _tree(path)
+        if trees and not _parts(path, tree) and {"R", "T"} <= set(_said(tree)):
+            trees[-1][1].update(tree)  # extrinsics.yml of OpenCV's stereo sample
+        else:
+            trees.append((path, tree))
+    found = []
+    for path, tree in trees:
+        parts = _parts(path, tree)
+        if not parts:
+            do = "name the matrix camera_matrix in the file"
+            raise camera_error(f"{path}, camera_matrix", "3 x 3 numbers for each camera", f"keys {short([*tree])}", do)
+        for name, said, unread in parts:
+            with named(str(path) if len(parts) == 1 else f"{path}, {name}"):
+                camera = _camera(said, image_size)
+            found.append(FoundCamera(name=name, camera=camera, placed="T" in said, unread=tuple(unread)))
+    return found
+
+
+def _tree(path: Path) -> Tree:
+    """Parse a file into mappings, lists, numbers and texts; numbers may be texts still."""
+    content = read_whole(path, TEXT_BYTES, "a camera file", CameraError, "correct the path")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        expected = f"a file ending in {', '.join(SUFFIXES)}, or all in .ori"
+        do = "name camera files of OpenCV, ROS, anipose, COLMAP (cameras.txt) or OpenPTV"
+        raise camera_error(str(path), expected, f"'{path.name}'", do)
+    text = content.decode("utf-8-sig", errors="replace")
     try:
-        K, fisheye = _camera_matrix(storage), _is_fisheye(storage)
-        coefficients = torch.from_numpy(_coefficients(storage, 4 if fisheye else 5))
-        lens: dict[str, Any] = {"centre_px": torch.from_numpy(K[:2, 2]), "f_px": torch.from_numpy(K[[0, 1], [0, 1]])}
-        lens |= {"image_size": _size(storage, image_size)} | _pose(storage)
-        if fisheye:
-            return FisheyeCamera(k=coefficients, **lens)
-        return BrownCamera(k=coefficients[[0, 1, 4]], p=coefficients[[2, 3]], **lens)
-    except CameraError as error:
-        raise CameraError(f"{path}, {error}") from None
-    finally:
-        storage.release()
+        if suffix == ".txt":
+            return _colmap(path, text)
+        if suffix == ".toml":
+            return tomllib.loads(text)
+        if suffix == ".xml":
+            tree = _xml(ElementTree.fromstring(text))
+        else:  # JSON is YAML but for tabs; OpenCV's first line and its tags are not
+            text = re.sub(r"\A%YAML.*|!!opencv-[a-z-]+", "", text.replace("\t", " "))
+            tree = parse_yaml(text, MOST_NODES)
+    except (*FAULTS, ElementTree.ParseError, RecursionError) as fault:
+        raise camera_error(str(path), "a file that can be parsed", yaml_words(fault), "correct it there") from None
+    if not isinstance(tree, dict):
+        raise camera_error(str(path), "keys and values", short(tree), "name a camera file")
+    return tree
 
 
-def save_opencv(path: Path | str, camera: BrownCamera | FisheyeCamera) -> None:
-    """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
-    Raises OutputError (an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written).
-    """
-    path = Path(path)
-    check_ending(path, "OpenCV file", SUFFIXES)
-    (fx, fy), (cx, cy) = camera.f_px.tolist(), camera.centre_px.tolist()
-    coefficients = camera.k if isinstance(camera, FisheyeCamera) else torch.cat([camera.k[:2], camera.p, camera.k[2:]])
-    with put_aside(path) as aside:
-        storage = cv2.FileStorage(str(aside), cv2.FILE_STORAGE_WRITE)
-        storage.write("image_width", camera.image_size[0])
-        storage.write("image_height", camera.image_size[1])
-        storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-        storage.write("fisheye_model", int(isinstance(camera, FisheyeCamera)))
-        storage.write("distortion_coefficients", coefficients.detach().numpy()[:, None])
-        storage.write("R", camera.R_cam_lab.detach().numpy())
-        storage.write("T", camera.T_cam_lab_mm.detach().numpy()[:, None])
-        storage.release()
+def _xml(element: ElementTree.Element) -> Any:
+    """Return an element of OpenCV's XML, where list entries are called _ and the numbers of a matrix are one text."""
+    if not len(element):
+        words = (element.text or "").split()
+        return words[0] if len(words) == 1 else words
+    if all(child.tag == "_" for child in element):
+        return [_xml(child) for child in element]
+    return {child.tag: _xml(child) for child in element}
 
 
-def _opened(path: Path) -> cv2.FileStorage:
-    expected = "a file of OpenCV's FileStorage"
-    content = read_whole(path, TEXT_BYTES, expected, CameraError, "correct the path")
-    if len(OPENER.findall(content)) > MOST_OPENERS or re.search(rb"[ \t]{%d}" % MOST_BLANKS, content):
-        got, do = "one with thousands of lists, tags or levels", "name the file of one camera"
-        raise camera_error(str(path), expected, got, do)
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError):  # SystemError: a fault of the parser inside the constructor
-        storage = None
-    if storage is None or not storage.isOpened() or not storage.root().isMap():
-        raise camera_error(str(path), expected, "another", "write it with cv2.FileStorage")
-    return storage
+def _colmap(path: Path, text: str) -> Tree:
+    """Return the cameras of COLMAP's cameras.txt, whose first pixel has its centre at (0.5, 0.5)."""
+    tree: Tree = {}
+    for line in text.splitlines():
+        name, model, *words = [*line.split(), "", ""]
+        if not name or name.startswith("#"):
+            continue
+        where = f"{path}, camera {name[:20]}"
+        if model not in COLMAP:
+            expected, do = f"one of {', '.join(COLMAP)}", "name COLMAP's cameras.txt with such a model"
+            raise camera_error(where, expected, short(model), do)
+        expected = f"width, height and {COLMAP[model]} parameters of {model}"
+        size, numbers = np.split(_numbers(where, words[:-2], expected, 2 + COLMAP[model]), [2])
+        single = model.startswith(("SIMPLE", "RADIAL"))
+        fx, fy, cx, cy, *coefficients = [*numbers[:1], *numbers] if single else numbers
+        tree[f"cam{name}"] = {
+            "camera_matrix": [[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]],
+            "distortion_coefficients": [*coefficients, *[0.0] * (4 - len(coefficients))],
+            "image_size": size,
+            "fisheye": model.endswith("FISHEYE"),
+        }
+    return tree
 
 
-def _node(storage: cv2.FileStorage, key: str) -> Array | None:
-    """Return a matrix of at most MOST numbers; None for anything else."""
-    node = storage.getNode(key)
-    if node.empty() or not node.isMap() or not _claims_few(node):
-        return None
-    try:
-        matrix = node.mat()
-    except cv2.error:
-        return None
-    return None if matrix is None or matrix.size > MOST else np.asarray(matrix, np.float64)
+def _parts(path: Path, tree: Tree) -> list[Part]:
+    """Return the cameras in a file; none where it has none."""
+    said = _said(tree)
+    if "camera_matrix" in said:
+        return [(path.name.partition(".")[0], said, _unread(tree, said))]
+    inside = {key: _said(part) for key, part in tree.items() if isinstance(part, dict)}
+    inside = {key: part for key, part in inside.items() if "camera_matrix" in part}
+    others = [key for key in tree if key not in inside]
+    parts = [(key, part, _unread(tree[key], part) + others) for key, part in inside.items()]
+    return [(str(part.get("name", ("", key))[1]), part, unread) for key, part, unread in parts] or _pair(tree, said)
 
 
-def _claims_few(node: cv2.FileNode) -> bool:
-    """Return whether a matrix claims at most MOST numbers, by rows and columns or by the sizes of its axes."""
-    axes = node.getNode("sizes")
-    if axes.empty():
-        sides = [_whole(node.getNode(side)) for side in ("rows", "cols")]
-    else:
-        sides = [_whole(axes.at(k)) for k in range(axes.size())] if axes.isSeq() and axes.size() < 4 else [_whole(axes)]
-    known = [side for side in sides if side is not None and 0 < side <= MOST]
-    return len(known) == len(sides) and math.prod(known) <= MOST
+def _pair(tree: Tree, said: Said) -> list[Part]:
+    """Return both cameras of a stereo pair, X_2 = R X_1 + T, the lab being the frame of the first."""
+    lenses: tuple[Said, Said] = {}, {}
+    for key, value in tree.items():
+        side = SIDE.fullmatch(_folded(key))
+        if side and (meaning := MEANING.get(side[1])) in ("camera_matrix", "distortion_coefficients"):
+            lenses[side[3] is not None][meaning] = key, value
+    if not all("camera_matrix" in lens for lens in lenses):
+        return []
+    unread = _unread(tree, said, *lenses)
+    first: Said = {"R": ("R", np.eye(3)), "T": ("T", np.zeros(3))} if "T" in said else {}
+    return [("cam1", said | lenses[0] | first, unread), ("cam2", said | lenses[1], unread)]
 
 
-def _whole(node: cv2.FileNode) -> int | None:
-    number = float(node.real()) if node.isInt() or node.isReal() else math.nan
-    return int(number) if number.is_integer() else None
+def _said(tree: Tree) -> Said:
+    said: Said = {}
+    for key, value in tree.items():
+        if meaning := MEANING.get(_folded(key)):
+            said.setdefault(meaning, (key, value))
+    if "T" not in said and RECTIFIED & set(map(_folded, tree)):
+        said.pop("R", None)
+    return said
 
 
-def _required(storage: cv2.FileStorage, key: str) -> Array:
-    matrix = _node(storage, key)
-    if matrix is not None:
-        return matrix
-    for first in ("K1", "M1"):
-        if key == "camera_matrix" and _node(storage, first) is not None:
-            expected, got = "the matrix of one camera", f"a stereo pair ({first}, D1, ...)"
-            raise camera_error(key, expected, got, "split the stereo file into one file per camera")
-    do = "write five zeros where there is no distortion"
-    if key == "camera_matrix":
-        do = "name a file with camera_matrix as OpenCV writes it, or write f, centre and distortion into cameras.yaml"
-    raise camera_error(key, "an OpenCV matrix", "none", do)
+def _unread(tree: Tree, *said: Said) -> list[str]:
+    used = {key for one in said for key, _ in one.values()}
+    return [str(key) for key in tree if key not in used]
 
 
-def _camera_matrix(storage: cv2.FileStorage) -> Array:
-    K = _required(storage, "camera_matrix")
-    if K.shape != (3, 3):
-        raise camera_error("camera_matrix", "3 x 3 numbers", str(K.shape), "correct the file")
+def _folded(key: object) -> str:
+    return str(key).lower().replace("_", "")
+
+
+def _camera(said: Said, image_size: tuple[int, int] | None) -> Camera:
+    key, K = said["camera_matrix"][0], _numbers(*said["camera_matrix"], "3 x 3 numbers", 9).reshape(3, 3)
     if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
         expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
-        raise camera_error("camera_matrix", expected, short(K.round(6).tolist()), "calibrate without shear")
-    return K
+        raise camera_error(key, expected, short(K.round(6).tolist()), "calibrate without shear")
+    fisheye = _is_fisheye(said)
+    coefficients = torch.from_numpy(_coefficients(said, fisheye))
+    lens: dict[str, Any] = {"centre_px": torch.from_numpy(K[:2, 2]), "f_px": torch.from_numpy(K[[0, 1], [0, 1]])}
+    lens |= {"image_size": _size(said, image_size)} | _pose(said)
+    if fisheye:
+        return FisheyeCamera(k=coefficients, **lens)
+    return BrownCamera(k=coefficients[[0, 1, 4]], p=coefficients[[2, 3]], **lens)
 
 
-def _is_fisheye(storage: cv2.FileStorage) -> bool:
+def _numbers(name: str, value: Any, expected: str, *counts: int) -> Array:
+    """Return numbers in lists, or in OpenCV's rows, cols and data, as one row; CameraError for other counts."""
+    try:
+        if isinstance(value, dict):
+            shape = value["sizes"] if "sizes" in value else (value["rows"], value["cols"])
+            flat = np.asarray(value["data"], np.float64).reshape([int(side) for side in shape]).reshape(-1)
+        else:
+            flat = np.asarray(value, np.float64).reshape(-1)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise camera_error(name, expected, short(value), "correct the file") from None
+    if len(flat) not in counts:
+        raise camera_error(name, expected, f"{len(flat)} numbers", "correct the file")
+    return flat
+
+
+def _is_fisheye(said: Said) -> bool:
     """Return whether the file names OpenCV's fisheye model; CameraError for a model that is not known."""
-    model = storage.getNode("distortion_model")
-    name = model.string() if model.isString() else "" if model.empty() else "another"
-    if name not in ROS_MODELS:
-        do = "calibrate with one of these"
-        raise camera_error("distortion_model", f"one of {', '.join(ROS_MODELS)}", short(name), do)
-    flag = _whole(storage.getNode("fisheye_model"))
-    return ROS_MODELS.get(name, False) or bool(flag)
+    key, model = said.get("distortion_model", ("", ""))
+    if str(model) not in FISHEYE:
+        raise camera_error(key, f"one of {', '.join(FISHEYE)}", short(model), "calibrate with one of these")
+    return FISHEYE[str(model)] or bool(_numbers(*said.get("fisheye_model", ("", 0)), "0 or 1", 1)[0])
 
 
-def _coefficients(storage: cv2.FileStorage, count: int) -> Array:
-    where = "distortion_coefficients"
-    flat = _required(storage, where).reshape(-1)
-    if count == 4 != len(flat):
-        raise camera_error(where, "k1 to k4 of the fisheye model", f"{len(flat)} numbers", "correct the file")
-    if len(flat) not in LENGTHS:
-        expected = f"{', '.join(map(str, LENGTHS[:-1]))} or {LENGTHS[-1]} numbers"
-        raise camera_error(where, expected, str(len(flat)), "correct the file")
+def _coefficients(said: Said, fisheye: bool) -> Array:
+    if "distortion_coefficients" not in said:
+        do = "add distortion_coefficients to the file: k1, k2, p1, p2, k3; zeros for a lens without distortion"
+        raise camera_error("distortion_coefficients", "the lens' coefficients", "none under a known name", do)
+    key, value = said["distortion_coefficients"]
+    if fisheye:
+        return _numbers(key, value, "k1 to k4 of the fisheye model", 4)
+    flat = _numbers(key, value, "4, 5, 8, 12 or 14 numbers", 4, 5, 8, 12, 14)
     if np.any(flat[5:] != 0):
-        do = "calibrate without CALIB_RATIONAL_MODEL, CALIB_THIN_PRISM_MODEL and CALIB_TILTED_MODEL"
-        raise camera_error(where, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
-    return np.pad(flat, (0, 1))[:count]
+        last = len(np.trim_zeros(flat, "b"))
+        model = "rational" if last <= 8 else "thin prism" if last <= 12 else "tilted"
+        raise camera_error(key, "k1, k2, p1, p2, k3 alone", f"OpenCV's {model} model", "calibrate without it")
+    return np.pad(flat, (0, 1))[:5]
 
 
-def _first(storage: cv2.FileStorage, keys: tuple[str, str], usual: Array) -> tuple[str, Array]:
-    """Return the first of two keys that the file has, and its matrix; without both the usual one."""
-    return next(((key, found) for key in keys if (found := _node(storage, key)) is not None), (keys[0], usual))
+def _pose(said: Said) -> dict[str, Any]:
+    if ("R" in said) != ("T" in said):
+        raise camera_error("R, T", "both or none", "one", "write both into the file, X_cam = R X_lab + T")
+    R = _numbers(*said.get("R", ("R", np.eye(3))), "a matrix of 3 x 3 or a vector of 3 numbers", 3, 9)
+    T = _numbers(*said.get("T", ("T", np.zeros(3))), "3 numbers", 3)
+    R = R.reshape(3, 3) if len(R) == 9 else np.asarray(cv2.Rodrigues(R)[0], np.float64)
+    return {"R_cam_lab": torch.from_numpy(R), "T_cam_lab_mm": torch.from_numpy(T)}
 
 
-def _pose(storage: cv2.FileStorage) -> dict[str, Any]:
-    key, R = _first(storage, ("R", "rvec"), np.eye(3))
-    if R.size != 3 and R.shape != (3, 3):
-        raise camera_error(key, "a matrix of 3 x 3 or a vector of 3 numbers", str(R.shape), "correct the file")
-    R = np.asarray(cv2.Rodrigues(R.reshape(3, 1))[0], np.float64) if R.size == 3 else R
-    key, T = _first(storage, ("T", "tvec"), np.zeros(3))
-    if T.size != 3:
-        raise camera_error(key, "3 numbers", str(T.shape), "correct the file")
-    return {"R_cam_lab": torch.from_numpy(R), "T_cam_lab_mm": torch.from_numpy(T.reshape(3))}
-
-
-def _size(storage: cv2.FileStorage, image_size: tuple[int, int] | None) -> tuple[int, int]:
-    where = "image_width, image_height"
-    width, height = (_whole(storage.getNode(key)) or 0 for key in ("image_width", "image_height"))
-    if width > 0 and height > 0:
-        if image_size not in (None, (width, height)):
-            raise camera_error(where, str(image_size), short((width, height)), "correct one")
-        return width, height
-    if image_size is None:
-        raise camera_error(where, "two whole numbers", "none", "give image_size (--image-size W,H)")
-    return image_size
+def _size(said: Said, image_size: tuple[int, int] | None) -> tuple[int, int]:
+    where, sides = said.get("image_size", ("image_width, image_height", None))
+    if "image_width" in said and "image_height" in said:
+        where, sides = "image_width, image_height", [said[f"image_{side}"][1] for side in ("width", "height")]
+    if sides is None:
+        if image_size is None:
+            raise camera_error(where, "two whole numbers", "none", "give image_size (--image-size W,H)")
+        return image_size
+    sides = _numbers(where, sides, "two whole numbers", 2).tolist()
+    width, height = (int(side) if side.is_integer() else side for side in sides)  # the camera refuses fractions
+    if image_size not in (None, (width, height)):
+        raise camera_error(where, str(image_size), short((width, height)), "correct one")
+    return width, height

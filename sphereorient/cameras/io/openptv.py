@@ -17,15 +17,17 @@ from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
-from sphereorient.cameras.port import Port, PortCamera, in_air
+from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError
-from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text
-from sphereorient.files.yaml_file import short
+from sphereorient.files.whole_file import TEXT_BYTES, read_text
+from sphereorient.files.yaml_file import read_yaml, short
 
 # How many numbers each file has, and which.
 ORI = 21, "centre, angles, matrix, xh yh cc, glass vector"
 ADDPAR = 7, "k1 k2 k3 p1 p2 scx she"
 PAR = 12, "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
+YAML_KEYS = ("imx", "imy", "pix_x", "pix_y", "chfield", "mmp_n1", "mmp_n2", "mmp_n3", "mmp_d")
+MOST_NAMES = 4  # cameras whose names older programs write, however many there are
 NO_ADDPAR = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]  # OpenPTV's defaults where there is no file
 AXES = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenPTV's camera components to ours
 
@@ -76,29 +78,26 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
         return PortCamera(camera=camera, port=_port(glass, par)) if par.refracts else camera
 
 
-def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
-    """Write an OpenPTVCamera, behind a port or not, as .ori and .addpar; `par_of` gives its part of ptv.par.
-    Raises CameraError (another model, or the lab's origin is not on the liquid side of the wall), OutputError (a file
-    that cannot be written).
-    """
-    inner, glass = _openptv_of(camera), _glass_vector(camera)
-    dm = inner.R_cam_lab.detach().mT @ AXES
-    shift_mm = (inner.centre_px.detach() - middle_of_picture(inner.image_size)) * inner.pixel_pitch_mm.detach()
-    xh_yh = shift_mm * _tensor((1.0, -1.0))
-    lines = [inner.centre_lab_mm.detach(), so3.to_tait_bryan(dm), *dm, xh_yh, inner.f_mm.detach()[None], glass]
-    write_text(Path(ori), "".join(_row(line) for line in lines))
-    parts = (inner.k, inner.p, inner.scx[None], inner.she[None])
-    write_text(Path(addpar), _row(torch.cat([part.detach() for part in parts])))
-
-
 def load_ptv_par(path: Path | str) -> PtvPar:
-    """Read the sensor and the media from ptv.par; CameraError if missing, malformed or interlaced."""
+    """Read the sensor and the media from ptv.par, also one with more names than cameras, as older programs write, or
+    from the key ptv of OpenPTV's YAML; CameraError if missing, malformed or interlaced.
+    """
     path = Path(path)
-    words = _words(path, "\n")
-    count = words[0].strip() if words else ""
-    if not (count.isascii() and count.isdigit() and len(count) < 4):
-        raise camera_error(str(path), "the number of cameras first", short(count[:20]), "name OpenPTV's ptv.par")
-    imx, imy, pix_x, pix_y, chfield, *media = _numbers(path, words[1 + 2 * int(count) :], *PAR)[3:]
+    parts = PAR
+    if path.suffix in (".yaml", ".yml"):
+        document = read_yaml(path, CameraError)
+        ptv = document.get("ptv") if isinstance(document, dict) else None
+        parts = len(YAML_KEYS), " ".join(YAML_KEYS)
+        words = [str(ptv[key]) for key in YAML_KEYS if key in ptv] if isinstance(ptv, dict) else []
+    else:
+        words = _words(path, "\n")
+        count = words[0].strip() if words else ""
+        if not (count.isascii() and count.isdigit() and len(count) < 4):
+            do = "name OpenPTV's ptv.par, or its YAML with the key ptv"
+            raise camera_error(str(path), "the number of cameras first", short(count[:20]), do)
+        names = max(2 * int(count), min(len(words) - 1 - PAR[0], 2 * MOST_NAMES))
+        words = words[1 + names :]
+    imx, imy, pix_x, pix_y, chfield, *media = _numbers(path, words, *parts)[-len(YAML_KEYS) :]
     if chfield != 0:
         got, do = f"chfield {chfield:g}", "make whole frames of the fields first"
         raise camera_error(str(path), "whole frames (chfield 0)", got, do)
@@ -106,27 +105,6 @@ def load_ptv_par(path: Path | str) -> PtvPar:
         expected, do = "sizes, pixels and indices above zero", f"correct them ({PAR[1]})"
         raise camera_error(str(path), expected, "zero or less", do)
     return PtvPar((int(imx), int(imy)), (pix_x, pix_y), *media)
-
-
-def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
-    """Write ptv.par for cameras with common sensor and media, pictures img/NAME. and cal/NAME.tif (or OutputError)."""
-    lines = [str(len(names))]
-    for name in names:
-        lines += [f"img/{name}.", f"cal/{name}.tif"]
-    lines += ["1", "0", "1", *map(str, par.image_size), *map(repr, par.pixel_pitch_mm), "0"]
-    lines += map(repr, (par.n_air, par.n_glass, par.n_fluid, par.thickness_mm))
-    write_text(Path(path), "\n".join(lines) + "\n")
-
-
-def par_of(camera: Camera) -> PtvPar:
-    """Return the content of ptv.par for an OpenPTV camera; CameraError for another model."""
-    inner = _openptv_of(camera)
-    pitch_u, pitch_v = inner.pixel_pitch_mm.tolist()
-    media: list[float] = []
-    if isinstance(camera, PortCamera):
-        port = camera.port
-        media = [1.0, port.n_glass.item(), port.n_fluid.item(), port.thickness_mm.item()]
-    return PtvPar(inner.image_size, (pitch_u, pitch_v), *media)
 
 
 def _port(glass_mm: Sequence[float], par: PtvPar) -> Port:
@@ -142,25 +120,6 @@ def _port(glass_mm: Sequence[float], par: PtvPar) -> Port:
         n_glass=_tensor(par.n_glass / par.n_air),
         n_fluid=_tensor(par.n_fluid / par.n_air),
     )
-
-
-def _glass_vector(camera: Camera) -> Tensor:
-    if not isinstance(camera, PortCamera):
-        return -camera.R_cam_lab[2].detach()  # OpenPTV divides by its length also where nothing refracts
-    offset = camera.port.offset_mm.detach()
-    if float(offset) <= 0:
-        expected = "a wall with the lab's origin on its liquid side (OpenPTV has only the distance)"
-        got, do = f"offset {float(offset):g}", "move the lab's origin into the liquid"
-        raise camera_error("port", expected, got, do)
-    return camera.port.normal_lab.detach() * offset
-
-
-def _openptv_of(camera: Camera) -> OpenPTVCamera:
-    inner = in_air(camera)
-    if not isinstance(inner, OpenPTVCamera):
-        got, do = type(inner).__name__, "build an OpenPTVCamera; other distortions have no exact counterpart there"
-        raise camera_error("camera", "a camera of model openptv", got, do)
-    return inner
 
 
 def _words(path: Path, separator: str | None = None) -> list[str]:
@@ -184,10 +143,6 @@ def _numbers(path: Path, words: Sequence[str] | None, count: int, parts: str) ->
             raise camera_error(name, "a finite number", short(word[:20]), do)
         numbers.append(number)
     return numbers
-
-
-def _row(numbers: Tensor) -> str:
-    return " ".join(map(repr, numbers.tolist())) + "\n"
 
 
 def _tensor(value: object) -> Tensor:
