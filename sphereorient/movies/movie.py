@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
 from sphereorient.files.picture import OnDemand
+from sphereorient.movies.stamps import Stamps
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FRAMES_A_MAP = 64  # after which a file is mapped anew: read pages count as memory meanwhile
@@ -18,6 +19,7 @@ MOST_MISSING = 100  # times the pictures that are there: with more gaps the numb
 GAMMA_CODED = "usually gamma-coded: response: srgb"
 COLOUR_REMARK = f"colour, made grey (0.299 R + 0.587 G + 0.114 B); {GAMMA_CODED}"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
+TRANSPOSE = "transpose"  # rows become columns
 
 
 class Movie:
@@ -27,7 +29,8 @@ class Movie:
     format: str  # kind of file, codec, bits, in words
     frame_shape: tuple[int, int]  # (H, W)
     dtype: np.dtype[Any]  # uint8, or uint16 where the file holds more than 8 bits; values are not rescaled
-    times_s: NDArray[np.float64] | None = None  # (N,), s, exact time stamps of the file; None: none, or rounded (MKV)
+    times_s: Stamps | None = None  # (N,), s, time stamps of the recording; None: none, or those of a player
+    times_unit: str = "s"  # of these stamps by the file; empty: it states none, and s is a guess
     played_hz: float | None = None  # rate at which players show it; that of the recording only of an ordinary camera
     photographs: bool = False  # whether these are picture files of 8 bits, as ordinary cameras write them
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
@@ -104,11 +107,11 @@ class Movie:
 
 
 class FlippedMovie(Movie):
-    """Another movie with its rows, its columns or both reversed."""
+    """Another movie with its rows, its columns or both reversed, or with rows as columns."""
 
     def __init__(self, movie: Movie, how: str) -> None:
-        super().__init__(movie.path, movie.format, len(movie), movie.frame_shape, movie.dtype)
-        self.times_s, self.played_hz = movie.times_s, movie.played_hz
+        super().__init__(movie.path, movie.format, len(movie), flipped_shape(movie.frame_shape, how), movie.dtype)
+        self.times_s, self.times_unit, self.played_hz = movie.times_s, movie.times_unit, movie.played_hz
         self.remarks = (*movie.remarks, f"flipped on reading: {how}")
         self.photographs = movie.photographs
         self._movie, self._how = movie, how
@@ -122,16 +125,33 @@ class FlippedMovie(Movie):
 
 
 def flipped(movie: Movie, how: str) -> Movie:
-    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both."""
-    if how not in FLIPS:
-        raise refused(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
+    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both, or transpose
+    (rows become columns: of files written by MATLAB). Each of them undoes itself.
+    """
+    if how not in (*FLIPS, TRANSPOSE):
+        raise refused(f"{movie.path}, flip", ", ".join((*FLIPS, TRANSPOSE)), f"'{how}'", "write one of these")
     return movie if how == "none" else FlippedMovie(movie, how)
 
 
 def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
     """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
+    if how == TRANSPOSE:
+        return np.ascontiguousarray(picture.swapaxes(-1, -2))
     rows, columns = FLIPS[how]
     return np.ascontiguousarray(picture[..., ::rows, ::columns])
+
+
+def flipped_shape(frame_shape: tuple[int, int], how: str) -> tuple[int, int]:
+    """Return the shape (H, W) of pictures that `flipped_picture` mirrors."""
+    return (frame_shape[1], frame_shape[0]) if how == TRANSPOSE else frame_shape
+
+
+def grey_shape(shape: Sequence[int]) -> tuple[int, int, int] | None:
+    """Return (N, H, W) of an array of grey pictures, of four axes if one after the first is 1; None of other arrays."""
+    sizes = [int(size) for size in shape]
+    if len(sizes) == 4 and sizes[1:].count(1) == 1:
+        del sizes[sizes.index(1, 1)]
+    return (sizes[0], sizes[1], sizes[2]) if len(sizes) == 3 and 0 not in sizes else None
 
 
 def mapped(
