@@ -118,16 +118,13 @@ def convert(
 ) -> None:
     """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""
     from sphereorient.movies import flipped, movie_files, open_movie, write_movie
-    from sphereorient.movies.stamps import other_units, rate_of
     from sphereorient.movies.write import times_path
 
     with writing(movie_files(source)), flipped(open_movie(source), flip) as opened:
         check_writable(target)
         first, last = frames_of(frames, MovieError, len(opened))
         assert last is not None  # a number of frames was given
-        times_s = None if opened.times_s is None else opened.times_s[first:last]
-        unknown = times_s is not None and not opened.times_unit and other_units(rate_of(times_s))
-        times_s = None if unknown else times_s
+        times_s = None if opened.times_s is None or opened.likely_units else opened.times_s[first:last]
         rate_hz = rate or opened.played_hz or 25.0
         dead: list[int] = []
         with progress_bar(quiet) as advance:
@@ -139,8 +136,8 @@ def convert(
             left = "black" if target.suffix.lower() == ".mkv" else "left out, still counted"
             typer.echo(f"Not decodable, {left}: {_numbers(dead, ', ')}")
         typer.echo(f"Wrote {target}: {_frames(count)}" + (f", {first} .. {last - 1} of the movie" if first else ""))
-        if unknown:
-            typer.echo("Their times are left out: the unit is not known.")
+        if opened.likely_units:
+            typer.echo("Their times are left out: the file does not state the unit, and they are hardly in s.")
         if times_s is not None and target.suffix.lower() == ".mkv":
             typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
 
@@ -174,7 +171,8 @@ def _times(opened: "Movie") -> str:
         return f"{shown}: give frame_rate or times in experiment.yaml"
     if len(times_s) < 2:
         return f"{times_s[0]:.9g} s"
-    return f"{times_s[0]:.9g} .. {times_s[-1]:.9g} s, {spacing(times_s)}"
+    unit = f"; no unit is stated: by their size in {opened.likely_units}" if opened.likely_units else ""
+    return f"{times_s[0]:.9g} .. {times_s[-1]:.9g} s, {spacing(times_s)[1]}{unit}"
 
 
 def _frames(count: int) -> str:

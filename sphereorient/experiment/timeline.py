@@ -116,12 +116,11 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 def _questioned(experiment: Experiment, frame_s: float, movies: Mapping[str, Movie]) -> Iterator[str]:
     """Yield remarks on a rate that no camera has, or that contradicts the time stamps of a movie."""
-    single = max(map(len, movies.values())) == 1
-    if (why := doubt(1 / frame_s)) and not single:
+    if (why := doubt(1 / frame_s)) and max(map(len, movies.values())) > 1:
         yield f"{experiment.path}: the frames come at {why}"
     for movie in movies.values():
         rate_hz = rate_of(movie.times_s) if movie.times_s is not None and movie.times_unit else float("nan")
-        if abs(rate_hz * frame_s - 1) > CONTRADICTION:
+        if abs(rate_hz / experiment.frame_rate_hz - 1) > CONTRADICTION:
             yield f"{movie.path}: its time stamps say {rate_hz:.6g} Hz, {experiment.path} {1 / frame_s:.6g} Hz"
 
 
@@ -173,7 +172,12 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         if own is None and movie.played_hz and any(one.times_s is not None for one in movies.values()):
             own = np.arange(len(movie)) / movie.played_hz
         if own is None:
-            raise MovieError(refusal(str(movie.path), expected="time stamps", **_without_stamps(movie)))
+            do, table = "write frame_rate:, or times: with a file", times_path(movie.path)
+            if table.is_file():
+                do = f"write times: {table.name}"
+            elif movie.played_hz:
+                do = f"write frame_rate: {movie.played_hz:.6g}, at which players show it, if it was recorded so"
+            raise MovieError(refusal(str(movie.path), expected="time stamps", got="none in this file", do=do))
         if start >= len(movie):
             got, do = f"{len(movie)}", "correct start:"
             raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
@@ -206,16 +210,6 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
             remarks.append(f"{experiment.path}: the stamps of {names[0]} and {name} differ by {late:.3g} s, usually")
     number = np.arange(taken.shape[1])
     return Timeline(number=number, time_s=np.nanmean(taken, axis=0), rows=rows, remarks=tuple(remarks))
-
-
-def _without_stamps(movie: Movie) -> dict[str, str]:
-    """Return what a movie has instead of time stamps of its recording, and what to do."""
-    if (table := times_path(movie.path)).is_file():
-        return {"got": "none in this file", "do": f"write times: {table.name}, the table beside it"}
-    if movie.played_hz:
-        got = f"even ones, as players show it, {movie.played_hz:.6g} Hz"
-        return {"got": got, "do": f"write frame_rate: {movie.played_hz:.6g} if it was recorded at this rate"}
-    return {"got": "none in this file", "do": "write frame_rate:, or times: with a file"}
 
 
 def paired(one: Floats, other: Floats, within_s: float) -> Rows:

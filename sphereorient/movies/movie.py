@@ -1,5 +1,5 @@
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Self
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
 from sphereorient.files.picture import OnDemand
-from sphereorient.movies.stamps import Stamps
+from sphereorient.movies.stamps import Stamps, other_units, rate_of
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FRAMES_A_MAP = 64  # after which a file is mapped anew: read pages count as memory meanwhile
@@ -18,8 +18,13 @@ MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
 GAMMA_CODED = "usually gamma-coded: response: srgb"
 COLOUR_REMARK = f"colour, made grey (0.299 R + 0.587 G + 0.114 B); {GAMMA_CODED}"
-FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
-TRANSPOSE = "transpose"  # rows become columns
+FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {  # of pictures (..., H, W); each undoes itself
+    "none": lambda picture: picture,
+    "vertical": lambda picture: picture[..., ::-1, :],
+    "horizontal": lambda picture: picture[..., ::-1],
+    "both": lambda picture: picture[..., ::-1, ::-1],
+    "transpose": lambda picture: picture.swapaxes(-1, -2),
+}
 
 
 class Movie:
@@ -59,6 +64,11 @@ class Movie:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def likely_units(self) -> str:
+        """Units, in words, of time stamps without a stated unit whose rate in s is doubtful; empty: they are in s."""
+        return "" if self.times_s is None or self.times_unit else other_units(rate_of(self.times_s))
 
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
         """Yield frames first .. last - 1 in order, as copies (H, W); MovieError outside the movie or at damage."""
@@ -126,24 +136,21 @@ class FlippedMovie(Movie):
 
 def flipped(movie: Movie, how: str) -> Movie:
     """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both, or transpose
-    (rows become columns: of files written by MATLAB). Each of them undoes itself.
+    (rows become columns, as in files written by MATLAB).
     """
-    if how not in (*FLIPS, TRANSPOSE):
-        raise refused(f"{movie.path}, flip", ", ".join((*FLIPS, TRANSPOSE)), f"'{how}'", "write one of these")
+    if how not in FLIPS:
+        raise refused(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
     return movie if how == "none" else FlippedMovie(movie, how)
 
 
 def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
     """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
-    if how == TRANSPOSE:
-        return np.ascontiguousarray(picture.swapaxes(-1, -2))
-    rows, columns = FLIPS[how]
-    return np.ascontiguousarray(picture[..., ::rows, ::columns])
+    return np.ascontiguousarray(FLIPS[how](picture))
 
 
 def flipped_shape(frame_shape: tuple[int, int], how: str) -> tuple[int, int]:
     """Return the shape (H, W) of pictures that `flipped_picture` mirrors."""
-    return (frame_shape[1], frame_shape[0]) if how == TRANSPOSE else frame_shape
+    return (frame_shape[1], frame_shape[0]) if how == "transpose" else frame_shape
 
 
 def grey_shape(shape: Sequence[int]) -> tuple[int, int, int] | None:

@@ -2,7 +2,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sphereorient.movies.cine import CineMovie
-from sphereorient.movies.hdf5 import Hdf5Movie, split_path
+from sphereorient.movies.hdf5 import hdf5_movie, split_path
 from sphereorient.movies.movie import Movie, refused
 from sphereorient.movies.npy import NpyMovie
 from sphereorient.movies.sequence import PICTURES, SequenceMovie, is_pattern, sequence_files
@@ -14,7 +14,7 @@ READERS: dict[str, Callable[[Path], Movie]] = {
     ".npy": NpyMovie,
     ".cine": CineMovie,
     **dict.fromkeys((".tif", ".tiff"), TiffMovie),
-    **dict.fromkeys((".h5", ".hdf5", ".mat"), Hdf5Movie),
+    **dict.fromkeys((".h5", ".hdf5", ".mat"), hdf5_movie),
 }
 LOSSLESS = "convert it, lossless: ffmpeg -i FILE{} -c:v ffv1 -pix_fmt gray FILE.mkv"
 PHOTRON = "convert it in Python: numpy.save('FILE.npy', pyMRAW.load_video('FILE.cihx')[0]), or .cih; pip install pyMRAW"

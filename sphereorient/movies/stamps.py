@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Stamps = NDArray[np.float64]  # (N,), increasing
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # s
-_LONG = {"sec": "s", "millisec": "ms", "msec": "ms", "microsec": "us", "usec": "us", "nanosec": "ns", "nsec": "ns"}
+_UNIT = re.compile(r"(milli|micro|nano|[mun])?s(ec(ond)?s?)?")
 SLOWEST_HZ, FASTEST_HZ = 1.0, 1e5  # of cameras that film a turning ball
 UNEVEN = 1e-3  # of the usual time between frames
 
@@ -16,8 +16,8 @@ def unit_in(text: object) -> str:
     """Return the unit, a key of UNITS, that an attribute or a heading names; empty: none."""
     text = text.decode(errors="replace") if isinstance(text, bytes) else str(text)
     words = re.split(r"[\W_\d]+", re.sub("[\u00b5\u03bc]", "u", text.lower()))
-    known = [_LONG.get(re.sub("(onds?|s)$", "", word), word) for word in words]
-    return next((word for word in known if word in UNITS), "")
+    found = next(filter(None, map(_UNIT.fullmatch, words)), None)
+    return "" if found is None else {"micro": "u"}.get(found[1], (found[1] or "")[:1]) + "s"
 
 
 def rate_of(stamps: Stamps) -> float:
@@ -27,32 +27,21 @@ def rate_of(stamps: Stamps) -> float:
 
 def doubt(rate_hz: float) -> str:
     """Return what makes a rate doubtful, in words, empty for one of a camera or NaN."""
-    if not (rate_hz < SLOWEST_HZ or rate_hz > FASTEST_HZ):
-        return ""
-    return f"{rate_hz:.3g} Hz, which is outside {SLOWEST_HZ:g} to {FASTEST_HZ:,.0f} Hz"
+    doubtful = rate_hz < SLOWEST_HZ or rate_hz > FASTEST_HZ
+    return f"{rate_hz:.3g} Hz, which is outside {SLOWEST_HZ:g} to {FASTEST_HZ:,.0f} Hz" if doubtful else ""
 
 
 def other_units(rate_hz: float) -> str:
-    """Return in which other units stamps, which in s have a doubtful rate, have one of a camera, in words."""
-    if not doubt(rate_hz):
-        return ""
-    rates = {unit: rate_hz / size for unit, size in UNITS.items() if not doubt(rate_hz / size)}
+    """Return in which units stamps have the rate of a camera, in words; empty where they have it in s, `rate_hz`."""
+    rates = {unit: rate_hz / size for unit, size in UNITS.items() if doubt(rate_hz) and not doubt(rate_hz / size)}
     return ", ".join(f"{unit} ({rate:,.6g} Hz)" for unit, rate in rates.items())
 
 
-def spacing(times_s: Stamps, tick_s: float = 0.0) -> str:
-    """Return the rate of stamps in words, with the uneven steps; `tick_s`: they are rounded to this, s."""
-    steps = np.diff(times_s)
-    rate, off = f"{rate_of(times_s):.6g} Hz", np.count_nonzero(uneven(times_s, tick_s))
-    if not off:
-        return f"even: {rate}"
-    longest = int(np.argmax(steps))
+def spacing(times_s: Stamps, tick_s: float = 0.0) -> tuple[bool, str]:
+    """Return whether stamps, at least two, rounded to `tick_s`, are evenly spaced, and their rate and gaps in words."""
+    steps, rate = np.diff(times_s), f"{rate_of(times_s):.6g} Hz"
+    usual, longest = float(np.median(steps)), int(np.argmax(steps))
+    off = np.count_nonzero(np.abs(steps - usual) > max(UNEVEN * usual, 1.01 * tick_s))
     gap = f"the longest, {steps[longest]:.6g} s, after frame {longest}"
-    return f"not even: usually {rate}, {off} of {len(steps)} steps differ, {gap}"
-
-
-def uneven(times_s: Stamps, tick_s: float = 0.0) -> NDArray[np.bool_]:
-    """Return which steps between stamps, (N - 1,), differ from the usual one, by more than rounding to `tick_s`."""
-    steps = np.diff(times_s)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    return np.asarray(np.abs(steps - usual) > max(UNEVEN * usual, 1.01 * tick_s))
+    uneven = f"not even: usually {rate}, {off} of {len(steps)} steps differ, {gap}"
+    return not off, uneven if off else f"even: {rate}"

@@ -18,7 +18,7 @@ from sphereorient.files.picture import OnDemand, luma
 from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
 from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, Grey, Movie, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
-from sphereorient.movies.stamps import Stamps, rate_of, spacing, uneven
+from sphereorient.movies.stamps import Stamps, rate_of, spacing
 
 Found = TypeVar("Found")
 LOSSLESS = "lossless"
@@ -26,10 +26,7 @@ PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so ma
 NOTHING = "none from the decoder"
 PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
 TURNED_REMARK = "read as it is stored: players and ffmpeg turn it by {} degrees clockwise, as its rotation tag says"
-FIELDS_REMARK = (
-    "interlaced: each frame is two pictures of different instants; separate them first: "
-    "ffmpeg -i MOVIE -vf bwdif=send_field -c:v ffv1 MOVIE.mkv"
-)
+FIELDS_REMARK = "interlaced, two instants a frame; part them: ffmpeg -i MOVIE -vf bwdif=send_field -c:v ffv1 NEW.mkv"
 COARSE = 0.1  # steps of time stamps, of the usual time between frames: coarser ones are not used
 SHOWN = 8  # missing frames named in a remark
 SLACK = 1.5  # frames by which a rounded duration may be too long
@@ -59,8 +56,8 @@ class VideoMovie(Movie):
             turned = (TURNED_REMARK.format(-frame.rotation % 360),) if frame.rotation else ()
             fields = (FIELDS_REMARK,) if frame.interlaced_frame else ()
             self.times_s, spaced = _uneven_times(self._index, container.streams.video[0].time_base)
-            known = (*damaged, *cut_off, *turned, *fields, *spaced)
-            self.remarks = (*known, *_remarks(container, self._pixels, self._index))
+            known = _remarks(container, self._pixels, self._index)
+            self.remarks = (*damaged, *cut_off, *turned, *fields, *spaced, *known)
 
     def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, float, str]:
         """Return the packet table, the end of the last frame, s, and the error that ended it, if any."""
@@ -272,18 +269,15 @@ def _remarks(container: av.container.InputContainer, pixels: str, index: PacketI
 
 
 def _uneven_times(index: PacketIndex, tick: Fraction | None) -> tuple[Stamps | None, tuple[str, ...]]:
-    """Return the time stamps of a recorder that spaced them unevenly, (N,), s, with a remark; None: evenly spaced, as
-    players show them, whatever the rate of the recording; or too coarse for times.
-    """
-    if index.by_place or index.number_of is None or len(index.number_of) < index.count or tick is None:
-        return None, ()
-    tick_s = float(tick)
-    times_s = np.array(sorted(index.number_of), np.float64) * tick_s
-    if not uneven(times_s, tick_s).any():
+    """Return stamps that are spaced unevenly, by a recorder, (N,), s, with a remark; None: even ones, for players."""
+    marks, tick_s = sorted({} if index.by_place else index.number_of or {}), float(tick or 0)
+    times_s = np.array(marks, np.float64) * tick_s
+    even, words = spacing(times_s, tick_s) if index.count == len(marks) > 2 else (True, "")
+    if even:
         return None, ()
     coarse = tick_s * rate_of(times_s) > COARSE
-    do = "too coarse for times: movies" if coarse else "write times: movies"
-    remark = f"time stamps in steps of {1e3 * tick_s:.3g} ms, {spacing(times_s, tick_s)}; {do}"
+    use = "too coarse for times: movies" if coarse else "times: movies uses them"
+    remark = f"time stamps in steps of {1e3 * tick_s:.3g} ms, {words}; {use}"
     return (None if coarse else times_s), (remark,)
 
 

@@ -23,7 +23,7 @@ from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import CameraScene, fixed_ball, still_ball, swaying_ball, wander_px
 from sphereorient.movies import Movie, movie_files, open_movie
-from sphereorient.movies.stamps import other_units, rate_of
+from sphereorient.movies.stamps import rate_of
 from sphereorient.preflight.sample import sample_movie
 
 WIDE_DEG = 30.0  # field of view that is the example
@@ -167,11 +167,10 @@ def _rate_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
         return [DraftKey(name="frame_rate", value=1.0, comment="Hz; any, of one picture")]
     rate = looks[0].rate_hz
     if rate is not None and all(one.rate_hz for one in looks):
-        words = f"time stamps of the files: usually {rate:.6g} Hz"
-        others = "" if looks[0].movie.times_unit else other_units(rate)
-        unit = f"of these stamps, of which the files state none: s ({rate:.3g} Hz), {others}"
-        asked = [DraftKey(name="time_unit", comment=unit, example="ms", asked=True)] if others else []
-        return [DraftKey(name="times", value="movies", comment=words), *asked]
+        times = DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
+        units = f"of these stamps, not stated in the files: s, or by their size {looks[0].movie.likely_units}"
+        asked = DraftKey(name="time_unit", comment=units, example="ms", asked=True)
+        return [times, asked] if looks[0].movie.likely_units else [times]
     played = next((f"; players show it at {one.movie.played_hz:g}" for one in looks if one.movie.played_hz), "")
     return [DraftKey(name="frame_rate", comment=f"Hz, of the recording{played}", example=600.0, asked=True)]
 
