@@ -110,10 +110,7 @@ def convert(
     target: Annotated[Path, Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
     frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
     flip: Flip = "none",
-    rate: Annotated[
-        float | None,
-        Option(min=1.0e-3, max=1.0e6, help="Frames per second of .mkv, for players; else as before, or 25."),
-    ] = None,
+    rate: Annotated[float | None, Option(min=1e-3, max=1e6, help="Hz, of .mkv in players; else as before.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""

@@ -125,10 +125,8 @@ def _questioned(experiment: Experiment, frame_s: float, movies: Mapping[str, Mov
 
 
 def load_times(path: Path, unit: str = "") -> Floats:
-    """Read a table of times, (N,), s, one per line; # comments are skipped. A heading may name their unit, such as
-    time_ms; else they are in `unit`.
-    Raises ExperimentError (missing, too large, a line without a number, times not increasing, or hardly in s, without
-    a unit).
+    """Read a table of times, (N,), s, one a line; the first line may name their unit, such as time_ms, or else `unit`.
+    Raises ExperimentError (missing, too large, a line without a number, times not increasing, or hardly in s).
     """
     do = "write one time a line, increasing"
     lines = read_text(path, 1 << 24, "a table of times", ExperimentError, "correct times:").splitlines()
@@ -140,8 +138,9 @@ def load_times(path: Path, unit: str = "") -> Floats:
         except ValueError:
             if number > 1:  # the first line may be a heading
                 raise refused(f"{path}, line {number}", "a number", repr(text[:40]), do) from None
-            unit = unit_in(text) or unit
-    return _in_s(str(path), _increasing(str(path), np.asarray(values, np.float64), do), unit)
+    times = _increasing(str(path), np.asarray(values, np.float64), do)
+    unit = unit_in(lines[0]) or unit  # there is a time, or it was refused
+    return _in_s(str(path), times, unit)
 
 
 def _in_s(name: str, times: Floats, unit: str) -> Floats:
@@ -181,9 +180,8 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         if start >= len(movie):
             got, do = f"{len(movie)}", "correct start:"
             raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
-        where = f"{movie.path}, time stamps"
-        stamps = _increasing(where, own, "write frame_rate:, or times: with a file")
-        stamps = stamps if movie.times_unit else _in_s(where, stamps, experiment.time_unit)
+        where, unit = f"{movie.path}, time stamps", "s" if movie.times_unit else experiment.time_unit
+        stamps = _in_s(where, _increasing(where, own, "write frame_rate:, or times: with a file"), unit)
         # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
     usual_s, names = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]))), list(clocks)

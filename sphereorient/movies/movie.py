@@ -1,5 +1,5 @@
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Self
@@ -18,13 +18,7 @@ MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
 GAMMA_CODED = "usually gamma-coded: response: srgb"
 COLOUR_REMARK = f"colour, made grey (0.299 R + 0.587 G + 0.114 B); {GAMMA_CODED}"
-FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {  # of pictures (..., H, W); each undoes itself
-    "none": lambda picture: picture,
-    "vertical": lambda picture: picture[..., ::-1, :],
-    "horizontal": lambda picture: picture[..., ::-1],
-    "both": lambda picture: picture[..., ::-1, ::-1],
-    "transpose": lambda picture: picture.swapaxes(-1, -2),
-}
+FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1), "transpose": (1, 1)}  # steps
 
 
 class Movie:
@@ -122,7 +116,8 @@ class FlippedMovie(Movie):
     def __init__(self, movie: Movie, how: str) -> None:
         super().__init__(movie.path, movie.format, len(movie), flipped_shape(movie.frame_shape, how), movie.dtype)
         self.times_s, self.times_unit, self.played_hz = movie.times_s, movie.times_unit, movie.played_hz
-        self.remarks = (*movie.remarks, f"flipped on reading: {how}")
+        others = (remark for remark in movie.remarks if f"flip: {how}" not in remark)  # without the advice to do so
+        self.remarks = (*others, f"flipped on reading: {how}")
         self.photographs = movie.photographs
         self._movie, self._how = movie, how
 
@@ -145,7 +140,9 @@ def flipped(movie: Movie, how: str) -> Movie:
 
 def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
     """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
-    return np.ascontiguousarray(FLIPS[how](picture))
+    rows, columns = FLIPS[how]
+    turned = picture.swapaxes(-1, -2) if how == "transpose" else picture
+    return np.ascontiguousarray(turned[..., ::rows, ::columns])
 
 
 def flipped_shape(frame_shape: tuple[int, int], how: str) -> tuple[int, int]:

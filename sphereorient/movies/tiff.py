@@ -124,8 +124,8 @@ def _stated(path: Path, file: TiffFile) -> int:
             text, page = str(file.ome_metadata), _first_page(path, file)
             files, images = set(re.findall(r'FileName="([^"]*)"', text)), len(re.findall(r"<(?:\w+:)?Pixels\b", text))
             if len(files) > 1 or images > 1:
-                got, do = f"{images} movies in {max(len(files), 1)} files", "export it as one movie in one file"
-                raise refused(path, "one movie in the file", got, do)
+                got = f"{images} movies in {max(len(files), 1)} files"
+                raise refused(path, "one movie in the file", got, "export it as one movie in one file")
             sizes = {axis: int(size) for axis, size in re.findall(r'\bSize([CZT])="(\d+)"', text)}
             axes = [sizes["C"] // page.samplesperpixel, sizes["Z"], sizes["T"]]
             stated = int(math.prod(axes))

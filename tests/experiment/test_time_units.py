@@ -87,7 +87,8 @@ def test_stamps_that_are_hardly_in_s_are_refused_until_their_unit_is_written(tmp
 
 
 @pytest.mark.parametrize(
-    ("heading", "unit"), [("time_ms", "ms"), ("t (\u00b5s)", "us"), ("frame times [ns]", "ns"), ("time_s", "s")]
+    ("heading", "unit"),
+    [("time_ms", "ms"), ("t (\u00b5s)", "us"), ("frame times [ns]", "ns"), ("time_s", "s"), ("# ms", "ms")],
 )
 def test_a_heading_may_name_the_unit_of_a_table(tmp_path, heading, unit):
     rows = "".join(f"{time!r}\n" for time in (np.arange(FRAMES) * UNITS[unit] / 50).tolist())

@@ -148,6 +148,7 @@ def test_a_transposed_movie_says_so_where_nothing_marks_it_and_flip_turns_it_bac
     assert movie.frame_shape == (51, 37)
     assert remark(movie, "flip: transpose")
     back = flipped(movie, "transpose")
+    assert not remark(back, "flip: transpose")
     assert back.frame_shape == (37, 51)
     assert np.array_equal(np.stack(list(back.frames())), frames)
     assert np.array_equal(back.sample([3]), frames[[3]])
