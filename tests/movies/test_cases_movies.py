@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,8 @@ from conftest import SHARED
 from sphereorient.cli import main
 from sphereorient.errors import MovieError
 from sphereorient.experiment.timeline import load_times
-from sphereorient.movies import flipped, open_movie
+from sphereorient.movies import flipped, open_movie, write_movie
+from sphereorient.trajectory import Trajectory
 
 CASES = SHARED / "cases"
 pytestmark = pytest.mark.shared
@@ -103,3 +106,52 @@ def test_units_that_no_file_states_are_asked_for(tmp_path, monkeypatch, capsys, 
 
 def test_a_table_in_ns_is_in_ns():
     assert np.diff(load_times(CASES / "time_units" / "times_ns.csv", "ns")) == pytest.approx(1 / 30, rel=1e-6)
+
+
+def test_convert_keeps_a_phones_time_stamps_beside_the_movie(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(monkeypatch, capsys, "convert", str(CASES / "variable_rate" / "vfr.mp4"), "out.mkv")
+    assert code == 0
+    assert "out.times.csv" in out
+    times_s = open_movie(CASES / "variable_rate" / "vfr.mp4").times_s
+    assert load_times(tmp_path / "out.times.csv") == pytest.approx(times_s, abs=1e-12)
+
+
+def test_convert_leaves_out_times_whose_unit_nobody_knows(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(monkeypatch, capsys, "convert", str(CASES / "time_units" / "ms.h5"), "out.h5")
+    assert code == 0
+    assert "times are left out" in out
+    assert open_movie("out.h5").times_s is None
+
+
+@pytest.mark.slow
+def test_a_ball_that_turns_evenly_does_so_across_a_phones_pause(tmp_path, monkeypatch, capsys):
+    shutil.copy(CASES / "variable_rate" / "vfr.mp4", tmp_path / "m.mp4")
+    shutil.copy(CASES / "time_units" / "texture.png", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(monkeypatch, capsys, "init", "m.mp4", "--vfov", "30", "--set", "sphere.diameter=null")
+    assert code == 0
+    assert "not even" in out
+    assert run(monkeypatch, capsys, "track", "experiment.yaml", "--out", "track.h5", "--quiet")[0] == 0
+    track = Trajectory.load("track.h5")
+    speed = np.linalg.norm(track.omega_lab, axis=1)
+    assert np.nanmedian(speed) == pytest.approx(math.pi, rel=0.25)
+    assert np.nanmax(speed) < 2 * math.pi  # 13 times as fast across the pause at a constant rate
+
+
+@pytest.mark.slow
+def test_a_transposed_movie_is_followed_live_and_recorded_as_it_is_filmed(tmp_path, monkeypatch, capsys):
+    shutil.copy(CASES / "matlab_hdf5" / "h5create.h5", tmp_path / "m.h5")
+    shutil.copy(CASES / "time_units" / "texture.png", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    write_movie("upright.h5", flipped(open_movie("m.h5"), "transpose").frames())
+    keys = ["--vfov", "30", "--set", "sphere.diameter=null", "--set", "frame_rate=30"]
+    assert run(monkeypatch, capsys, "init", "upright.h5", *keys)[0] == 0
+    text = Path("experiment.yaml").read_text()
+    Path("experiment.yaml").write_text(text.replace("{cam1: upright.h5}", "{cam1: m.h5}\nflip: {cam1: transpose}"))
+    live = ["--source", "movie-fast", "--to", "poses.jsonl", "--record", "record.h5"]
+    code, out, err = run(monkeypatch, capsys, "live", "experiment.yaml", *live)
+    assert code == 0
+    assert "0 without a pose" in out + err
+    assert np.array_equal(open_movie("record.h5").sample(range(24)), open_movie("m.h5").sample(range(24)))
