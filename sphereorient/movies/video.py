@@ -27,6 +27,7 @@ NOTHING = "none from the decoder"
 PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
 TURNED_REMARK = "read as it is stored: players and ffmpeg turn it by {} degrees clockwise, as its rotation tag says"
 FIELDS_REMARK = "interlaced, two instants a frame; part them: ffmpeg -i MOVIE -vf bwdif=send_field -c:v ffv1 NEW.mkv"
+UNKNOWN, PROGRESSIVE = 0, 1  # field orders of FFmpeg; others are interlaced
 COARSE = 0.1  # steps of time stamps, of the usual time between frames: coarser ones are not used
 SHOWN = 8  # missing frames named in a remark
 SLACK = 1.5  # frames by which a rounded duration may be too long
@@ -44,6 +45,8 @@ class VideoMovie(Movie):
             self._pixels = frame.format.name
             codec = container.streams.video[0].codec_context
             form = f"{path.suffix[1:].lower()}, codec {codec.name} ({_loss(codec)}), pixels {self._pixels}"
+            by_stream = getattr(codec, "field_order", UNKNOWN) not in (UNKNOWN, PROGRESSIVE)
+            interlaced = frame.interlaced_frame or by_stream
             rate = container.streams.video[0].average_rate
             self.played_hz = float(rate) if rate else None
         self._checked = False  # whether the packets carry check sums that can be verified
@@ -54,7 +57,7 @@ class VideoMovie(Movie):
             damaged = (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
             cut_off = self._truncated(_stated_frames(path, container, count, end_s))
             turned = (TURNED_REMARK.format(-frame.rotation % 360),) if frame.rotation else ()
-            fields = (FIELDS_REMARK,) if frame.interlaced_frame else ()
+            fields = (FIELDS_REMARK,) if interlaced else ()
             self.times_s, spaced = _uneven_times(self._index, container.streams.video[0].time_base)
             known = _remarks(container, self._pixels, self._index)
             self.remarks = (*damaged, *cut_off, *turned, *fields, *spaced, *known)
