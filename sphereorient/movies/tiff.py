@@ -48,7 +48,7 @@ class TiffMovie(Movie):
             self._stored = np.dtype(page.dtype).newbyteorder(file.byteorder)
             # ImageJ's stacks above 4 GB have one page, truncated stacks lack the table of pages: values are contiguous.
             whole = 0
-            if stated > pages and page.compression == UNCOMPRESSED and page.is_contiguous:
+            if stated > pages and not file.is_ome and page.compression == UNCOMPRESSED and page.is_contiguous:
                 whole = int((path.stat().st_size - page.dataoffsets[0]) // page.nbytes)
             self._offset = int(page.dataoffsets[0]) if whole > pages else None
             count = min(stated, whole) if self._offset is not None else pages
@@ -126,7 +126,7 @@ def _stated(path: Path, file: TiffFile) -> int:
             if len(files) > 1 or images > 1:
                 got = f"{images} movies in {max(len(files), 1)} files"
                 raise refused(path, "one movie in the file", got, "export it as one movie in one file")
-            sizes = {axis: int(size) for axis, size in re.findall(r'\bSize([CZT])="(\d+)"', text)}
+            sizes = {axis: int(size) for axis, size in re.findall(r'\bSize([CZT])="(\d{1,9})"', text)}
             axes = [sizes["C"] // page.samplesperpixel, sizes["Z"], sizes["T"]]
             stated = int(math.prod(axes))
         elif file.is_imagej and file.imagej_metadata:

@@ -208,6 +208,19 @@ def test_ome_parts_and_channels_are_refused_and_one_of_each_is_read(tmp_path):
         open_movie(path)
 
 
+def test_a_cut_off_ome_movie_gives_its_pages_and_says_so(tmp_path):
+    pixels = (
+        '<Pixels ID="P:0" DimensionOrder="XYZCT" Type="uint8" SizeX="51" SizeY="37" SizeZ="1" SizeC="1" SizeT="30"/>'
+    )
+    ome = f'<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">{pixels}</OME>'
+    with tifffile.TiffWriter(tmp_path / "movie.ome.tif") as file:
+        for k in range(20):  # tables lie between the pictures
+            file.write(pictures()[k], description=ome if k == 0 else None, metadata=None, contiguous=False)
+    movie = open_movie(tmp_path / "movie.ome.tif")
+    assert np.array_equal(np.stack(list(movie.frames())), pictures()[:20])
+    assert remark(movie, "header tells of 30 frames, 20 are there")
+
+
 def test_a_part_of_an_ome_movie_in_several_files_is_refused(tmp_path):
     uuid = "urn:uuid:00000000-0000-0000-0000-00000000000"
     data = "".join(
