@@ -110,7 +110,7 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
         missing += open_keys([field])
     if quiet:
         return
-    echo_lines(_found(look) for look in looks)
+    echo_lines(line for look in looks for line in _found(look))
     if len({len(look.movie) for look in looks}) > 1:
         typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
     _end(target, missing, _next(target, cameras), [cameras] if alone else [])
@@ -143,13 +143,13 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     if hidden:
         write_picture(mask, shown.astype("uint8") * 255)
         made.append(mask)
-    rate_hz = said.rate_hz or (None if look.rate_hz else look.movie.played_hz)  # its cameras are ordinary ones
+    rate_hz = None if look.rate_hz else said.rate_hz or look.movie.played_hz  # its cameras are ordinary ones
     known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
     missing = _write_experiment([look], target, [*known, *changes], {look.name: mask.name} if hidden else None)
     model = "fisheye" if said.fisheye else "pinhole"
     _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab, model))
     if not quiet:
-        typer.echo(_found(look))
+        echo_lines(_found(look))
         if said.unread:
             typer.echo(f"{config}, not read: {', '.join(said.unread)}")
         live = [] if isinstance(said.source, Path) else [f"sphereorient live {target} --source camera:{said.source}"]
@@ -223,14 +223,15 @@ def _asked(keys: list[DraftKey]) -> list[DraftKey]:
     return keys
 
 
-def _found(look: "FirstLook") -> str:
-    """Return what a movie shows, in a line."""
+def _found(look: "FirstLook") -> list[str]:
+    """Return what a movie shows, in a line, and the remarks of its reader."""
+    remarks = [f"{look.name}: {remark}" for remark in look.movie.remarks]
     height, width = look.movie.frame_shape
     told = f"{look.name}: {look.movie.path}, {len(look.movie)} frames of {width} x {height} px"
     if look.rate_hz:
         told += f", {look.rate_hz:.6g} Hz"
     if look.diameter_px is None:
-        return f"{told}; no ball was found: light, or more than one thing that moves?"
+        return [f"{told}; no ball was found: light, or more than one thing that moves?", *remarks]
     where = (
         "one picture"
         if look.photograph
@@ -240,7 +241,7 @@ def _found(look: "FirstLook") -> str:
         if look.stays
         else f"moves, found in {look.found} of {look.looked} frames"
     )
-    return f"{told}; ball of {look.diameter_px:.0f} px, {where}"
+    return [f"{told}; ball of {look.diameter_px:.0f} px, {where}", *remarks]
 
 
 def _next(target: Path, cameras: Path) -> list[str]:

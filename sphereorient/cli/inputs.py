@@ -16,18 +16,14 @@ from sphereorient.errors import MovieError
 from sphereorient.files.whole_file import check_ending, writing
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from sphereorient.movies import Grey, Movie
     from sphereorient.movies.survey import Survey
     from sphereorient.preflight import Finding
 
 Source = Annotated[str, Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")]
-Flip = Annotated[str, Option(help="Mirror: none, vertical (rows), horizontal (columns), both.")]
+Flip = Annotated[str, Option(help="Mirror: none, vertical (rows), horizontal (columns), both, transpose.")]
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
-UNEVEN = 1e-3  # of the usual time between frames
 COLOURS = {"ok": typer.colors.GREEN, "warning": typer.colors.YELLOW, "fault": typer.colors.RED}
 MARK, TITLE = 9, 25  # columns of the list
 
@@ -114,7 +110,7 @@ def convert(
     target: Annotated[Path, Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
     frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
     flip: Flip = "none",
-    rate: Annotated[float, Option(min=1.0e-3, max=1.0e6, help="Frames per second of .mkv, for players.")] = 25.0,
+    rate: Annotated[float | None, Option(min=1e-3, max=1e6, help="Hz, of .mkv in players; else as before.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""
@@ -125,10 +121,11 @@ def convert(
         check_writable(target)
         first, last = frames_of(frames, MovieError, len(opened))
         assert last is not None  # a number of frames was given
-        times_s = None if opened.times_s is None else opened.times_s[first:last]
+        times_s = None if opened.times_s is None or opened.likely_units else opened.times_s[first:last]
+        rate_hz = rate or opened.played_hz or 25.0
         dead: list[int] = []
         with progress_bar(quiet) as advance:
-            count = write_movie(target, _pictures(opened, first, last, dead, advance), times_s, rate)
+            count = write_movie(target, _pictures(opened, first, last, dead, advance), times_s, rate_hz)
         if quiet:
             return
         echo_lines(f"{source}: {remark}" for remark in opened.remarks)
@@ -136,6 +133,8 @@ def convert(
             left = "black" if target.suffix.lower() == ".mkv" else "left out, still counted"
             typer.echo(f"Not decodable, {left}: {_numbers(dead, ', ')}")
         typer.echo(f"Wrote {target}: {_frames(count)}" + (f", {first} .. {last - 1} of the movie" if first else ""))
+        if opened.likely_units:
+            typer.echo("Their times are left out: the file does not state the unit, and they are hardly in s.")
         if times_s is not None and target.suffix.lower() == ".mkv":
             typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
 
@@ -152,29 +151,25 @@ def _facts(opened: "Movie", seen: "Survey") -> list[tuple[str, str]]:
         ("format", opened.format),
         ("pictures", f"{width} x {height} px, {8 * opened.dtype.itemsize} bit"),
         ("frames", str(len(opened))),
-        ("times", _times(opened.times_s)),
+        ("times", _times(opened)),
         *(("remark", remark) for remark in opened.remarks),
         ("looked at", f"{whole}: grey levels {seen.lowest} .. {seen.highest}"),
         *((fault, _numbers(numbers) if numbers else "none") for fault, numbers in seen.faults.items()),
     ]
 
 
-def _times(times_s: "NDArray[np.float64] | None") -> str:
+def _times(opened: "Movie") -> str:
+    """Return the time stamps of a movie in words."""
+    from sphereorient.movies.stamps import spacing
+
+    times_s = opened.times_s
     if times_s is None:
-        return "none that are exact: give frame_rate or times in experiment.yaml"
+        shown = f"even ones of players, {opened.played_hz:.6g} Hz" if opened.played_hz else "none"
+        return f"{shown}: give frame_rate or times in experiment.yaml"
     if len(times_s) < 2:
         return f"{times_s[0]:.9g} s"
-    import numpy as np
-
-    steps = np.diff(times_s)
-    usual = float(np.median(steps))
-    span = f"{times_s[0]:.9g} .. {times_s[-1]:.9g} s"
-    off = np.flatnonzero(np.abs(steps - usual) > UNEVEN * usual)
-    if not len(off):
-        return f"{span}, even: {1 / usual:.6g} Hz"
-    longest = int(np.argmax(steps))
-    gap = f"the longest, {steps[longest]:.6g} s, after frame {longest}"
-    return f"{span}, not even: usually {1 / usual:.6g} Hz, {len(off)} of {len(steps)} steps differ, {gap}"
+    unit = f"; no unit is stated: by their size in {opened.likely_units}" if opened.likely_units else ""
+    return f"{times_s[0]:.9g} .. {times_s[-1]:.9g} s, {spacing(times_s)[1]}{unit}"
 
 
 def _frames(count: int) -> str:

@@ -206,6 +206,7 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.live.outputs import open_output
     from sphereorient.live.page import PageProcess
     from sphereorient.live.sources import recorded, source_of
+    from sphereorient.movies import flipped
     from sphereorient.movies.record import Recorder
 
     chosen = given.chosen("precise")
@@ -234,7 +235,8 @@ def live(given: _LiveOptions) -> None:
             output.begin(blocks)
         recorders, frame_s = [], set_up.recording.timeline.frame_s
         for stream in set_up.recording.streams if movies else ():
-            recorders.append(Recorder(movies[stream.name], stream.movie, frame_s, _tell, wait=source.waits))
+            filmed = flipped(stream.movie, set_up.recording.experiment.flip.get(stream.name, "none"))
+            recorders.append(Recorder(movies[stream.name], filmed, frame_s, _tell, wait=source.waits))
             opened.callback(recorders[-1].close)
         monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell)
         if set_up.save_map is not None:

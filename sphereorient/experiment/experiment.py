@@ -57,6 +57,7 @@ class Experiment:
     background_paths: dict[str, Path] = field(default_factory=dict)  # scene without the sphere
     circles: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # of a fixed ball: u, v, radius, px
     times: str | None = None  # path of a table, or "movies": their time stamps; None: constant frame rate
+    time_unit: str = ""  # of times whose file states none, see movies.stamps.UNITS; empty: s, unless that is doubtful
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
     start_given: bool = False  # whether the file has `start`; time stamps then begin there
     flip: dict[str, str] = field(default_factory=dict)  # mirrored movies, see movies.flipped
@@ -182,6 +183,7 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     name: str | None = None
     frame_rate: Positive | None = None
     times: str | None = None
+    time_unit: Literal["", "s", "ms", "us", "ns"] = ""
     exposure: Positive | None = None
     sphere: SphereKeys | None = None
     spheres: dict[str, SphereKeys] = Field(default_factory=dict, min_length=1)
@@ -192,7 +194,7 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     movies: dict[str, str] = Field(min_length=1, max_length=MAX_CAMERAS)
     start: dict[str, FrameNumber] = Field(default_factory=dict)
     frames: tuple[FrameNumber, FrameNumber] | None = None
-    flip: dict[str, Literal["none", "vertical", "horizontal", "both"]] = Field(default_factory=dict)
+    flip: dict[str, Literal["none", "vertical", "horizontal", "both", "transpose"]] = Field(default_factory=dict)
     response: Any = None
     flow: FlowKeys = FlowKeys()
     camera: dict[str, DeviceKeys] = Field(default_factory=dict)
@@ -251,6 +253,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
         background_paths=at(keys.backgrounds),
         circles=dict(keys.circles),
         times=keys.times if keys.times in (None, MOVIES_OWN) else str(path.parent / str(keys.times)),
+        time_unit=keys.time_unit,
         start={name: keys.start.get(name, 0) for name in keys.movies},
         start_given=bool(keys.start),
         flip=dict(keys.flip),
@@ -273,6 +276,8 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
         if (rows, columns) != (height, width):
             expected = f"{width} x {height} px as camera {name} in {experiment.cameras_path}"
             got, do = f"{columns} x {rows}", "calibrate the camera with this movie's picture size"
+            if (columns, rows) == (height, width):
+                do = f"{do}, or write flip: {{{name}: transpose}} if rows are columns, as in files written by MATLAB"
             raise MovieError(refusal(str(movie.path), expected=expected, got=got, do=do))
         movies[name] = movie
     return movies

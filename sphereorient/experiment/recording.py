@@ -22,7 +22,7 @@ from sphereorient.experiment.experiment import Experiment, Sphere, load_experime
 from sphereorient.experiment.timeline import NONE, Rows, Timeline, timeline
 from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
-from sphereorient.movies import Grey, Movie, flipped_picture
+from sphereorient.movies import Grey, Movie, flipped_picture, flipped_shape
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
 Shown = Grey | OnDemand  # a picture that was decoded, or is where it is asked for
@@ -145,13 +145,13 @@ def _glares(picture: Grey) -> bool:
 def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
     """Return a camera's background, (H, W) grey levels, flipped as its movie; None if not given."""
     path, flip = experiment.background_paths.get(name), experiment.flip.get(name, "none")
-    return None if path is None else flipped_picture(load_background(path, frame_shape), flip)
+    return None if path is None else flipped_picture(load_background(path, flipped_shape(frame_shape, flip)), flip)
 
 
 def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
     """Return a camera's mask, (H, W), False where the sphere is hidden, flipped as its movie; None if not given."""
     path, flip = experiment.mask_paths.get(name), experiment.flip.get(name, "none")
-    return None if path is None else flipped_picture(load_mask(path, frame_shape), flip)
+    return None if path is None else flipped_picture(load_mask(path, flipped_shape(frame_shape, flip)), flip)
 
 
 def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """Times of an experiment's frames, and the picture of each movie at each frame."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,8 @@ from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment.experiment import MOVIES_OWN, Experiment, refused
 from sphereorient.files.whole_file import read_text
 from sphereorient.movies import Movie
+from sphereorient.movies.stamps import UNITS, doubt, other_units, rate_of, unit_in
+from sphereorient.movies.write import times_path
 
 Rows = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -20,6 +22,7 @@ PAIR_STEPS = 0.5  # frame periods: nearer stamps of several cameras are one inst
 LATE_STEPS = 0.05  # frame periods: a larger median difference of stamps causes a remark
 EVEN_STEPS = 1e-3  # frame periods: tolerance of evenly spaced times
 ON_GRID = 0.02  # frame periods: tolerance of a regular grid
+CONTRADICTION = 0.01  # of a frame rate: a larger difference from the stamps of a movie causes a remark
 LONGEST_PAUSE = 50  # frame periods; no motion continues over a longer pause
 
 
@@ -68,12 +71,13 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     """Return the times of the selected frames and the pictures of the cameras at each frame.
 
     Times come from the frame rate, a table, or stamps of the movies; equal stamps of several cameras make one frame.
-    MKV stamps are not used: they are rounded to 1 ms.
+    A remark questions a rate that no camera has, and a frame rate that contradicts the stamps of a movie.
 
-    Raises ExperimentError (unreadable table of times, or one of another length), MovieError (a movie lacks frames, or
-    time stamps with `times: movies`).
+    Raises ExperimentError (unreadable table of times, one of another length, or times that are hardly in s and state
+    no unit), MovieError (a movie lacks frames, or time stamps with `times: movies`).
     """
     whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
+    whole = replace(whole, remarks=(*whole.remarks, *_questioned(experiment, whole.frame_s, movies)))
     if experiment.frames is None:
         return whole
     first, last = experiment.frames
@@ -103,18 +107,28 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     if experiment.times is None:
         time_s = number / experiment.frame_rate_hz
     else:
-        time_s = load_times(Path(experiment.times))
+        time_s = load_times(Path(experiment.times), experiment.time_unit)
         if len(time_s) != count:
             do = "give one time for each frame of the experiment, counted after start:"
             raise refused(experiment.times, f"{count} times", f"{len(time_s)}", do)
     return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
 
 
-def load_times(path: Path) -> Floats:
-    """Read a table of times, (N,), s, one per line; a heading and # comments are skipped.
-    Raises ExperimentError (missing, too large, a line without a number, or times not increasing).
+def _questioned(experiment: Experiment, frame_s: float, movies: Mapping[str, Movie]) -> Iterator[str]:
+    """Yield remarks on a rate that no camera has, or that contradicts the time stamps of a movie."""
+    if (why := doubt(1 / frame_s)) and max(map(len, movies.values())) > 1:
+        yield f"{experiment.path}: the frames come at {why}"
+    for movie in movies.values():
+        rate_hz = rate_of(movie.times_s) if movie.times_s is not None and movie.times_unit else float("nan")
+        if abs(rate_hz / experiment.frame_rate_hz - 1) > CONTRADICTION:
+            yield f"{movie.path}: its time stamps say {rate_hz:.6g} Hz, {experiment.path} {1 / frame_s:.6g} Hz"
+
+
+def load_times(path: Path, unit: str = "") -> Floats:
+    """Read a table of times, (N,), s, one a line; the first line may name their unit, such as time_ms, or else `unit`.
+    Raises ExperimentError (missing, too large, a line without a number, times not increasing, or hardly in s).
     """
-    do = "write one time a line, in seconds, increasing"
+    do = "write one time a line, increasing"
     lines = read_text(path, 1 << 24, "a table of times", ExperimentError, "correct times:").splitlines()
     values: list[float] = []
     for number, line in enumerate(lines, 1):
@@ -124,7 +138,18 @@ def load_times(path: Path) -> Floats:
         except ValueError:
             if number > 1:  # the first line may be a heading
                 raise refused(f"{path}, line {number}", "a number", repr(text[:40]), do) from None
-    return _increasing(str(path), np.asarray(values, np.float64), do)
+    times = _increasing(str(path), np.asarray(values, np.float64), do)
+    unit = unit_in(lines[0]) or unit  # there is a time, or it was refused
+    return _in_s(str(path), times, unit)
+
+
+def _in_s(name: str, times: Floats, unit: str) -> Floats:
+    """Return times, (N,), in s; ExperimentError for ones without a unit that are hardly in s."""
+    rate_hz = rate_of(times)
+    if not unit and (others := other_units(rate_hz)):
+        do = "write time_unit: ms (or us, ns, s) in experiment.yaml, as they are"
+        raise refused(name, "times in s", f"{doubt(rate_hz)}; by their size they are in {others}", do)
+    return times * UNITS[unit or "s"]
 
 
 def _increasing(name: str, time_s: Floats, do: str) -> Floats:
@@ -142,13 +167,21 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     clocks: dict[str, Floats] = {}
     for name, movie in movies.items():
         start = experiment.start.get(name, 0)
-        if movie.times_s is None:
-            do = "write frame_rate:, or times: with a file"
+        own = movie.times_s
+        if own is None and movie.played_hz and any(one.times_s is not None for one in movies.values()):
+            own = np.arange(len(movie)) / movie.played_hz
+        if own is None:
+            do, table = "write frame_rate:, or times: with a file", times_path(movie.path)
+            if table.is_file():
+                do = f"write times: {table.name}"
+            elif movie.played_hz:
+                do = f"write frame_rate: {movie.played_hz:.6g}, at which players show it, if it was recorded so"
             raise MovieError(refusal(str(movie.path), expected="time stamps", got="none in this file", do=do))
         if start >= len(movie):
             got, do = f"{len(movie)}", "correct start:"
             raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
-        stamps = _increasing(f"{movie.path}, time stamps", movie.times_s, "write frame_rate:, or times: with a file")
+        where, unit = f"{movie.path}, time stamps", "s" if movie.times_unit else experiment.time_unit
+        stamps = _in_s(where, _increasing(where, own, "write frame_rate:, or times: with a file"), unit)
         # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
     usual_s, names = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]))), list(clocks)

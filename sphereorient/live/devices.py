@@ -22,7 +22,7 @@ from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
 from sphereorient.live.feed import Arrival, Tell
 from sphereorient.live.instants import Instants, Shot
-from sphereorient.movies import flipped_picture
+from sphereorient.movies import flipped_picture, flipped_shape
 
 AGAIN_S = 1.0  # between attempts to open a camera
 WAIT_S = 0.2  # of one call of a driver; a camera that waits for its trigger is asked again
@@ -310,7 +310,7 @@ class Camera:
             stopped.wait(AGAIN_S)
 
     def _set_up(self, device: Device) -> None:
-        name, size = self.stream.name, self.stream.movie.frame_shape[::-1]
+        name, size = self.stream.name, flipped_shape(self.stream.movie.frame_shape, self.flip)[::-1]
         wanted = _features(self.keys, size) if self.keys else ()
         if refused := ", ".join(filter(None, (_refused(device, feature, value) for feature, value in wanted))):
             do = f"correct camera: {name}: in experiment.yaml"
@@ -324,7 +324,8 @@ class Camera:
         """Return a picture as it lies in the movie; MovieError: of another size or type."""
         if (picture := shot.picture) is None:
             return shot
-        (height, width), kind = self.stream.movie.frame_shape, self.stream.movie.dtype
+        height, width = flipped_shape(self.stream.movie.frame_shape, self.flip)
+        kind = self.stream.movie.dtype
         if (*picture.shape, picture.dtype) != (height, width, kind):
             got = f"{picture.shape[1]} x {picture.shape[0]} px {picture.dtype}"
             do = "set the camera to the size and depth of the movie that the experiment names"

@@ -1,43 +1,50 @@
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from sphereorient.errors import error_words
 from sphereorient.files.hdf5 import DAMAGE
 from sphereorient.files.whole_file import LARGEST_RATIO
-from sphereorient.movies.movie import MOST_MISSING, Grey, Movie, refused
+from sphereorient.movies.movie import MOST_MISSING, Grey, Movie, flipped, grey_shape, refused
+from sphereorient.movies.stamps import UNITS, Stamps, unit_in
 
 KIND = "data set (N, H, W) of uint8 or uint16"
+UPRIGHT = "higher than wide: if MATLAB wrote it by h5write, rows are columns: write flip: transpose"
+NAME_ONE = "name one: file.h5::group/dataset"
+AS_MOVIE = "write one channel as a data set of its own: file['grey'] = file['NAME'][..., 0]"
+SHOWN = 5  # data sets named in a refusal
 SEPARATOR = "::"  # between the file and the data set in it
 TIMES = ("time", "times", "timestamps")
+MATLAB = "MATLAB_class"  # attribute of what MATLAB saves: in the file its axes are reversed
 MAX_OBJECTS = 10_000  # searched for the one data set
 BLOCK_BYTES = 64 << 20  # held at once, of a data set whose chunks hold many frames
 
 
 class Hdf5Movie(Movie):
-    """A data set (N, H, W) of uint8 or uint16; frames that were never written are unreadable."""
+    """A data set (N, H, W) of uint8 or uint16, a fourth axis of 1 left out; frames never written are unreadable."""
 
     def __init__(self, path: Path) -> None:
         self._file, name = split_path(path)
         with _opened(path, self._file) as file:
             data = _data_set(path, file, name)
             self._name = data.name
-            stated, height, width = (int(size) for size in data.shape)
+            stated, height, width = grey_shape(data.shape) or (0, 0, 0)
+            self.by_matlab = MATLAB in data.attrs
             self._block = 1 if data.chunks is None else data.chunks[0]  # frames in one chunk
             count, self._blocks = _written(path, data, self._file.stat().st_size)
             if count < 1:
                 raise refused(path, "frames", f"{stated} of which none was written", "record it again")
-            self.times_s, remarks = _times(data, stated, count)
-            form = f"HDF5, data set {data.name}" + (f", {data.compression}" if data.compression else "")
+            self.times_s, self.times_unit, remarks = _times(data, stated, count)
+            form = f"HDF5, data set {data.name} {data.shape}" + (f", {data.compression}" if data.compression else "")
             super().__init__(path, form, count, (height, width), data.dtype.newbyteorder("="))
-        self.remarks = (*self._truncated(stated), *remarks)
+        doubtful = (UPRIGHT,) if height > width and not self.by_matlab else ()
+        self.remarks = (*self._truncated(stated), *remarks, *doubtful)
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         at_once = max(1, BLOCK_BYTES // (math.prod(self.frame_shape) * self.dtype.itemsize))
@@ -56,7 +63,13 @@ class Hdf5Movie(Movie):
                         held, pictures = start, data[start:end]
                     except DAMAGE as error:
                         raise self._damage(number, error_words(error)) from error
-                yield pictures[number - start].astype(self.dtype)
+                yield pictures[number - start].reshape(self.frame_shape).astype(self.dtype)
+
+
+def hdf5_movie(path: Path) -> Movie:
+    """Open a data set of a file; one that MATLAB saved, (H, W, N) there, has rows and columns as there."""
+    movie = Hdf5Movie(path)
+    return flipped(movie, "transpose" if movie.by_matlab else "none")
 
 
 def split_path(path: Path) -> tuple[Path, str]:
@@ -76,7 +89,8 @@ def _opened(path: Path, file: Path) -> Iterator[Any]:
         with h5py.File(file, "r") as opened:
             yield opened
     except DAMAGE as error:
-        raise refused(path, "an HDF5 file that is whole", error_words(error), "copy or record it again") from error
+        do = "save it in MATLAB with '-v7.3'" if file.suffix.lower() == ".mat" else "copy or record it again"
+        raise refused(path, "an HDF5 file that is whole", error_words(error), do) from error
 
 
 def _data_set(path: Path, file: Any, name: str) -> Any:
@@ -86,12 +100,13 @@ def _data_set(path: Path, file: Any, name: str) -> Any:
     else:
         names = _candidates(file)
         if len(names) != 1:
-            got = ", ".join(map(_shown, names[:5])) or "none"
-            raise refused(path, f"one {KIND}", got, "name one: file.h5::group/dataset")
+            others = [f"{_shown(one)} {file[one].shape} of {file[one].dtype}" for one in _data_sets(file)[:SHOWN]]
+            got = ", ".join([_shown(one) for one in names[:SHOWN]] or others) or "none"
+            raise refused(path, f"one {KIND}", got, NAME_ONE if names else AS_MOVIE)
         data = file[names[0]]
     if not _is_movie(data):
         got = f"{data.shape} of {data.dtype}" if isinstance(data, h5py.Dataset) else "a group"
-        raise refused(path, f"a {KIND}", got, "name another one: file.h5::group/dataset")
+        raise refused(path, f"a {KIND}", got, NAME_ONE if _candidates(file) else AS_MOVIE)
     if data.external or data.is_virtual:
         got, do = "one that lies in other files", "copy the pictures into this file"
         raise refused(path, "a data set in the file itself", got, do)
@@ -120,13 +135,17 @@ def _follow(path: Path, file: Any, name: str) -> Any:
 
 
 def _candidates(file: Any) -> list[str]:
+    return _data_sets(file, _is_movie)
+
+
+def _data_sets(file: Any, wanted: Callable[[Any], bool] = lambda thing: isinstance(thing, h5py.Dataset)) -> list[str]:
     found: list[str] = []
     seen = 0
 
     def visit(name: str, thing: Any) -> bool | None:
         nonlocal seen
         seen += 1
-        if _is_movie(thing):
+        if wanted(thing):
             found.append(name)
         return True if seen > MAX_OBJECTS else None  # anything but None ends the walk
 
@@ -137,21 +156,21 @@ def _candidates(file: Any) -> list[str]:
 def _is_movie(thing: Any) -> bool:
     if not isinstance(thing, h5py.Dataset) or thing.dtype not in (np.uint8, np.uint16):
         return False
-    return thing.shape is not None and len(thing.shape) == 3 and 0 not in thing.shape
+    return thing.shape is not None and grey_shape(thing.shape) is not None
 
 
 def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int] | None]:
     """Return the number of frames up to the last written one, and the written chunks, None if contiguous."""
-    stated, height, width = (int(size) for size in data.shape)
-    frame_bytes = height * width * data.dtype.itemsize
+    stated, *frame_shape = (int(size) for size in data.shape)
+    frame_bytes = math.prod(frame_shape) * data.dtype.itemsize
     if frame_bytes > LARGEST_RATIO * file_bytes:
-        raise refused(path, "frames that the file can hold", f"{height} x {width}", "record it again")
+        raise refused(path, "frames that the file can hold", f"{frame_shape} px", "record it again")
     if data.chunks is None:
         stored = min(data.id.get_storage_size(), file_bytes)
         return min(stated, stored // frame_bytes), None
-    block, rows, columns = data.chunks
-    claimed = block * rows * columns * data.dtype.itemsize
-    tiles = -(-height // rows) * -(-width // columns)
+    block, *tile = data.chunks
+    claimed = block * math.prod(tile) * data.dtype.itemsize
+    tiles = math.prod(-(-size // part) for size, part in zip(frame_shape, tile, strict=True))
     there: Counter[int] = Counter()
 
     def note(chunk: Any) -> None:
@@ -166,22 +185,25 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
     return count, whole
 
 
-def _times(data: Any, stated: int, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return the times (count,), s, beside a data set, or a remark why they are not used."""
+def _times(data: Any, stated: int, count: int) -> tuple[Stamps | None, str, tuple[str, ...]]:
+    """Return the times (count,), s, beside a data set, their unit by the file, or a remark why they are not used."""
     for name in TIMES:
         if not isinstance(data.parent.get(name, getlink=True), h5py.HardLink):
             continue
         times = data.parent[name]
-        if not isinstance(times, h5py.Dataset) or times.shape != (stated,) or times.dtype.kind not in "fiu":
-            fault = "it is not one number a frame"
-        elif (unit := times.attrs.get("units", "s")) != "s":
-            fault = f"in {_shown(unit)}, not in s"
+        shapes = (stated,), (stated, 1), (1, count)  # the last two by MATLAB
+        single = isinstance(times, h5py.Dataset) and times.shape in shapes and times.dtype.kind in "fiu"
+        unit = times.attrs.get("units", "") if single else ""
+        if not single:
+            fault = f"it is not one number a frame: {getattr(times, 'shape', ())} for {stated} frames"
+        elif "units" in times.attrs and not unit_in(unit):
+            fault = f"in {_shown(unit)}, not in {', '.join(UNITS)}"
         elif times.external or times.is_virtual:
             fault = "it lies in other files"
         else:
-            seconds = times[:count].astype(np.float64)
+            seconds = times[:count].reshape(-1)[:count].astype(np.float64) * UNITS[unit_in(unit) or "s"]
             if np.isfinite(seconds).all() and (np.diff(seconds) > 0).all():
-                return seconds, ()
+                return seconds, unit_in(unit), ()
             fault = "it does not increase"
-        return None, (f"its '{name}' is not used: {fault}",)
-    return None, ()
+        return None, "", (f"its '{name}' is not used: {fault}",)
+    return None, "", ()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
 from sphereorient.files.picture import OnDemand
+from sphereorient.movies.stamps import Stamps, other_units, rate_of
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FRAMES_A_MAP = 64  # after which a file is mapped anew: read pages count as memory meanwhile
@@ -17,7 +18,7 @@ MOST_PIXELS = 1 << 26  # more than any movie camera has
 MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
 GAMMA_CODED = "usually gamma-coded: response: srgb"
 COLOUR_REMARK = f"colour, made grey (0.299 R + 0.587 G + 0.114 B); {GAMMA_CODED}"
-FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
+FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1), "transpose": (1, 1)}  # steps
 
 
 class Movie:
@@ -27,7 +28,8 @@ class Movie:
     format: str  # kind of file, codec, bits, in words
     frame_shape: tuple[int, int]  # (H, W)
     dtype: np.dtype[Any]  # uint8, or uint16 where the file holds more than 8 bits; values are not rescaled
-    times_s: NDArray[np.float64] | None = None  # (N,), s, exact time stamps of the file; None: none, or rounded (MKV)
+    times_s: Stamps | None = None  # (N,), s, time stamps of the recording; None: none, or those of a player
+    times_unit: str = "s"  # of these stamps by the file; empty: it states none, and s is a guess
     played_hz: float | None = None  # rate at which players show it; that of the recording only of an ordinary camera
     photographs: bool = False  # whether these are picture files of 8 bits, as ordinary cameras write them
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
@@ -56,6 +58,11 @@ class Movie:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def likely_units(self) -> str:
+        """Units, in words, of time stamps without a stated unit whose rate in s is doubtful; empty: they are in s."""
+        return "" if self.times_s is None or self.times_unit else other_units(rate_of(self.times_s))
 
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
         """Yield frames first .. last - 1 in order, as copies (H, W); MovieError outside the movie or at damage."""
@@ -104,12 +111,13 @@ class Movie:
 
 
 class FlippedMovie(Movie):
-    """Another movie with its rows, its columns or both reversed."""
+    """Another movie with its rows, its columns or both reversed, or with rows as columns."""
 
     def __init__(self, movie: Movie, how: str) -> None:
-        super().__init__(movie.path, movie.format, len(movie), movie.frame_shape, movie.dtype)
-        self.times_s, self.played_hz = movie.times_s, movie.played_hz
-        self.remarks = (*movie.remarks, f"flipped on reading: {how}")
+        super().__init__(movie.path, movie.format, len(movie), flipped_shape(movie.frame_shape, how), movie.dtype)
+        self.times_s, self.times_unit, self.played_hz = movie.times_s, movie.times_unit, movie.played_hz
+        others = (remark for remark in movie.remarks if f"flip: {how}" not in remark)  # without the advice to do so
+        self.remarks = (*others, f"flipped on reading: {how}")
         self.photographs = movie.photographs
         self._movie, self._how = movie, how
 
@@ -122,7 +130,9 @@ class FlippedMovie(Movie):
 
 
 def flipped(movie: Movie, how: str) -> Movie:
-    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both."""
+    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both, or transpose
+    (rows become columns, as in files written by MATLAB).
+    """
     if how not in FLIPS:
         raise refused(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
     return movie if how == "none" else FlippedMovie(movie, how)
@@ -131,7 +141,21 @@ def flipped(movie: Movie, how: str) -> Movie:
 def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
     """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
     rows, columns = FLIPS[how]
-    return np.ascontiguousarray(picture[..., ::rows, ::columns])
+    turned = picture.swapaxes(-1, -2) if how == "transpose" else picture
+    return np.ascontiguousarray(turned[..., ::rows, ::columns])
+
+
+def flipped_shape(frame_shape: tuple[int, int], how: str) -> tuple[int, int]:
+    """Return the shape (H, W) of pictures that `flipped_picture` mirrors."""
+    return (frame_shape[1], frame_shape[0]) if how == "transpose" else frame_shape
+
+
+def grey_shape(shape: Sequence[int]) -> tuple[int, int, int] | None:
+    """Return (N, H, W) of an array of grey pictures, of four axes if one after the first is 1; None of other arrays."""
+    sizes = [int(size) for size in shape]
+    if len(sizes) == 4 and sizes[1:].count(1) == 1:
+        del sizes[sizes.index(1, 1)]
+    return (sizes[0], sizes[1], sizes[2]) if len(sizes) == 3 and 0 not in sizes else None
 
 
 def mapped(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import error_words
-from sphereorient.movies.movie import Grey, Movie, mapped, refused
+from sphereorient.movies.movie import Grey, Movie, grey_shape, mapped, refused
 
 # numpy parses a header as a Python literal, and old ones as its tokens.
 DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)
@@ -16,19 +16,20 @@ SAVE_AGAIN = "write it again with numpy.save"
 
 
 class NpyMovie(Movie):
-    """A .npy file, (N, H, W), uint8 or uint16."""
+    """A .npy file, (N, H, W), uint8 or uint16; a fourth axis of one channel is left out."""
 
     def __init__(self, path: Path) -> None:
         shape, self._stored, self._offset = _header(path)
-        if len(shape) != 3 or self._stored.kind != "u" or self._stored.itemsize > 2 or 0 in shape:
+        sizes = grey_shape(shape)
+        if sizes is None or self._stored.kind != "u" or self._stored.itemsize > 2:
             expected, got = "an array (N, H, W) of uint8 or uint16, not empty", f"{shape} of {self._stored}"
-            raise refused(path, expected, got, "save grey frames along the first axis")
-        frame_bytes = math.prod(shape[1:]) * self._stored.itemsize
-        count = min(shape[0], (path.stat().st_size - self._offset) // frame_bytes)
+            raise refused(path, expected, got, "save grey frames along the first axis, one channel")
+        frame_bytes = math.prod(sizes[1:]) * self._stored.itemsize
+        count = min(sizes[0], (path.stat().st_size - self._offset) // frame_bytes)
         if count < 1:
             raise refused(path, "at least one whole frame", "a cut off file", SAVE_AGAIN)
-        super().__init__(path, "numpy array", count, (shape[1], shape[2]), self._stored.newbyteorder("="))
-        self.remarks = self._truncated(shape[0])
+        super().__init__(path, "numpy array", count, sizes[1:], self._stored.newbyteorder("="))
+        self.remarks = self._truncated(sizes[0])
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         shape = (len(self), *self.frame_shape)

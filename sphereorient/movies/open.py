@@ -2,7 +2,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sphereorient.movies.cine import CineMovie
-from sphereorient.movies.hdf5 import Hdf5Movie, split_path
+from sphereorient.movies.hdf5 import hdf5_movie, split_path
 from sphereorient.movies.movie import Movie, refused
 from sphereorient.movies.npy import NpyMovie
 from sphereorient.movies.sequence import PICTURES, SequenceMovie, is_pattern, sequence_files
@@ -14,14 +14,23 @@ READERS: dict[str, Callable[[Path], Movie]] = {
     ".npy": NpyMovie,
     ".cine": CineMovie,
     **dict.fromkeys((".tif", ".tiff"), TiffMovie),
-    **dict.fromkeys((".h5", ".hdf5"), Hdf5Movie),
+    **dict.fromkeys((".h5", ".hdf5", ".mat"), hdf5_movie),
+}
+LOSSLESS = "convert it, lossless: ffmpeg -i FILE{} -c:v ffv1 -pix_fmt gray FILE.mkv"
+PHOTRON = "convert it in Python: numpy.save('FILE.npy', pyMRAW.load_video('FILE.cihx')[0]), or .cih; pip install pyMRAW"
+CONVERT = {  # files that ffmpeg does not read, by suffix
+    **dict.fromkeys((".mraw", ".cih", ".cihx"), PHOTRON),
+    ".seq": "convert it in Python: numpy.save('FILE.npy', numpy.array(pims.NorpixSeq('FILE.seq'))); pip install pims",
+    ".fmf": "convert it with motmot.FlyMovieFormat: fmf2bmps FILE.fmf --extension=png --outdir=FILE; name that folder",
+    ".slp": "name the movie that was labelled: this file holds labels, and at most the labelled frames",
 }
 
 
 def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
     Videos: .mkv, .avi, .mp4, .mov (any codec of FFmpeg), .cine. Stacks of uint8 or uint16: .tif, .tiff, .npy (N, H, W),
-    .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: one, a folder, a pattern with * or %05d.
+    .h5, .hdf5, .mat of v7.3 (its only such data set, or `file.h5::group/dataset`). Pictures: one, a folder, a pattern
+    with * or %05d.
     Raises MovieError: missing, of another suffix, unreadable, or empty.
     """
     path = Path(path)
@@ -34,7 +43,7 @@ def open_movie(path: Path | str) -> Movie:
     reader = READERS.get(suffix, SequenceMovie if suffix in PICTURES else None)
     if reader is None:
         expected = f"a movie of type {' '.join(READERS)} or a folder of pictures"
-        do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
+        do = CONVERT.get(suffix, LOSSLESS.format(suffix)).replace("FILE", file.stem)
         raise refused(path, expected, f"'{path.suffix}'", do)
     return reader(path)
 

@@ -1,5 +1,7 @@
 import logging
 import lzma
+import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -46,7 +48,7 @@ class TiffMovie(Movie):
             self._stored = np.dtype(page.dtype).newbyteorder(file.byteorder)
             # ImageJ's stacks above 4 GB have one page, truncated stacks lack the table of pages: values are contiguous.
             whole = 0
-            if stated > pages and page.compression == UNCOMPRESSED and page.is_contiguous:
+            if stated > pages and not file.is_ome and page.compression == UNCOMPRESSED and page.is_contiguous:
                 whole = int((path.stat().st_size - page.dataoffsets[0]) // page.nbytes)
             self._offset = int(page.dataoffsets[0]) if whole > pages else None
             count = min(stated, whole) if self._offset is not None else pages
@@ -116,9 +118,18 @@ def _check_claim(page: Any) -> None:
 
 
 def _stated(path: Path, file: TiffFile) -> int:
-    """Return how many pictures the metadata of ImageJ or tifffile states, 0 without metadata."""
+    """Return how many pictures the metadata of ImageJ, OME or tifffile states, 0 without metadata."""
     try:
-        if file.is_imagej and file.imagej_metadata:
+        if file.is_ome:
+            text, page = str(file.ome_metadata), _first_page(path, file)
+            files, images = set(re.findall(r'FileName="([^"]*)"', text)), len(re.findall(r"<(?:\w+:)?Pixels\b", text))
+            if len(files) > 1 or images > 1:
+                got = f"{images} movies in {max(len(files), 1)} files"
+                raise refused(path, "one movie in the file", got, "export it as one movie in one file")
+            sizes = {axis: int(size) for axis, size in re.findall(r'\bSize([CZT])="(\d{1,9})"', text)}
+            axes = [sizes["C"] // page.samplesperpixel, sizes["Z"], sizes["T"]]
+            stated = int(math.prod(axes))
+        elif file.is_imagej and file.imagej_metadata:
             notes = file.imagej_metadata
             axes = [int(notes.get(axis, 1)) for axis in ("channels", "slices", "frames")]
             stated = int(notes.get("images", 1))

@@ -4,6 +4,7 @@ import ctypes
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ from sphereorient.files.picture import OnDemand, luma
 from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
 from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, Grey, Movie, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
+from sphereorient.movies.stamps import Stamps, rate_of, spacing
 
 Found = TypeVar("Found")
 LOSSLESS = "lossless"
@@ -24,6 +26,9 @@ PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so ma
 NOTHING = "none from the decoder"
 PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
 TURNED_REMARK = "read as it is stored: players and ffmpeg turn it by {} degrees clockwise, as its rotation tag says"
+FIELDS_REMARK = "interlaced, two instants a frame; part them: ffmpeg -i MOVIE -vf bwdif=send_field -c:v ffv1 NEW.mkv"
+UNKNOWN, PROGRESSIVE = 0, 1  # field orders of FFmpeg; others are interlaced
+COARSE = 0.1  # steps of time stamps, of the usual time between frames: coarser ones are not used
 SHOWN = 8  # missing frames named in a remark
 SLACK = 1.5  # frames by which a rounded duration may be too long
 
@@ -40,29 +45,35 @@ class VideoMovie(Movie):
             self._pixels = frame.format.name
             codec = container.streams.video[0].codec_context
             form = f"{path.suffix[1:].lower()}, codec {codec.name} ({_loss(codec)}), pixels {self._pixels}"
+            by_stream = getattr(codec, "field_order", UNKNOWN) not in (UNKNOWN, PROGRESSIVE)
+            interlaced = frame.interlaced_frame or by_stream
             rate = container.streams.video[0].average_rate
             self.played_hz = float(rate) if rate else None
         self._checked = False  # whether the packets carry check sums that can be verified
         with _opened(path) as container:
-            self._index, broken = self._read_index(container)
+            self._index, end_s, broken = self._read_index(container)
             count = self._index.count
             super().__init__(path, form, count, (frame.height, frame.width), grey_dtype(frame.format))
             damaged = (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
-            cut_off = self._truncated(_stated_frames(container, count))
+            cut_off = self._truncated(_stated_frames(path, container, count, end_s))
             turned = (TURNED_REMARK.format(-frame.rotation % 360),) if frame.rotation else ()
-            self.remarks = (*damaged, *cut_off, *turned, *_remarks(container, self._pixels, self._index))
+            fields = (FIELDS_REMARK,) if interlaced else ()
+            self.times_s, spaced = _uneven_times(self._index, container.streams.video[0].time_base)
+            known = _remarks(container, self._pixels, self._index)
+            self.remarks = (*damaged, *cut_off, *turned, *fields, *spaced, *known)
 
-    def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, str]:
-        """Return the packet table, and the error that ended it, if any."""
+    def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, float, str]:
+        """Return the packet table, the end of the last frame, s, and the error that ended it, if any."""
         stream = container.streams.video[0]
         packets: list[Packet] = []
-        broken = ""
+        end, broken = 0, ""
         try:
             for number, packet in enumerate(container.demux(stream)):
                 if number < PACKETS_TRIED and stream.codec_context.name == "ffv1":
                     self._checked |= split_slices(bytes(packet)) is not None
                 if packet.size and not packet.is_discard:
                     packets.append(Packet(packet.pts, packet.dts, packet.is_keyframe, packet.pos))
+                    end = max(end, (packet.pts or 0) + (packet.duration or 0))
         except av.FFmpegError as error:
             broken = error_words(error)
         # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
@@ -70,7 +81,7 @@ class VideoMovie(Movie):
         step: Fraction | None = None
         if stream.average_rate and stream.time_base:
             step = 1 / (stream.average_rate * stream.time_base)
-        return index_packets(packets, guessed, step), broken
+        return index_packets(packets, guessed, step), float(end * (stream.time_base or 0)), broken
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         for got in self._decode(numbers):
@@ -260,16 +271,33 @@ def _remarks(container: av.container.InputContainer, pixels: str, index: PacketI
         yield f"stored as colour ({pixels}): its brightness is taken as it is; {GAMMA_CODED}"
 
 
-def _stated_frames(container: av.container.InputContainer, count: int) -> int:
+def _uneven_times(index: PacketIndex, tick: Fraction | None) -> tuple[Stamps | None, tuple[str, ...]]:
+    """Return stamps that are spaced unevenly, by a recorder, (N,), s, with a remark; None: even ones, for players."""
+    marks, tick_s = sorted({} if index.by_place else index.number_of or {}), float(tick or 0)
+    times_s = np.array(marks, np.float64) * tick_s
+    even, words = spacing(times_s, tick_s) if index.count == len(marks) > 2 else (True, "")
+    if even:
+        return None, ()
+    coarse = tick_s * rate_of(times_s) > COARSE
+    use = "too coarse for times: movies" if coarse else "times: movies uses them"
+    remark = f"time stamps in steps of {1e3 * tick_s:.3g} ms, {words}; {use}"
+    return (None if coarse else times_s), (remark,)
+
+
+def _stated_frames(path: Path, container: av.container.InputContainer, count: int, end_s: float) -> int:
     """Return how many frames the header states; 0 without, or if not more than there are."""
     stream = container.streams.video[0]
-    if stream.frames:
-        return int(stream.frames)
+    if stream.frames > count:  # an edit list hides frames of a movie that was cut without encoding
+        with av.open(str(path), options={"ignore_editlist": "1"}) as whole, suppress(av.FFmpegError):
+            count = sum(bool(packet.size) for packet in whole.demux(whole.streams.video[0]))
+        return int(stream.frames) if count < stream.frames else 0
     matroska = "matroska" in container.format.name and len(container.streams) == 1
     if not (matroska and container.duration and stream.average_rate):
         return 0
-    whole = container.duration * stream.average_rate / av.time_base
-    return round(whole) if count < whole - SLACK else 0
+    rate = float(stream.average_rate)
+    # Of unevenly spaced frames only the end tells, of many in a step of their stamps only the number.
+    missing = min(container.duration * rate / av.time_base - count, (container.duration / av.time_base - end_s) * rate)
+    return count + round(missing) if missing > SLACK else 0
 
 
 def _loss(context: av.CodecContext) -> str:

@@ -23,6 +23,7 @@ from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import CameraScene, fixed_ball, still_ball, swaying_ball, wander_px
 from sphereorient.movies import Movie, movie_files, open_movie
+from sphereorient.movies.stamps import rate_of
 from sphereorient.preflight.sample import sample_movie
 
 WIDE_DEG = 30.0  # field of view that is the example
@@ -101,7 +102,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
             # Of a ball that sinks: in a few frames it nearly stays.
             outline, _ = swaying_ball(stream.spread(SLOW_PICTURES), settings, shown=shown)
             seen, stays, sways, radius_px = True, True, True, outline.radius_px
-    rate_hz = None if movie.times_s is None or len(movie) < 2 else 1 / float(np.median(np.diff(movie.times_s)))
+    rate_hz = None if movie.times_s is None or len(movie) < 2 else rate_of(movie.times_s)
     return FirstLook(
         name=name,
         movie=movie,
@@ -144,7 +145,7 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
     hidden = "black where something that does not move hides the ball: `sphereorient mark` draws them"
     return [
         key("name", "free", folder.resolve().name),
-        _rate_key(looks),
+        *_rate_keys(looks),
         key("exposure", EXPOSURE, example=0.0004),
         *_sphere_keys(looks),
         key("cameras", made, "cameras.yaml"),
@@ -154,21 +155,24 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
         key("circles", "outline of a fixed ball, else found: u, v, radius, px", example=each([320.0, 240.0, 90.0])),
         key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
         key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
-        key("flip", "mirrored movies: vertical, horizontal, both", example=each("vertical")),
+        key("flip", "mirrored movies: vertical, horizontal, both, transpose", example=each("vertical")),
         key("response", "of the cameras: linear, srgb, {gamma: 2.2}, or a table; learnt without it", example="srgb"),
         key("flow", "SI, for reports", example=FLOW),
         key("camera", "what `live` sets on each device; trigger: none runs freely", example=each(DEVICE)),
     ]
 
 
-def _rate_key(looks: Sequence[FirstLook]) -> DraftKey:
+def _rate_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
     if all(one.photograph for one in looks):
-        return DraftKey(name="frame_rate", value=1.0, comment="Hz; any, of one picture")
+        return [DraftKey(name="frame_rate", value=1.0, comment="Hz; any, of one picture")]
     rate = looks[0].rate_hz
     if rate is not None and all(one.rate_hz for one in looks):
-        return DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
+        times = DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
+        units = f"of these stamps, not stated in the files: s, or by their size {looks[0].movie.likely_units}"
+        asked = DraftKey(name="time_unit", comment=units, example="ms", asked=True)
+        return [times, asked] if looks[0].movie.likely_units else [times]
     played = next((f"; players show it at {one.movie.played_hz:g}" for one in looks if one.movie.played_hz), "")
-    return DraftKey(name="frame_rate", comment=f"Hz, of the recording{played}", example=600.0, asked=True)
+    return [DraftKey(name="frame_rate", comment=f"Hz, of the recording{played}", example=600.0, asked=True)]
 
 
 def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:

@@ -406,11 +406,12 @@ def test_a_camera_of_opencv_that_ends_or_changes_its_pictures_is_told_once_and_t
     assert all(device.released for device in devices[:6])
 
 
-def test_pictures_are_mirrored_as_those_of_the_movie_are(alone, monkeypatch):
-    picture = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH)
-    opencv(monkeypatch, Capture([picture]))
-    mirrored = replace(alone, experiment=replace(alone.experiment, flip={"cam1": "horizontal"}))
-    np.testing.assert_array_equal(next(source_of("camera:0", print).frames(mirrored)).pictures[0], picture[:, ::-1])
+@pytest.mark.parametrize("how", ["horizontal", "transpose"])
+def test_pictures_are_mirrored_as_those_of_the_movie_are(alone, monkeypatch, how):
+    seen = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH)
+    opencv(monkeypatch, Capture([np.ascontiguousarray(seen.T if how == "transpose" else seen[:, ::-1])]))
+    mirrored = replace(alone, experiment=replace(alone.experiment, flip={"cam1": how}))
+    np.testing.assert_array_equal(next(source_of("camera:0", print).frames(mirrored)).pictures[0], seen)
 
 
 TURNS = {90: (0, -1, 1, 0), 180: (-1, 0, 0, -1)}  # of a display matrix

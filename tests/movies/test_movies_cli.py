@@ -114,7 +114,7 @@ def test_convert_goes_on_after_frames_that_cannot_be_decoded(tmp_path, monkeypat
         (["movie.npy", "out.mkv", "--frames", "5:5"], "expected A:B within 0:30"),
         (["movie.npy", "out.mkv", "--frames", "5:99"], "expected A:B within 0:30"),
         (["movie.npy", "out.mkv", "--frames", "some"], "expected A:B within 0:30"),
-        (["movie.npy", "out.mkv", "--flip", "up"], "expected none, vertical, horizontal, both, got 'up'"),
+        (["movie.npy", "out.mkv", "--flip", "up"], "expected none, vertical, horizontal, both, transpose, got 'up'"),
         (["none.npy", "out.mkv"], "got no such file"),
     ],
 )

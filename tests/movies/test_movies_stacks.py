@@ -156,7 +156,7 @@ def test_times_beside_the_data_set_are_the_movies(tmp_path, name):
         (np.arange(FRAMES - 1.0), None, "one number a frame"),
         (np.zeros(FRAMES), None, "increase"),
         (np.full(FRAMES, np.nan), None, "increase"),
-        (np.arange(float(FRAMES)), "ms", "in ms"),
+        (np.arange(float(FRAMES)), "min", "in min"),
     ],
     ids=["length", "stand still", "nan", "unit"],
 )

@@ -150,7 +150,7 @@ def test_a_draft_has_every_key_and_valid_examples(tmp_path):
     ExperimentKeys.model_validate(document)
     names = {key for key in leaves(ExperimentKeys) if not key.startswith("flow.")} | {"flow"}
     written = {key.name for key in keys}
-    assert names - written == {"times", "spheres"}  # instead of frame_rate and sphere
+    assert names - written == {"times", "time_unit", "spheres"}  # instead of frame_rate and sphere
 
 
 def test_a_key_that_is_not_one_is_refused_with_its_neighbour():

@@ -86,13 +86,15 @@ def test_the_mask_is_saved_and_named(marking):
     assert not again[200, 200]
 
 
-def test_a_mirrored_movie_keeps_its_mask_where_it_was_drawn(clean, tmp_path):
-    marking = MaskMarking(write(clean, tmp_path / "experiment", flip={"cam1": "vertical"}))
+@pytest.mark.parametrize("how", ["vertical", "transpose"])
+def test_a_mirrored_movie_keeps_its_mask_where_it_was_drawn(clean, tmp_path, how):
+    marking = MaskMarking(write(clean, tmp_path / "experiment", flip={"cam1": how}))
     marking.save("cam1", [TRIANGLE], keep=True)
     experiment = load_experiment(marking.path)
     file = cv2.imread(str(experiment.mask_paths["cam1"]), cv2.IMREAD_GRAYSCALE)
-    assert file[-21, 20] == 0  # as the file of the movie lies
-    assert not given_mask(experiment, "cam1", (240, 240))[20, 20]
+    drawn = drawn_mask((240, 240), [TRIANGLE], None)
+    assert np.array_equal(file > 127, drawn[::-1] if how == "vertical" else drawn.T)  # as the file of the movie lies
+    assert np.array_equal(given_mask(experiment, "cam1", (240, 240)), drawn)
 
 
 def test_comments_and_other_keys_of_the_file_stay(marking):
