@@ -34,6 +34,27 @@ import yaml
 REPO = Path(__file__).resolve().parents[1]
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
 KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what nobody can measure
+CASES = """
+camera_files_of_others: convert-cameras ros_camera_info.yaml --out ros.yaml
+camera_files_of_others: convert-cameras anipose.toml --out anipose.yaml
+camera_files_of_others: convert-cameras colmap_cameras.txt --out colmap.yaml
+edit_list: movie cut.mp4
+fictrac_camera_source: init --from-fictrac config.txt
+fictrac_empty_ignore: init --from-fictrac config.txt
+fictrac_fisheye: init --from-fictrac config.txt
+fictrac_no_c2a_r: init --from-fictrac config.txt
+hdf5_four_axes: movie nchw.h5
+hdf5_four_axes: movie pkg.slp
+interlaced: movie interlaced.mp4
+matlab_hdf5: movie matlab73.mat
+matlab_hdf5: movie h5create.h5
+opencv_two_intrinsics: convert-cameras a.yml b.yml --names cam1,cam2 --out c.yaml
+openptv_par: convert-cameras cam1.ori cam2.ori --par pyptv.yaml --out c.yaml
+time_units: init ms.h5 --vfov 30 --set sphere.diameter=null
+variable_rate: movie vfr.mp4
+near_ball: check experiment.yaml
+sharp_pictures: check experiment.yaml
+"""  # of ../shared/cases: files of others that were read wrongly once
 SHOWN = 60  # letters of a word in the protocol
 CALLS = """
 import sphereorient; from sphereorient import Trajectory, load_texture
@@ -99,7 +120,7 @@ def run(folder: Path, *words: str, wrong: bool = False) -> None:
     done = subprocess.run([*PROGRAM, *words], cwd=folder, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - begun
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    lines = [line for line in done.stdout.splitlines() if line.startswith(("doubtful", "fault", "warning"))]
+    lines = [line for line in done.stdout.splitlines() if line.startswith(("doubtful", "fault", "warning", "remark"))]
     if done.returncode == 2:
         lines = done.stderr.strip().splitlines()[-1:]
     last = f"{done.returncode}: " + " / ".join(lines) if wrong else ""
@@ -197,6 +218,11 @@ def wrong(shared: Path, folder: Path) -> None:
     run(folder, "track", "swapped.yaml", "--out", "track.h5", wrong=True)
     run(folder, "track", "experiment.yaml", "--out", "plates", wrong=True)
     run(folder, "report", "experiment.yaml", "--out", "report", wrong=True)
+    head("command, with a file of others")
+    for case in CASES.strip().splitlines():
+        name, words = case.split(": ")
+        shutil.copytree(shared / "cases" / name, folder / name, dirs_exist_ok=True)
+        run(folder / name, *words.split(), "--force", wrong=True)
 
 
 def notebook(shared: Path, folder: Path) -> None:

@@ -138,8 +138,8 @@ class LinesOfSight:
         return tuple(np.broadcast_to(part, shape).astype(np.float64) for part, shape in zip(found, shapes, strict=True))
 
     def of_size(self, middle_px: NDArray[np.float64], mm_px: float) -> tuple[NDArray[np.float64], ...]:
-        """Return the lines of sight nearest to B places (B, 2), px: direction (B, 3), the point (B, 3), lab, mm, where a
-        pixel is `mm_px` wide, and its distance (B,), mm, from their origin; of parallel ones their origin.
+        """Return the lines of sight nearest to B places (B, 2), px: direction (B, 3), the point (B, 3), lab, mm, where
+        a pixel is `mm_px` wide, and its distance (B,), mm, from their origin; of parallel ones their origin.
         """
         direction, origin, pitch_rad, pitch_mm = self.about(middle_px)
         distance = np.divide(mm_px - pitch_mm, pitch_rad, out=np.zeros_like(pitch_rad), where=pitch_rad > 0)
