@@ -31,9 +31,9 @@ from sphereorient.pose.fit import (
     HOPELESS,
     LEAST_OF_WINDOW,
     MARGIN_PX,
-    MORE,
     MOST_EACH,
     WINDOW_PX,
+    further_steps,
 )
 from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel, SphereView
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
@@ -270,7 +270,8 @@ def _near(
 ) -> tuple[Any, "_Addresses", object]:
     """Return the record of fits but for their frames, with what gives further addresses and what else it points to."""
     task, at = _task_of(begin, model, instants)
-    near = Near(task=task, some_more=MORE[0], all_more=MORE[1], near_rad=model.near_rad, most_hidden=hidden)
+    some, more = further_steps(model)
+    near = Near(task=task, some_more=some, all_more=more, near_rad=model.near_rad, most_hidden=hidden)
     near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
     known = [_of_view(view) for view in views]
     scene = (_Scene * len(views))(*(one[0] for one in known))

@@ -264,11 +264,18 @@ def settle(
     Return also which poses that moved far, (B,) bool: nothing else was done there; the disks are to be cut out anew.
     """
     pixels = moved_to(begin.R_lab_body.device, disks.pixels().exposed(begin.moved, instants))
+    some, more = further_steps(model)
     if not first:
-        fit, far = _step(pixels, begin, model, MORE[1], most_hidden)
+        fit, far = _step(pixels, begin, model, more, most_hidden)
         return fit, torch.zeros_like(far)
-    near, far = _step(pixels.thinned(FIRST_EVERY), begin, model, MORE[0])
-    return near.where(far, _step(pixels, begin.after(near), model, MORE[1], most_hidden)[0]), far
+    near, far = _step(pixels.thinned(FIRST_EVERY), begin, model, some)
+    return near.where(far, _step(pixels, begin.after(near), model, more, most_hidden)[0]), far
+
+
+def further_steps(model: SphereModel) -> tuple[int, int]:
+    """Return how many further iterations follow a long step, of some pixels and of all: more for a narrower blur."""
+    some, more = (math.ceil(count * max(1.0, NEAR_RAD / model.near_rad)) for count in MORE)
+    return some, more
 
 
 def _step(

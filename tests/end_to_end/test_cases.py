@@ -26,7 +26,7 @@ def live(folder: Path, source: str = "movie-fast", experiment: str = "experiment
     return [json.loads(line) for line in (folder / "p.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize(("name", "most_deg"), [("near_ball", (0.01, 0.02)), ("sharp_pictures", (0.06, 0.15))])
+@pytest.mark.parametrize(("name", "most_deg"), [("near_ball", (0.01, 0.02)), ("sharp_pictures", (0.04, 0.13))])
 def test_a_near_ball_and_sharp_pictures_are_measured(name, most_deg, tmp_path):
     folder = Path(shutil.copytree(CASES / name, tmp_path / name))
     truth = np.load(folder / "truth.npz")["R"]
