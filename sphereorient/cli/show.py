@@ -13,6 +13,7 @@ from sphereorient.cli.options import (
     Align,
     CommonOptions,
     ExperimentPath,
+    FicTracConfig,
     Quiet,
     SphereName,
     TrackPath,
@@ -150,6 +151,7 @@ def export(
         ),
     ] = None,
     experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None,
+    axes: FicTracConfig = None,
     sphere: SphereName = None,
     quiet: Quiet = False,
 ) -> None:
@@ -161,13 +163,14 @@ def export(
     to = format_of(out, to)
     loaded = tracks_in(track, sphere)
     paths = _paths(out, loaded)
-    camera = None
+    of_table = None
     if experiment is not None:
         from sphereorient.experiment import load_experiment
+        from sphereorient.preflight.fictrac import fictrac_axes
 
-        camera = next(iter(load_experiment(experiment).cameras.values()))
+        of_table = fictrac_axes(next(iter(load_experiment(experiment).cameras.values())), axes)
     with progress_bar(quiet) as advance:
         for ball, path in paths.items():
-            export_track(loaded[ball], path, to, partial(advance, f"export {ball}".strip()), camera)
+            export_track(loaded[ball], path, to, partial(advance, f"export {ball}".strip()), of_table)
     for ball, path in paths.items() if not quiet else ():
         typer.echo(f"Wrote {path}: {len(loaded[ball])} frames")

@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, ball_words
+from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfig, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 from sphereorient.files.whole_file import check_ending
 
@@ -187,6 +187,7 @@ class _LiveOptions(CameraOptions):
     ] = None
     record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
+    axes: FicTracConfig = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
 
 
@@ -216,7 +217,7 @@ def live(given: _LiveOptions) -> None:
             got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
             raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
         if given.page is not None:
-            page = PageProcess(given.experiment, given.names, given.page, _tell)
+            page = PageProcess(given.experiment, given.names, given.page, _tell, given.axes)
             opened.callback(page.close)
             typer.echo(f"page: {page.address}", err=True)
         set_up = opened.enter_context(open_live(given.experiment, chosen, given.names, given.learnt))
@@ -233,7 +234,7 @@ def live(given: _LiveOptions) -> None:
         for stream in set_up.recording.streams if movies else ():
             recorders.append(Recorder(movies[stream.name], stream.movie, frame_s, _tell, wait=source.waits))
             opened.callback(recorders[-1].close)
-        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell)
+        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell, given.axes)
         if set_up.save_map is not None:
             _tell("the map is finished; this takes some seconds")
             try:
