@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from sphereorient.statistics.behaviour import Behaviour
 
 
-APART_DEG = 1.0  # angle between lab axes that is worth a remark
+APART_DEG = 1.0  # angle between axes that is worth a remark
+EXPLAINED = 0.5  # of the median error, left after a constant turn of the body axes that is worth one
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -83,6 +84,8 @@ def score(
     as_json: Annotated[bool, Option("--json", help="Print orientation errors and behaviour as JSON.")] = False,
 ) -> None:
     """Print the errors of a track against exact truth, and gain, drift and walk against truth or another tracker."""
+    import numpy as np
+
     from sphereorient.bench import score_track
     from sphereorient.bench.score import against, given_to_others, named_as_true, reference_of
 
@@ -96,8 +99,8 @@ def score(
         if as_json:
             numbers.append({"ball": name, "exact": of.exact, **error_numbers(errors), **behaviour.numbers()})
             continue
-        if of.exact and align == "none":
-            print_table(error_table(score_track(one, reference), name))
+        if of.exact and align != "both":
+            print_table(error_table(score_track(one, reference, align), name))
         else:
             print_errors(errors, name, "error" if of.exact else "difference")
         print_table(behaviour_table(behaviour, name, exact=of.exact))
@@ -105,6 +108,11 @@ def score(
             typer.echo(
                 f"The lab axes are {behaviour.apart_deg:.1f} degrees apart: --align both takes that off.", err=True
             )
+        if align == "none" and np.isfinite(errors).any():
+            usual, left = (float(np.nanmedian(part)) for part in (errors, against(of, one, "body")[0]))
+            if usual > APART_DEG and left < EXPLAINED * usual:
+                words = f"A constant turn of the body axes explains most: {usual:.2f} degrees are {left:.3g} without it"
+                typer.echo(f"{words}; --align body takes it off. A learnt map has axes of its own.", err=True)
         given = given or (given_to_others(tracks, reference) if of.exact and len(tracks) > 1 else {})
         if name in given:
             wrong, changes = given[name]

@@ -65,6 +65,32 @@ def test_the_errors_of_a_track_are_printed(track):
     assert all(name in words for name in ("acceleration", "omega_body", "alpha_lab", "alpha_body"))
 
 
+def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
+    """As of a learnt map: errors of 150 degrees, and one rotation explains them."""
+    loaded, turn = Trajectory.load(track), Rotation.from_rotvec([2.0, 1.5, -0.8]).as_matrix()
+    with h5py.File(TRUTH) as file:
+        rates = {key: file[key][()] for key in ("omega_lab", "omega_body", "alpha_body") if key in file}
+    rates |= {key: rates[key] @ turn for key in ("omega_body", "alpha_body")}  # components in axes that are turned
+    off = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix() @ loaded.orientation @ turn
+    off[3] = np.nan
+    cov = np.tile(np.eye(3) * 0.01**2, (40, 1, 1))
+    replace(loaded, orientation=off, orientation_cov=cov, **rates).save(track)
+    plain, body = (CliRunner().invoke(app, ["score", str(track), str(TRUTH), *more])
+                   for more in ((), ("--align", "body")))  # fmt: skip
+    assert "--align body" in plain.stderr
+    assert "--align body" not in body.stderr
+    found = score_track(Trajectory.load(track), TRUTH, "body")
+    assert found.percentiles_deg()[3] < 1.2  # 0.01 rad in the lab; the turn takes some of it
+    assert found.over_stated()[0] < 1.2
+    assert found.relative_rms["omega_body"] == pytest.approx(0.0, abs=0.03)
+    assert found.relative_rms["omega_lab"] == pytest.approx(0.0, abs=1e-9)
+    assert score_track(Trajectory.load(track), TRUTH).percentiles_deg()[0] > 100
+
+
+def test_a_right_track_gets_no_such_hint(track):
+    assert "--align" not in CliRunner().invoke(app, ["score", str(track), str(TRUTH)]).stderr
+
+
 def refused(*arguments: object, error: type[Exception] = TrackError) -> str:
     run = CliRunner().invoke(app, ["score", *map(str, arguments)])
     assert isinstance(run.exception, error), (run.exception, run.output)
