@@ -63,12 +63,20 @@ filmed = SphereRenderer(texture, radius_mm=9.0, camera=camera)
 truth = torch.tensor([0.6, -0.4, 0.0])
 grey = 200 * filmed(R_true, truth) + torch.randn(160, 160, generator=torch.Generator().manual_seed(0))
 fitter = PoseFitter(camera, texture, radius_mm=9.0, diameter_px=79.0)
-R, X, covariance = fitter(grey, so3.exp(torch.tensor([0.05, -0.04, 0.03], dtype=torch.float64)) @ R_true, truth)
-off, sigma = (
-    math.degrees(value) for value in (float(so3.geodesic_distance(R, R_true)), float(covariance[:3, :3].trace().sqrt()))
-)
-print(f"off by {off:.3f} degrees, stated {sigma:.3f}")
+fit = fitter(grey, so3.exp(torch.tensor([0.05, -0.04, 0.03], dtype=torch.float64)) @ R_true, truth)
+off = math.degrees(so3.geodesic_distance(fit.R_lab_body, R_true))
+sigma = math.degrees(fit.covariance[:3, :3].trace().sqrt())
+print(f"off by {off:.3f} degrees, stated {sigma:.3f}; score {float(fit.score[0]):.3f}")
+assert fit.success
 assert off < 5 * sigma
+
+# %% [markdown]
+# A start that is too far away ends elsewhere: the fit says so, and states no error.
+
+# %%
+lost = fitter(grey, so3.exp(torch.tensor([0.0, 1.5, 0.0], dtype=torch.float64)) @ R_true, truth)
+print(lost.reason, f"score {float(lost.score[0]):.2f}")
+assert not lost.success
 
 # %% [markdown]
 # ## Gradients
@@ -77,7 +85,7 @@ assert off < 5 * sigma
 
 # %%
 delta = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-loss = (filmed(so3.exp(delta) @ R, X) - grey / 200).square().mean()
+loss = (filmed(so3.exp(delta) @ fit.R_lab_body, fit.position_lab_mm) - grey / 200).square().mean()
 loss.backward()
 print("slope by the rotation:", delta.grad)
 

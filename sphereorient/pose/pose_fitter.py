@@ -1,6 +1,7 @@
 """`PoseFitter`: poses from pictures without the pipeline."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,12 +12,39 @@ from sphereorient.cameras import Camera
 from sphereorient.errors import CameraError, SettingsError, ShapeError, check_finite, check_tail, refusal, tensor_of
 from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, base_table
+from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import first_fitter
-from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.poses import FittedPoses, PoseStart, blank_parts
 from sphereorient.so3 import check_rotations
 from sphereorient.sphere.texture import as_texture
 
 NOISE = 1.0  # grey levels, of a background of one grey
+LEAST_SCORE = 0.5  # of right poses 0.9 and more; of fits that ended elsewhere 0.4 at most
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseFit:
+    """Poses that `PoseFitter` ended at, of any leading shape; float64. Those without `success` are no measurement."""
+
+    R_lab_body: Tensor  # (..., 3, 3)
+    position_lab_mm: Tensor  # (..., 3)
+    covariance: Tensor  # (..., 6, 6), of delta (rad, lab) and position (mm); NaN without success
+    score: Tensor  # (..., C), share of each picture's variance that the pose explains, 1 at best
+    last_step_rad: Tensor  # (...), turn by the last step of the fit
+    explained: Tensor  # (...) bool, whether the scores' mean is at least 0.5
+    converged: Tensor  # (...) bool, whether the last step was shorter than 0.006 rad
+
+    @property
+    def success(self) -> Tensor:
+        """Whether the pose explains the pictures and the fit came to rest there, (...) bool."""
+        return self.explained & self.converged
+
+    @property
+    def reason(self) -> list[str]:
+        """Why a pose is none, of each pose one after the other; empty where it is one."""
+        each = zip(self.explained.flatten().tolist(), self.converged.flatten().tolist(), strict=True)
+        none, on = "the pose does not explain the pictures: start nearer", "the last step was long: go on from here"
+        return [("" if rests else on) if explains else none for explains, rests in each]
 
 
 class PoseFitter(nn.Module):
@@ -73,10 +101,10 @@ class PoseFitter(nn.Module):
         pictures: Tensor | NDArray[np.generic],
         R_lab_body: ArrayLike | Tensor,
         position_lab_mm: ArrayLike | Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return fitted R_lab_body (..., 3, 3), position_lab_mm (..., 3) and covariance (..., 6, 6), float64.
-        The covariance is of delta (rad, lab) and position (mm). Pictures (..., C, H, W) are grey levels, (..., H, W)
-        for a single camera; the start is right to about 10 degrees and a few pixels.
+    ) -> PoseFit:
+        """Return the poses at which fits from a start (..., 3, 3), (..., 3) ended, and whether they are right.
+        Pictures (..., C, H, W) are grey levels, (..., H, W) for a single camera; the start is right to about 10 degrees
+        and a few pixels.
 
         Raises:
             ShapeError: shapes that do not fit together, starts that are no rotations, pictures that are not finite.
@@ -99,11 +127,21 @@ class PoseFitter(nn.Module):
         frames = [[_grey(one) for one in row] for row in grey.reshape(-1, len(views), height, width)]
         R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
         use = torch.ones(len(R), len(views), dtype=torch.bool)
-        covariance = torch.zeros(len(R), 6, 6, dtype=torch.float64)
+        fit = FittedPoses(**blank_parts(len(views), 0))
         if len(R):
             fit = fitter.fit_through(fitter.optics.steps, frames, PoseStart(X, R, use))
-            R, X, covariance = fit.R_lab_body, fit.position_lab_mm, fit.covariance
-        return R.reshape(*lead, 3, 3), X.reshape(*lead, 3), covariance.reshape(*lead, 6, 6)
+        step = fit.step[:, :3].norm(dim=1)
+        explained, converged = fit.score.mean(1) >= LEAST_SCORE, step < NEAR_RAD
+        covariance = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
+        return PoseFit(
+            R_lab_body=fit.R_lab_body.reshape(*lead, 3, 3),
+            position_lab_mm=fit.position_lab_mm.reshape(*lead, 3),
+            covariance=covariance.reshape(*lead, 6, 6),
+            score=fit.score.reshape(*lead, len(views)),
+            last_step_rad=step.reshape(lead),
+            explained=explained.reshape(lead),
+            converged=converged.reshape(lead),
+        )
 
 
 def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:
