@@ -16,7 +16,7 @@ from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.poses import FittedPoses, PoseStart, blank_parts
 from sphereorient.so3 import check_rotations
-from sphereorient.sphere.texture import as_texture
+from sphereorient.sphere import known_paint
 
 NOISE = 1.0  # grey levels, of a background of one grey
 LEAST_SCORE = 0.5  # of right poses 0.9 and more; of fits that ended elsewhere 0.4 at most
@@ -52,11 +52,12 @@ class PoseFitter(nn.Module):
 
     Args:
         cameras: one, or C of them.
-        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint.
         radius_mm: of the sphere.
         diameter_px: expected diameter of the sphere's disk in the pictures.
         blur_px: standard deviation of optics, pixel and exposure together, px.
         background: (C, H, W), grey levels of the scene without the sphere; None: black.
+        unseen: (H, 2 H) bool, texels of no known paint too, see `load_unseen`: they do not count.
 
     Raises:
         CameraError: something else than cameras.
@@ -73,6 +74,7 @@ class PoseFitter(nn.Module):
         diameter_px: float,
         blur_px: float = FIRST_BLUR_PX,
         background: Tensor | NDArray[np.generic] | None = None,
+        unseen: Tensor | NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__()
         seen = list(cameras) if isinstance(cameras, Sequence) else [cameras]
@@ -83,7 +85,8 @@ class PoseFitter(nn.Module):
         for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px)):
             if not value > 0:
                 raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do="measure it"))
-        self.register_buffer("texture", as_texture(texture).float())
+        paint, hidden = known_paint(texture, unseen)
+        self.register_buffer("texture", paint.float())
         views = []
         for k, camera in enumerate(seen):
             width, height = camera.image_size
@@ -93,7 +96,7 @@ class PoseFitter(nn.Module):
                 background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
             )
             views.append(CameraView.of(f"camera {k + 1}", camera, scene))
-        base = base_table(self.get_buffer("texture").cpu(), diameter_px)
+        base = base_table(self.get_buffer("texture").cpu(), diameter_px, None if hidden is None else hidden.cpu())
         self.fitter = first_fitter(views, radius_mm, base, blur_px)
 
     def forward(

@@ -184,6 +184,19 @@ def as_texture(texture: Any) -> Tensor:
     return values
 
 
+def known_paint(texture: Any, unseen: Any = None) -> tuple[Tensor, Tensor | None]:
+    """Return a map as `as_texture`, grey where no paint is known, and these texels (H, 2 H) bool: NaN, or True in
+    `unseen`, see `load_unseen`; None: paint is known everywhere. Raise ShapeError for `unseen` of another shape.
+    """
+    values = as_texture(texture)
+    hidden = values.detach().isnan()
+    if unseen is not None:
+        also = tensor_of("unseen", unseen)
+        check_tail("unseen", also, *values.shape)
+        hidden = hidden | also.bool().to(hidden.device)
+    return (torch.where(hidden, 0.5, values), hidden) if bool(hidden.any()) else (values, None)
+
+
 def check_texture_shape(texture: Tensor) -> None:
     """Raise ShapeError unless the tensor is one map (H, 2 H), H at least 2."""
     if texture.ndim != 2 or texture.shape[1] != 2 * texture.shape[0] or len(texture) < SPLINE_TEXELS:

@@ -13,6 +13,7 @@ from sphereorient import so3
 from sphereorient.errors import ShapeError
 from sphereorient.pose import camera_view
 from sphereorient.pose.pose_fitter import PoseFitter
+from sphereorient.sphere.texture import map_directions
 
 RIG = rig_of(64.0)
 
@@ -68,6 +69,23 @@ def test_a_fit_that_ends_elsewhere_is_no_success_and_states_no_error(seen, away_
     assert bool(found.covariance.isnan().all())
     assert float(found.score.mean(-1).max()) < 0.5
     assert all("start nearer" in why for why in found.reason)
+
+
+def test_paint_that_is_not_known_does_not_count(seen):
+    """Grey there would pull the pose."""
+    _, X, R, pictures = seen
+    paint = paint_of("patches")
+    unseen = map_directions(len(paint))[..., 2] < -0.3
+    made = {"radius_mm": RADIUS_MM, "diameter_px": 64.0, "blur_px": BLUR_PX}
+    made |= {"background": torch.full((2, *pictures.shape[-2:]), BEHIND)}
+    fits = [
+        PoseFitter(RIG.cameras, paint, unseen=unseen, **made),
+        PoseFitter(RIG.cameras, torch.where(unseen, torch.nan, paint), **made),
+    ]
+    named, by_nan = (fitter(pictures, turned(R, 3.0, 1), X) for fitter in fits)
+    assert torch.equal(named.R_lab_body, by_nan.R_lab_body)
+    assert bool(named.success.all())
+    assert math.degrees(float(so3.geodesic_distance(named.R_lab_body, R).max())) < 0.2
 
 
 def test_one_wrong_start_does_not_spoil_the_others(seen):
