@@ -217,7 +217,7 @@ def live(given: _LiveOptions) -> None:
             got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
             raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
         if given.page is not None:
-            page = PageProcess(given.experiment, given.names, given.page, _tell, given.axes)
+            page = PageProcess(given.experiment, given.names, given.page, _tell)
             opened.callback(page.close)
             typer.echo(f"page: {page.address}", err=True)
         set_up = opened.enter_context(open_live(given.experiment, chosen, given.names, given.learnt))

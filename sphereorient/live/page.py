@@ -38,10 +38,9 @@ from sphereorient.live.feed import Arrival, Feed, FrameBytes, Tell
 from sphereorient.live.lines import FicTracLines
 from sphereorient.live.live import Measured
 from sphereorient.live.shared import POSES, WORD, SharedFrames, SlotReader
-from sphereorient.preflight.fictrac import fictrac_axes
 from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
-from sphereorient.trajectory.walk import FICTRAC
+from sphereorient.trajectory.walk import FICTRAC, FicTracAxes
 
 KEPT = 1000  # latencies
 LOST_S = 0.5  # without a pose: then it is told
@@ -213,15 +212,13 @@ def _shown_bytes(recording: Recording) -> int:
 class PageProcess(PageWriter):
     """A page in the browser, served by a process of its own; port 0: any free one. Raise OutputError: it is in use."""
 
-    def __init__(
-        self, experiment: Path, cameras: Sequence[str] | None, port: int, tell: Tell, fictrac: Path | None = None
-    ) -> None:
+    def __init__(self, experiment: Path, cameras: Sequence[str] | None, port: int, tell: Tell) -> None:
         door, token = listen(port, "--page", OutputError), new_token()
         memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
         folder = Path(tempfile.mkdtemp(prefix="sphereorient-", dir=memory))
         spawn = multiprocessing.get_context("spawn")
         commands, theirs = spawn.Pipe()
-        given = (experiment, cameras, fictrac), folder, token, door, theirs
+        given = experiment, cameras, folder, token, door, theirs
         self.process = spawn.Process(target=_serve, args=given, name="page", daemon=True)
         self.process.start()
         self.address = address(door, token)
@@ -252,11 +249,7 @@ def _obeyed(word: str, running: Event, save_map: Callable[[], str] | None) -> st
 
 
 def _serve(
-    shown: tuple[Path, Sequence[str] | None, Path | None],
-    folder: Path,
-    token: str,
-    door: socket.socket,
-    commands: Connection,
+    experiment: Path, cameras: Sequence[str] | None, folder: Path, token: str, door: socket.socket, commands: Connection
 ) -> None:
     """Serve the page until the loop's process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
@@ -266,9 +259,8 @@ def _serve(
     cv2.setNumThreads(1)
     limit_cores(1)
     # The loop opens the same files, and tells what is wrong with them.
-    experiment, cameras, fictrac = shown
     with suppress(SphereOrientError), open_recording(experiment, cameras, textured=False) as recording:
-        page = LivePage(recording, folder, commands, fictrac)
+        page = LivePage(recording, folder, commands)
         Thread(target=PageServer(page, door, token).serve_forever, name="page", daemon=True).start()
         page.follow()
     shutil.rmtree(folder, ignore_errors=True)  # where the loop was killed
@@ -277,10 +269,10 @@ def _serve(
 class LivePage:
     """What the page shows and does, in its process: it reads the rings in a folder, and sends commands to the loop."""
 
-    def __init__(self, recording: Recording, folder: Path, commands: Connection, fictrac: Path | None = None) -> None:
+    def __init__(self, recording: Recording, folder: Path, commands: Connection) -> None:
         self._recording, self._folder, self._commands = recording, folder, commands
         self._layout = FrameBytes(recording.streams)
-        self._lines = FicTracLines(fictrac_axes(next(iter(recording.cameras.values())), fictrac))
+        self._lines = FicTracLines(FicTracAxes.of_lab(next(iter(recording.cameras.values())).R_cam_lab.numpy()))
         self._rings: tuple[SlotReader, SlotReader] | None = None  # None: not begun yet
         self._replies: SimpleQueue[Json] = SimpleQueue()
         self._lock, self._asking, self._running = Lock(), Lock(), True

@@ -30,7 +30,6 @@ class PoseFit:
     position_lab_mm: Tensor  # (..., 3)
     covariance: Tensor  # (..., 6, 6), of delta (rad, lab) and position (mm); NaN without success
     score: Tensor  # (..., C), share of each picture's variance that the pose explains, 1 at best; 0: of unseen paint
-    last_step_rad: Tensor  # (...), turn by the last step of the fit
     explained: Tensor  # (...) bool, whether the scores' mean is at least 0.5
     converged: Tensor  # (...) bool, whether the last step was shorter than 0.006 rad
 
@@ -133,16 +132,14 @@ class PoseFitter(nn.Module):
         fit = FittedPoses(**blank_parts(len(views), 0))
         if len(R):
             fit = fitter.fit_through(fitter.optics.steps, frames, PoseStart(X, R, use))
-        step = fit.step[:, :3].norm(dim=1)
         seen = (fit.score != 0).sum(1).clamp_min(1)  # cameras to which hardly any known paint is turned have 0
-        explained, converged = fit.score.sum(1) >= LEAST_SCORE * seen, step < NEAR_RAD
+        explained, converged = fit.score.sum(1) >= LEAST_SCORE * seen, fit.step[:, :3].norm(dim=1) < NEAR_RAD
         covariance = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
         return PoseFit(
             R_lab_body=fit.R_lab_body.reshape(*lead, 3, 3),
             position_lab_mm=fit.position_lab_mm.reshape(*lead, 3),
             covariance=covariance.reshape(*lead, 6, 6),
             score=fit.score.reshape(*lead, len(views)),
-            last_step_rad=step.reshape(lead),
             explained=explained.reshape(lead),
             converged=converged.reshape(lead),
         )
