@@ -1,6 +1,6 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -229,15 +229,15 @@ def against(reference: Reference, track: Trajectory, align: str = "none") -> tup
     return errors_deg, behaviour_of(track, reference, align == "both")
 
 
-def another_result(truth_path: Path, frame: Frames, R: Floats) -> tuple[Trajectory, Floats]:
-    """Return another program's orientations (N, 3, 3) in frames (N,) of a ball in its place as a track, and the true
-    ones; raise TrackError if the truth has too few.
+def another_result(path: Path, truth_path: Path) -> Trajectory:
+    """Return the orientations of a FicTrac .dat, of a ball in its place, as a track at the times of a truth; raise
+    TrackError if the truth has too few frames, BenchError for another file.
     """
-    time_s, R_true = _truth_at(truth_path, frame)
+    frame, R = read_fictrac(path)
+    time_s, _ = _truth_at(truth_path, frame)
     still, cov = np.zeros((len(frame), 3)), np.tile(np.eye(3), (len(frame), 1, 1))
     empty = Trajectory.empty(time_s)
-    track = replace(empty, orientation=R, position=still, position_cov=cov, valid=np.ones(len(frame), bool))
-    return track, R_true
+    return replace(empty, orientation=R, position=still, position_cov=cov, valid=np.ones(len(frame), bool))
 
 
 def _is_track(path: Path) -> bool:
@@ -288,9 +288,6 @@ def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
     sequence = rows[:, FICTRAC["sequence"]].ravel()
     begins = np.append(False, np.diff(sequence) < (1 if sequence.any() else 0))  # without a counter it is 0
     return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]]), begins
-
-
-READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}
 
 
 def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats:
