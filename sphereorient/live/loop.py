@@ -97,8 +97,8 @@ def run_live(
     fictrac: Path | None = None,
 ) -> Monitor:
     """Track the frames of a source until it ends, or Ctrl-C, and return what was counted. `outputs`: with what each
-    takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines; `fictrac`: the config.txt
-    that has the axes of FicTrac's lines, see `fictrac_axes`.
+    takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines; `fictrac`: see
+    `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker
     first = next(iter(tracker.appearances))  # of several balls the page shows this one

@@ -16,7 +16,7 @@ from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.poses import FittedPoses, PoseStart, blank_parts
 from sphereorient.so3 import check_rotations
-from sphereorient.sphere import known_paint
+from sphereorient.sphere.texture import known_paint
 
 NOISE = 1.0  # grey levels, of a background of one grey
 LEAST_SCORE = 0.5  # of right poses 0.9 and more; of fits that ended elsewhere 0.4 at most
@@ -134,15 +134,10 @@ class PoseFitter(nn.Module):
             fit = fitter.fit_through(fitter.optics.steps, frames, PoseStart(X, R, use))
         seen = (fit.score != 0).sum(1).clamp_min(1)  # cameras to which hardly any known paint is turned have 0
         explained, converged = fit.score.sum(1) >= LEAST_SCORE * seen, fit.step[:, :3].norm(dim=1) < NEAR_RAD
-        covariance = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
-        return PoseFit(
-            R_lab_body=fit.R_lab_body.reshape(*lead, 3, 3),
-            position_lab_mm=fit.position_lab_mm.reshape(*lead, 3),
-            covariance=covariance.reshape(*lead, 6, 6),
-            score=fit.score.reshape(*lead, len(views)),
-            explained=explained.reshape(lead),
-            converged=converged.reshape(lead),
-        )
+        found = {name: getattr(fit, name) for name in ("R_lab_body", "position_lab_mm", "score")}
+        found |= {"explained": explained, "converged": converged}
+        found["covariance"] = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
+        return PoseFit(**{name: part.reshape(*lead, *part.shape[1:]) for name, part in found.items()})
 
 
 def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:

@@ -12,14 +12,8 @@ from sphereorient import so3
 from sphereorient.errors import Reason
 from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.settings import OrientSettings
-from sphereorient.sphere import (
-    DirectionTable,
-    Sampling,
-    SphereRenderer,
-    known_paint,
-    orthographic_view,
-    reduced_texture,
-)
+from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view
+from sphereorient.sphere.texture import known_paint, reduced_texture
 from sphereorient.sphere.texture_table import STEPS
 from sphereorient.sphere.view import disk_offsets
 
@@ -137,6 +131,7 @@ class TemplateBank(DiskSearch):
 
     grid: Tensor
     bank: Tensor
+    known_share: Tensor  # (K,), of the pixels compared: those that show known paint
 
     def __init__(
         self,
@@ -167,7 +162,7 @@ class TemplateBank(DiskSearch):
         self._known: SphereRenderer | None = None
         if hidden is not None:  # templates are 0 there
             self._known = SphereRenderer((~hidden).float(), size_px=size // 2, sampling=HALF)
-            self._share = self._known_share(self.grid)
+            self.register_buffer("known_share", self._known_share(self.grid), persistent=False)
 
     def paint(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the paint (..., S, S) of grey disks: -1 black, +1 white, 0 undecided or outside."""
@@ -190,7 +185,7 @@ class TemplateBank(DiskSearch):
 
     def _known_share(self, R_view_body: Tensor) -> Tensor:
         """Return the share of the pixels compared that show known paint, (...), at orientations (..., 3, 3)."""
-        assert self._known is not None
+        assert self._known is not None  # who asks knows
         share: Tensor = self._known(R_view_body)[..., self._half].mean(-1)
         return share
 
@@ -198,7 +193,7 @@ class TemplateBank(DiskSearch):
         """Return T (..., K) of paint (..., S, S) at all rotations of the coarse grid, at half size."""
         half = F.avg_pool2d(paint.reshape(-1, 1, *paint.shape[-2:]), 2)[:, 0, self._half]
         T: Tensor = 0.5 + half @ self.bank.T / (2 * STEPS * half.shape[-1])
-        T = T if self._known is None else _of_known(T, self._share)
+        T = T if self._known is None else _of_known(T, self.known_share)
         return T.reshape(*paint.shape[:-2], len(self.bank))
 
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
@@ -219,7 +214,9 @@ class TemplateBank(DiskSearch):
         The best orientation left opens a group and takes all that are nearer than `group_deg`.
         """
         highest = T.max(-1, keepdim=True)
-        margin = self._settings.score_margin * (1.0 if self._known is None else self._share[highest.indices].sqrt())
+        margin = self._settings.score_margin * (
+            1.0 if self._known is None else self.known_share[highest.indices].sqrt()
+        )
         left = highest.values - margin < T
         group = torch.full_like(T, -1, dtype=torch.int64)
         flat, near = self.grid.flatten(1), 1 + 2 * math.cos(math.radians(self._settings.group_deg))

@@ -2,7 +2,6 @@
 
 from sphereorient.sphere.renderer import Sampling, SphereRenderer, see_sphere
 from sphereorient.sphere.texture import (
-    known_paint,
     load_texture,
     load_unseen,
     read_seen,

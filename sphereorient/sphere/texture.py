@@ -172,23 +172,18 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
 
 
-def as_texture(texture: Any) -> Tensor:
-    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor; refuse others (ShapeError)."""
+def known_paint(texture: Any, unseen: Any = None) -> tuple[Tensor, Tensor | None]:
+    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor, grey where no paint is known, and
+    these texels (H, 2 H) bool: NaN, or True in `unseen`, see `load_unseen`; None: it is known everywhere. Refuse other
+    maps, and `unseen` of another shape (ShapeError).
+    """
     values = tensor_of("texture", texture)
     check_texture_shape(values)
-    top = float(values.detach().amax())
+    top = float(values.detach().nan_to_num().amax())
     if not values.is_floating_point() or top > OVERSHOOT:
         got = f"{str(values.dtype).removeprefix('torch.')} up to {top:g}"
         do = "convert it to float and divide it by the level of white, as load_texture does"
         raise ShapeError(refusal("texture", expected="floating-point numbers, 0 black .. 1 white", got=got, do=do))
-    return values
-
-
-def known_paint(texture: Any, unseen: Any = None) -> tuple[Tensor, Tensor | None]:
-    """Return a map as `as_texture`, grey where no paint is known, and these texels (H, 2 H) bool: NaN, or True in
-    `unseen`, see `load_unseen`; None: paint is known everywhere. Raise ShapeError for `unseen` of another shape.
-    """
-    values = as_texture(texture)
     hidden = values.detach().isnan()
     if unseen is not None:
         also = tensor_of("unseen", unseen)
