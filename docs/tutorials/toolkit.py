@@ -46,13 +46,14 @@ for form in (picture, picture.double(), picture.numpy()):
     assert so3.geodesic_distance(best, R_true) < math.radians(3)
 
 # %% [markdown]
-# A disk without a candidate says why. Of a map with paint that no picture showed, pass these texels (`load_unseen`
-# reads them beside a learnt map), or write NaN there: pixels that show them are not compared.
+# A disk without a candidate says why. Where no picture showed the paint (`load_unseen` reads that beside a learnt map),
+# write NaN into the map: pixels that show it are not compared.
 
 # %%
 print("one grey:", bank(torch.full((80, 80), 0.5)).reason)
-half = TemplateBank(texture, size_px=80, unseen=torch.arange(texture.shape[0])[:, None].expand(texture.shape) > 330)
-best = half(picture).R_view_body[0]
+patchy = texture.clone()
+patchy[330:] = torch.nan
+best = TemplateBank(patchy, size_px=80)(picture).R_view_body[0]
 print(f"a third unseen: off by {math.degrees(so3.geodesic_distance(best, R_true)):.2f} degrees")
 assert so3.geodesic_distance(best, R_true) < math.radians(4)
 

@@ -51,12 +51,11 @@ class PoseFitter(nn.Module):
 
     Args:
         cameras: one, or C of them.
-        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint: that does not count.
         radius_mm: of the sphere.
         diameter_px: expected diameter of the sphere's disk in the pictures.
         blur_px: standard deviation of optics, pixel and exposure together, px.
         background: (C, H, W), grey levels of the scene without the sphere; None: black.
-        unseen: (H, 2 H) bool, texels of no known paint too, see `load_unseen`: they do not count.
 
     Raises:
         CameraError: something else than cameras.
@@ -73,7 +72,6 @@ class PoseFitter(nn.Module):
         diameter_px: float,
         blur_px: float = FIRST_BLUR_PX,
         background: Tensor | NDArray[np.generic] | None = None,
-        unseen: Tensor | NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__()
         seen = list(cameras) if isinstance(cameras, Sequence) else [cameras]
@@ -84,7 +82,7 @@ class PoseFitter(nn.Module):
         for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px)):
             if not value > 0:
                 raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do="measure it"))
-        paint, hidden = known_paint(texture, unseen)
+        paint, hidden = known_paint(texture)
         self.register_buffer("texture", paint.float())
         views = []
         for k, camera in enumerate(seen):
@@ -137,7 +135,7 @@ class PoseFitter(nn.Module):
         found = {name: getattr(fit, name) for name in ("R_lab_body", "position_lab_mm", "score")}
         found |= {"explained": explained, "converged": converged}
         found["covariance"] = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
-        return PoseFit(**{name: part.reshape(*lead, *part.shape[1:]) for name, part in found.items()})
+        return PoseFit(**{name: part.reshape((*lead, *part.shape[1:])) for name, part in found.items()})
 
 
 def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:

@@ -120,12 +120,12 @@ class TemplateBank(DiskSearch):
     Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
 
     Args:
-        texture: (H, 2 H), the texture map, 0 black .. 1 white; an `nn.Parameter` gets gradients through `quality`.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint: pixels that show it are not
+            compared, orientations that show it in most pixels not proposed; an `nn.Parameter` gets gradients through
+            `quality`.
         size_px: side of the disks, rounded up to an even number; the templates of the coarse grid have half of it.
         settings: of the search; None: the defaults.
         bank: that of another search with the same arguments; None: made now.
-        unseen: (H, 2 H) bool, texels of no known paint, see `load_unseen`; so are those that are NaN. Pixels that show
-            them are not compared, and orientations that show them in most pixels are not proposed.
     `grid` (K, 3, 3) float32 are the rotations of the coarse grid, `bank` (K, P) their templates at half size.
     """
 
@@ -139,10 +139,9 @@ class TemplateBank(DiskSearch):
         size_px: int = 80,
         settings: OrientSettings | None = None,
         bank: Tensor | None = None,
-        unseen: Tensor | NDArray[np.bool_] | None = None,
     ) -> None:
         super().__init__()
-        texture, hidden = known_paint(texture, unseen)
+        texture, hidden = known_paint(texture)
         self._settings = settings = settings or OrientSettings()
         self.size_px = size = size_px + size_px % 2
         self.renderer = SphereRenderer(texture, size_px=size, sampling=REAL)

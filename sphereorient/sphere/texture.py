@@ -172,10 +172,9 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
 
 
-def known_paint(texture: Any, unseen: Any = None) -> tuple[Tensor, Tensor | None]:
-    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor, grey where no paint is known, and
-    these texels (H, 2 H) bool: NaN, or True in `unseen`, see `load_unseen`; None: it is known everywhere. Refuse other
-    maps, and `unseen` of another shape (ShapeError).
+def known_paint(texture: Any) -> tuple[Tensor, Tensor | None]:
+    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor, grey where it is NaN: no paint is
+    known there; and these texels, (H, 2 H) bool, None if there are none. Refuse other maps (ShapeError).
     """
     values = tensor_of("texture", texture)
     check_texture_shape(values)
@@ -185,10 +184,6 @@ def known_paint(texture: Any, unseen: Any = None) -> tuple[Tensor, Tensor | None
         do = "convert it to float and divide it by the level of white, as load_texture does"
         raise ShapeError(refusal("texture", expected="floating-point numbers, 0 black .. 1 white", got=got, do=do))
     hidden = values.detach().isnan()
-    if unseen is not None:
-        also = tensor_of("unseen", unseen)
-        check_tail("unseen", also, *values.shape)
-        hidden = hidden | also.bool().to(hidden.device)
     return (torch.where(hidden, 0.5, values), hidden) if bool(hidden.any()) else (values, None)
 
 

@@ -234,21 +234,10 @@ def test_renderings_of_a_map_that_is_unseen_in_part_are_found(kind):
     assert bool(own.score[enough, 0].isfinite().all())
 
 
-def test_unseen_texels_are_nan_or_named_and_all_seen_changes_nothing():
-    whole, disks = texture_of("dots"), clean_disks("dots", attitudes(4))
-    unseen = unseen_cap(len(whole))
-    by_nan, named = TemplateBank(torch.where(unseen, torch.nan, whole), SIZE), TemplateBank(whole, SIZE, unseen=unseen)
-    for one, other in ((by_nan, named), (TemplateBank(whole, SIZE, unseen=~(unseen | True)), search_of("dots"))):
-        found, expected = one.propose(disks), other.propose(disks)
-        assert torch.equal(found.score, expected.score)
-        assert torch.equal(found.R_view_body, expected.R_view_body)
-    with pytest.raises(ShapeError, match="unseen"):
-        TemplateBank(whole, SIZE, unseen=unseen[1:])
-
-
 def test_T_of_known_paint_alone_is_1_of_the_right_picture_and_lower_for_the_same_share_of_fewer_pixels():
     whole, R = texture_of("patches"), attitudes(12)
-    bank = TemplateBank(whole, SIZE, OrientSettings(coarse_step_deg=30), unseen=unseen_cap(len(whole)))
+    patchy = torch.where(unseen_cap(len(whole)), torch.nan, whole)
+    bank = TemplateBank(patchy, SIZE, OrientSettings(coarse_step_deg=30))
     paint = torch.sign(SphereRenderer(whole, size_px=SIZE)(R.float()) - 0.5)
     T, all_seen = bank.quality(paint, R.float()), search_of("patches").quality(paint, R.float())
     assert float((T - all_seen).max()) < 0.02
