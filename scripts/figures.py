@@ -98,6 +98,7 @@ FIGURES: dict[str, Figure] = {
     ),
     "photographs-maps": Figure(pages=("map.md",), command="photographs.py --moves --counts 12 30 --sets 3"),
     "fly": Figure(pages=("map.md",), command="real_fictrac.py"),
+    "fictrac-axes": Figure(pages=("fictrac.md",), command="fictrac_axes.py"),
     "dots": Figure(pages=("photographs.md",), command="real_spindoe.py"),
     "moon": Figure(pages=("moon.md",), command=f"moon.py {SHARED}/real/moon", tables=("moon",)),
     "statistics": Figure(pages=("statistics.md",), command="ensemble_coverage.py"),

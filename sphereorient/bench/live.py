@@ -201,7 +201,7 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
             raise SphereOrientError(refusal("live", expected="a line a frame", got=got, do="correct that"))
     error_deg = _errors_deg(table, order, R_cam_lab, timing.experiment.parent / "truth.h5")[FIRST:]
     number, came_s, *_ = table = table[FIRST:].T
-    at, written_s = number.astype(int) - 1, np.array(writer.written_s)
+    at, written_s = number.astype(int), np.array(writer.written_s)
     shown = [k for k in range(at[0], at[-1] + 1) if not timing.dark(k)] if len(at) else []
     lit = np.isin(at, shown)
     ends_s += [written_s[k] for k in shown if timing.dark(k - 1)]
@@ -248,7 +248,7 @@ def _errors_deg(table: Floats, order: Sequence[int], R_cam_lab: Floats, truth: P
     """Return the error of the rotation since the stretch began, (n,), degrees; NaN where it is not known."""
     if not truth.is_file() or not len(table):
         return np.full(len(table), np.nan)
-    R = orientations_at(truth, np.array(order)[(table[:, 0].astype(int) - 1) % len(order)])
-    begins = np.maximum.accumulate(np.where(table[:, 5] == 1, np.arange(len(table)), 0))
+    R = orientations_at(truth, np.array(order)[table[:, 0].astype(int) % len(order)])
+    begins = np.maximum.accumulate(np.where(table[:, 5] == 0, np.arange(len(table)), 0))
     true = R_cam_lab @ R @ R[begins].transpose(0, 2, 1) @ R_cam_lab.T
     return distance_deg(rotations(table[:, 2:5]), true)

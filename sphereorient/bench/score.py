@@ -1,6 +1,6 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -71,10 +71,16 @@ def _percentiles(values: Floats) -> Floats:
     return np.percentile(values, [50, 95, 99, 100]) if len(values) else np.full(4, np.nan)
 
 
-def score_track(track: Trajectory, truth_path: str | Path) -> Score:
-    """Compare a track with the truth (docs/data-format.md) by time to half a frame; raise TrackError on a mismatch."""
+def score_track(track: Trajectory, truth_path: str | Path, align: str = "none") -> Score:
+    """Compare a track with the truth (docs/data-format.md) by time to half a frame; raise TrackError on a mismatch.
+    `align`: "none", or "body": the body axes of the truth are turned to those of the track first, by a constant turn.
+    """
     truth = _read_truth(truth_path, "position", sphere=track.sphere, also=RATES)
     row = _rows(truth["time"], track.time, truth_path)
+    if align == "body" and (known := np.isfinite(track.orientation).all((1, 2))).any():
+        turn = _alignment(track.orientation[known], truth["orientation"][row][known], align)[1].T
+        truth["orientation"] = truth["orientation"] @ turn
+        truth |= {key: truth[key] @ turn for key in RATES if key in truth and key.endswith("_body")}
     relative, coverage = {}, {}
     for key in (rate for rate in RATES if rate in truth):
         measured, true = getattr(track, key), truth[key][row]
@@ -83,14 +89,14 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
         wrong, whole = (np.square(x[have]).sum() for x in (measured - true, true))
         relative[key] = float(np.sqrt(wrong / whole)) if have.any() else np.nan
     R_true, off_mm = truth["orientation"][row], truth["position"][row] - track.position
-    turn = rotation_vectors(R_true @ track.orientation.transpose(0, 2, 1))
+    off_rad = rotation_vectors(R_true @ track.orientation.transpose(0, 2, 1))
     return Score(
         frames=len(track),
         valid=track.valid & np.isfinite(track.orientation).all(axis=(1, 2)) & np.isfinite(track.position).all(axis=1),
         orientation_deg=distance_deg(track.orientation, R_true),
         camera_orientation_deg={name: distance_deg(seen.orientation, R_true) for name, seen in track.cameras.items()},
         position_mm=np.linalg.norm(off_mm, axis=1),
-        orientation_sigmas=mahalanobis(turn, track.orientation_cov),
+        orientation_sigmas=mahalanobis(off_rad, track.orientation_cov),
         position_sigmas=mahalanobis(off_mm, track.position_cov),
         relative_rms=relative,
         coverage=coverage,
@@ -223,15 +229,15 @@ def against(reference: Reference, track: Trajectory, align: str = "none") -> tup
     return errors_deg, behaviour_of(track, reference, align == "both")
 
 
-def another_result(truth_path: Path, frame: Frames, R: Floats) -> tuple[Trajectory, Floats]:
-    """Return another program's orientations (N, 3, 3) in frames (N,) of a ball in its place as a track, and the true
-    ones; raise TrackError if the truth has too few.
+def another_result(path: Path, truth_path: Path) -> Trajectory:
+    """Return the orientations of a FicTrac .dat, of a ball in its place, as a track at the times of a truth; raise
+    TrackError if the truth has too few frames, BenchError for another file.
     """
-    time_s, R_true = _truth_at(truth_path, frame)
+    frame, R = read_fictrac(path)
+    time_s, _ = _truth_at(truth_path, frame)
     still, cov = np.zeros((len(frame), 3)), np.tile(np.eye(3), (len(frame), 1, 1))
     empty = Trajectory.empty(time_s)
-    track = replace(empty, orientation=R, position=still, position_cov=cov, valid=np.ones(len(frame), bool))
-    return track, R_true
+    return replace(empty, orientation=R, position=still, position_cov=cov, valid=np.ones(len(frame), bool))
 
 
 def _is_track(path: Path) -> bool:
@@ -282,9 +288,6 @@ def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
     sequence = rows[:, FICTRAC["sequence"]].ravel()
     begins = np.append(False, np.diff(sequence) < (1 if sequence.any() else 0))  # without a counter it is 0
     return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]]), begins
-
-
-READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}
 
 
 def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats:

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from sphereorient.statistics.behaviour import Behaviour
 
 
-APART_DEG = 1.0  # angle between lab axes that is worth a remark
+APART_DEG = 1.0  # angle between axes that is worth a remark
+EXPLAINED = 0.5  # of the median error, left after a constant turn of the body axes that is worth one
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -82,11 +83,17 @@ def score(
     align: Align = "none",
     as_json: Annotated[bool, Option("--json", help="Print orientation errors and behaviour as JSON.")] = False,
 ) -> None:
-    """Print the errors of a track against exact truth, and gain, drift and walk against truth or another tracker."""
-    from sphereorient.bench import score_track
-    from sphereorient.bench.score import against, given_to_others, named_as_true, reference_of
+    """Print the errors of a track against exact truth, and gain, drift and walk against truth or another tracker.
+    FicTrac's .dat in place of a track is compared with the truth.
+    """
+    import numpy as np
 
-    tracks, numbers = tracks_in(track, None), []
+    from sphereorient.bench import score_track
+    from sphereorient.bench.score import against, another_result, given_to_others, named_as_true, reference_of
+    from sphereorient.trajectory import Tracks
+
+    theirs, numbers = track.suffix.lower() == ".dat", []
+    tracks = Tracks({UNNAMED: another_result(track, reference)}) if theirs else tracks_in(track, None)
     given: dict[str, tuple[int, int]] = {}
     for names in alike or ():
         tracks = named_as_true(tracks, reference, names_in(names))
@@ -96,8 +103,8 @@ def score(
         if as_json:
             numbers.append({"ball": name, "exact": of.exact, **error_numbers(errors), **behaviour.numbers()})
             continue
-        if of.exact and align == "none":
-            print_table(error_table(score_track(one, reference), name))
+        if of.exact and align != "both" and not theirs:
+            print_table(error_table(score_track(one, reference, align), name))
         else:
             print_errors(errors, name, "error" if of.exact else "difference")
         print_table(behaviour_table(behaviour, name, exact=of.exact))
@@ -105,6 +112,11 @@ def score(
             typer.echo(
                 f"The lab axes are {behaviour.apart_deg:.1f} degrees apart: --align both takes that off.", err=True
             )
+        if align == "none" and np.isfinite(errors).any():
+            usual, left = (float(np.nanmedian(part)) for part in (errors, against(of, one, "body")[0]))
+            if usual > APART_DEG and left < EXPLAINED * usual:
+                words = f"A constant turn of the body axes explains most: {usual:.2f} degrees are {left:.3g} without it"
+                typer.echo(f"{words}; --align body takes it off. A learnt map has axes of its own.", err=True)
         given = given or (given_to_others(tracks, reference) if of.exact and len(tracks) > 1 else {})
         if name in given:
             wrong, changes = given[name]
@@ -469,32 +481,6 @@ def write_scenes(given: _SceneOptions) -> None:
     write_text(given.out / "scenes.json", json.dumps(index, indent=1) + "\n")
     if not given.quiet:
         typer.echo(f"Wrote {given.out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
-
-
-@bench.command("score")
-def score_result(
-    result: Annotated[Path, Argument(metavar="RESULT", help="track.h5, or another program's file.")],
-    truth: Annotated[Path, Argument(metavar="TRUTH", help="truth.h5 of the scene.")],
-    of: Annotated[str, Option("--format", help="sphereorient, or fictrac for its .dat.")] = "sphereorient",
-    align: Align = "none",
-) -> None:
-    """Print the errors of a track, or of another program's result, against the exact truth."""
-    from sphereorient.bench.score import READERS, against, another_result, true_orientations
-    from sphereorient.statistics.behaviour import Reference
-
-    found = {}
-    if of == "sphereorient":
-        for name, track in tracks_in(result, None).items():
-            found[name] = track, true_orientations(truth, track.time, name)
-    elif of in READERS:
-        found[UNNAMED] = another_result(truth, *READERS[of](result))
-    else:
-        known = ", ".join(["sphereorient", *READERS])
-        raise SettingsError(refusal("--format", expected=known, got=repr(of)[:40], do="choose one"))
-    for name, (track, R_true) in found.items():
-        errors, behaviour = against(Reference(R_lab_body=R_true), track, align)
-        print_errors(errors, name)
-        print_table(behaviour_table(behaviour, name, exact=True))
 
 
 def _print(found: "Results") -> None:

@@ -22,6 +22,10 @@ SphereName = Annotated[str | None, Option("--sphere", help="Of several balls, on
 Align = Annotated[
     str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
 ]
+FicTracConfig = Annotated[
+    Path | None,
+    Option("--axes", metavar="CONFIG", help="FicTrac's config.txt: its table in its own axes; default: in the lab's."),
+]
 Cameras = Annotated[str | None, Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
 SettingsPath = Annotated[Path | None, Option(help="YAML as `sphereorient settings` writes it.")]
 Overrides = Annotated[list[str] | None, Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")]

@@ -13,6 +13,7 @@ from sphereorient.cli.options import (
     Align,
     CommonOptions,
     ExperimentPath,
+    FicTracConfig,
     Quiet,
     SphereName,
     TrackPath,
@@ -138,36 +139,41 @@ def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
     return paths
 
 
-@app.command()
-def export(
-    track: TrackPath,
-    out: Annotated[Path, Option("--out", "-o", help="File to write.")],
+@dataclass(frozen=True, kw_only=True)
+class _ExportOptions:
+    track: TrackPath
+    out: Annotated[Path, Option("--out", "-o", help="File to write.")]
     to: Annotated[
         str | None,
         Option(
             help="csv, parquet, mat, fictrac, tum, vtk, nwb or netcdf; default: by the suffix of the name.",
             metavar="FORMAT",
         ),
-    ] = None,
-    experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None,
-    sphere: SphereName = None,
-    quiet: Quiet = False,
-) -> None:
+    ] = None
+    experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None
+    axes: FicTracConfig = None
+    sphere: SphereName = None
+    quiet: Quiet = False
+
+
+@app.command()
+def export(given: _ExportOptions) -> None:
     """Write a track for other programs: tables, MATLAB, FicTrac's table, poses (TUM), ParaView, NWB, netCDF.
     Of several balls, write a file each, with the ball's name at the end of its own.
     """
     from sphereorient.report.export import export_track, format_of
 
-    to = format_of(out, to)
-    loaded = tracks_in(track, sphere)
-    paths = _paths(out, loaded)
-    camera = None
-    if experiment is not None:
+    to = format_of(given.out, given.to)
+    loaded = tracks_in(given.track, given.sphere)
+    paths = _paths(given.out, loaded)
+    axes = None
+    if given.experiment is not None:
         from sphereorient.experiment import load_experiment
+        from sphereorient.preflight.fictrac import fictrac_axes
 
-        camera = next(iter(load_experiment(experiment).cameras.values()))
-    with progress_bar(quiet) as advance:
+        axes = fictrac_axes(next(iter(load_experiment(given.experiment).cameras.values())), given.axes)
+    with progress_bar(given.quiet) as advance:
         for ball, path in paths.items():
-            export_track(loaded[ball], path, to, partial(advance, f"export {ball}".strip()), camera)
-    for ball, path in paths.items() if not quiet else ():
+            export_track(loaded[ball], path, to, partial(advance, f"export {ball}".strip()), axes)
+    for ball, path in paths.items() if not given.quiet else ():
         typer.echo(f"Wrote {path}: {len(loaded[ball])} frames")

@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import CameraOptions, ExperimentPath, NoCache, Resume, ball_words
+from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfig, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 from sphereorient.files.whole_file import check_ending
 
@@ -190,6 +190,7 @@ class _LiveOptions(CameraOptions):
     ] = None
     record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
+    axes: FicTracConfig = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
 
 
@@ -238,7 +239,7 @@ def live(given: _LiveOptions) -> None:
             filmed = flipped(stream.movie, set_up.recording.experiment.flip.get(stream.name, "none"))
             recorders.append(Recorder(movies[stream.name], filmed, frame_s, _tell, wait=source.waits))
             opened.callback(recorders[-1].close)
-        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell)
+        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell, given.axes)
         if set_up.save_map is not None:
             _tell("the map is finished; this takes some seconds")
             try:

@@ -16,50 +16,51 @@ from sphereorient.live.live import Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
 from sphereorient.trajectory.rotations import rotation_vectors
-from sphereorient.trajectory.walk import arcs, fictrac_rows, turned
+from sphereorient.trajectory.walk import FicTracAxes, arcs, fictrac_rows, turned
 
 Floats = NDArray[np.float64]
 AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
 class FicTracLines:
-    """The 25 columns of FicTrac's table frame by frame, as `export --to fictrac` writes them of a whole track: the lab
+    """The 25 columns of FicTrac's table frame by frame, as `export --to fictrac` writes them of a whole track: its lab
     is the animal's frame. A frame without a pose is NaN; after it the sequence counter begins anew.
     """
 
-    def __init__(self, R_cam_lab: Floats) -> None:
-        self._R_cam_lab = R_cam_lab  # (3, 3)
+    def __init__(self, axes: FicTracAxes) -> None:
+        self._axes = axes
         self._before: tuple[float, Floats] | None = None  # time, s, and R_lab_body (3, 3) of the frame before
         self._first = np.eye(3)  # R_lab_body where this stretch begins
-        self._sequence = 0
+        self._sequence = -1
         self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
 
     def columns(self, number: int, time_s: float, R_lab_body: Floats, error_rad: float) -> Floats:
         """Return the columns (25,) of the next frame: its number, time, orientation (3, 3), NaN without a pose, and
         stated error.
         """
+        R_lab_body = self._axes.R_own_lab @ R_lab_body  # from here on the table's lab
         before, self._before = self._before, (time_s, R_lab_body)
         valid = math.isfinite(R_lab_body[0, 0])
         start = valid and (before is None or not math.isfinite(before[1][0, 0]))
         if start:
-            self._first, self._sequence = R_lab_body, 0
+            self._first, self._sequence = R_lab_body, -1
             self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
         R_before = R_lab_body if before is None or start else before[1]
         turn = rotation_vectors((R_lab_body @ R_before.T)[None])
         ahead, right, about, step = arcs(turn)
+        self._sequence += 1
         if valid:
             self._path = self._path + turned(step, np.array([self._heading]))
             self._heading = (self._heading + float(about[0])) % (2 * math.pi)
             self._sums = self._sums + np.column_stack([ahead, right])
-        self._sequence += 1
         nothing = 0.0 if valid else np.nan
         rows = fictrac_rows(
-            self._R_cam_lab,
+            self._axes.R_cam_own,
             (R_lab_body @ self._first.T)[None],
             ahead,
             right,
             np.array([start]),
-            frame=number + 1,
+            frame=number,
             turn_lab=turn,
             error=error_rad,
             path=self._path + nothing,

@@ -22,6 +22,7 @@ from sphereorient.live.sources import Source
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread
 from sphereorient.methods.settings import Settings
+from sphereorient.preflight.fictrac import fictrac_axes
 
 MOST_WAITING, MOST_BYTES = 512, 64 << 20  # frames that wait
 
@@ -88,15 +89,21 @@ def _learning(
 
 
 def run_live(
-    opened: LiveSetUp, source: Source, outputs: Sequence[tuple[Output, str]], page: PageProcess | None, tell: Tell
+    opened: LiveSetUp,
+    source: Source,
+    outputs: Sequence[tuple[Output, str]],
+    page: PageProcess | None,
+    tell: Tell,
+    fictrac: Path | None = None,
 ) -> Monitor:
     """Track the frames of a source until it ends, or Ctrl-C, and return what was counted. `outputs`: with what each
-    takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines.
+    takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines; `fictrac`: see
+    `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker
     first = next(iter(tracker.appearances))  # of several balls the page shows this one
     experiment, views = recording.experiment, tracker.appearances[first].fitter.views
-    table = FicTracLines(views[0].camera.R_cam_lab.numpy())
+    table = FicTracLines(fictrac_axes(views[0].camera, fictrac))
     known = {ball: Quantities(experiment.of(ball).fixed, experiment.length_unit, ball) for ball in tracker.appearances}
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it

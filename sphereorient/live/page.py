@@ -40,7 +40,7 @@ from sphereorient.live.live import Measured
 from sphereorient.live.shared import POSES, WORD, SharedFrames, SlotReader
 from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
-from sphereorient.trajectory.walk import FICTRAC
+from sphereorient.trajectory.walk import FICTRAC, FicTracAxes
 
 KEPT = 1000  # latencies
 LOST_S = 0.5  # without a pose: then it is told
@@ -272,7 +272,7 @@ class LivePage:
     def __init__(self, recording: Recording, folder: Path, commands: Connection) -> None:
         self._recording, self._folder, self._commands = recording, folder, commands
         self._layout = FrameBytes(recording.streams)
-        self._lines = FicTracLines(next(iter(recording.cameras.values())).R_cam_lab.numpy())
+        self._lines = FicTracLines(FicTracAxes.of_lab(next(iter(recording.cameras.values())).R_cam_lab.numpy()))
         self._rings: tuple[SlotReader, SlotReader] | None = None  # None: not begun yet
         self._replies: SimpleQueue[Json] = SimpleQueue()
         self._lock, self._asking, self._running = Lock(), Lock(), True

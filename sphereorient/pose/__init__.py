@@ -5,4 +5,4 @@ from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.implicit import ImplicitPose, implicit_pose
 from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import LinesOfSight
-from sphereorient.pose.pose_fitter import PoseFitter
+from sphereorient.pose.pose_fitter import PoseFit, PoseFitter

@@ -1,6 +1,7 @@
 """`PoseFitter`: poses from pictures without the pipeline."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,12 +12,38 @@ from sphereorient.cameras import Camera
 from sphereorient.errors import CameraError, SettingsError, ShapeError, check_finite, check_tail, refusal, tensor_of
 from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView, base_table
+from sphereorient.pose.fit import NEAR_RAD
 from sphereorient.pose.fitter import first_fitter
-from sphereorient.pose.poses import PoseStart
+from sphereorient.pose.poses import FittedPoses, PoseStart, blank_parts
 from sphereorient.so3 import check_rotations
-from sphereorient.sphere.texture import as_texture
+from sphereorient.sphere.texture import known_paint
 
 NOISE = 1.0  # grey levels, of a background of one grey
+LEAST_SCORE = 0.5  # of right poses 0.9 and more; of fits that ended elsewhere 0.4 at most
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseFit:
+    """Poses that `PoseFitter` ended at, of any leading shape; float64. Those without `success` are no measurement."""
+
+    R_lab_body: Tensor  # (..., 3, 3)
+    position_lab_mm: Tensor  # (..., 3)
+    covariance: Tensor  # (..., 6, 6), of delta (rad, lab) and position (mm); NaN without success
+    score: Tensor  # (..., C), share of each picture's variance that the pose explains, 1 at best; 0: of unseen paint
+    explained: Tensor  # (...) bool, whether the scores' mean is at least 0.5
+    converged: Tensor  # (...) bool, whether the last step was shorter than 0.006 rad
+
+    @property
+    def success(self) -> Tensor:
+        """Whether the pose explains the pictures and the fit came to rest there, (...) bool."""
+        return self.explained & self.converged
+
+    @property
+    def reason(self) -> list[str]:
+        """Why a pose is none, of each pose one after the other; empty where it is one."""
+        each = zip(self.explained.flatten().tolist(), self.converged.flatten().tolist(), strict=True)
+        none, on = "the pose does not explain the pictures: start nearer", "the last step was long: go on from here"
+        return [("" if rests else on) if explains else none for explains, rests in each]
 
 
 class PoseFitter(nn.Module):
@@ -24,7 +51,7 @@ class PoseFitter(nn.Module):
 
     Args:
         cameras: one, or C of them.
-        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint: that does not count.
         radius_mm: of the sphere.
         diameter_px: expected diameter of the sphere's disk in the pictures.
         blur_px: standard deviation of optics, pixel and exposure together, px.
@@ -55,7 +82,8 @@ class PoseFitter(nn.Module):
         for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px)):
             if not value > 0:
                 raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do="measure it"))
-        self.register_buffer("texture", as_texture(texture).float())
+        paint, hidden = known_paint(texture)
+        self.register_buffer("texture", paint.float())
         views = []
         for k, camera in enumerate(seen):
             width, height = camera.image_size
@@ -65,7 +93,7 @@ class PoseFitter(nn.Module):
                 background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
             )
             views.append(CameraView.of(f"camera {k + 1}", camera, scene))
-        base = base_table(self.get_buffer("texture").cpu(), diameter_px)
+        base = base_table(self.get_buffer("texture").cpu(), diameter_px, None if hidden is None else hidden.cpu())
         self.fitter = first_fitter(views, radius_mm, base, blur_px)
 
     def forward(
@@ -73,10 +101,10 @@ class PoseFitter(nn.Module):
         pictures: Tensor | NDArray[np.generic],
         R_lab_body: ArrayLike | Tensor,
         position_lab_mm: ArrayLike | Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return fitted R_lab_body (..., 3, 3), position_lab_mm (..., 3) and covariance (..., 6, 6), float64.
-        The covariance is of delta (rad, lab) and position (mm). Pictures (..., C, H, W) are grey levels, (..., H, W)
-        for a single camera; the start is right to about 10 degrees and a few pixels.
+    ) -> PoseFit:
+        """Return the poses at which fits from a start (..., 3, 3), (..., 3) ended, and whether they are right.
+        Pictures (..., C, H, W) are grey levels, (..., H, W) for a single camera; the start is right to about 10 degrees
+        and a few pixels.
 
         Raises:
             ShapeError: shapes that do not fit together, starts that are no rotations, pictures that are not finite.
@@ -99,11 +127,15 @@ class PoseFitter(nn.Module):
         frames = [[_grey(one) for one in row] for row in grey.reshape(-1, len(views), height, width)]
         R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
         use = torch.ones(len(R), len(views), dtype=torch.bool)
-        covariance = torch.zeros(len(R), 6, 6, dtype=torch.float64)
+        fit = FittedPoses(**blank_parts(len(views), 0))
         if len(R):
             fit = fitter.fit_through(fitter.optics.steps, frames, PoseStart(X, R, use))
-            R, X, covariance = fit.R_lab_body, fit.position_lab_mm, fit.covariance
-        return R.reshape(*lead, 3, 3), X.reshape(*lead, 3), covariance.reshape(*lead, 6, 6)
+        seen = (fit.score != 0).sum(1).clamp_min(1)  # cameras to which hardly any known paint is turned have 0
+        explained, converged = fit.score.sum(1) >= LEAST_SCORE * seen, fit.step[:, :3].norm(dim=1) < NEAR_RAD
+        found = {name: getattr(fit, name) for name in ("R_lab_body", "position_lab_mm", "score")}
+        found |= {"explained": explained, "converged": converged}
+        found["covariance"] = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
+        return PoseFit(**{name: part.reshape((*lead, *part.shape[1:])) for name, part in found.items()})
 
 
 def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:

@@ -13,11 +13,14 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.cameras import Camera
 from sphereorient.cameras.model import focal_of_field
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment.experiment import refused
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
 from sphereorient.sphere.view import fitted_circle
+from sphereorient.trajectory.rotations import rotations
+from sphereorient.trajectory.walk import FicTracAxes
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 DO = "name the config.txt with which FicTrac ran"
@@ -47,6 +50,8 @@ class FicTracConfig:
     fisheye: bool  # equidistant: vfov_deg / height is the angle of every pixel
     ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
     circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
+    limb_px: Array  # (n, 2), u, v of the points of the limb
+    ahead_cam: Array | None  # (3,), towards the ball's middle, where the file states it: `roi_c` goes before the limb
     turn: Array  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
     plane: str | None  # of the square: xy, yz or xz of the animal; None: `turn` is a rotation
     unread: tuple[str, ...]  # keys of the file that change nothing here
@@ -57,13 +62,22 @@ class FicTracConfig:
         """
         if self.plane is None:
             return so3.exp(torch.from_numpy(self.turn))
-        width, height = image_size
-        aside = self.turn - (width / 2, height / 2)  # FicTrac's middle of the picture
+        return _R_of_square(
+            np.array(SQUARES[self.plane]), self.rays_cam(self.turn, image_size), 1 / self.focal_px(image_size)
+        )
+
+    def focal_px(self, image_size: tuple[int, int]) -> float:
+        """Return the focal length, px, of a picture (width, height); of a fisheye px/rad."""
+        height = image_size[1]
+        return height / math.radians(self.vfov_deg) if self.fisheye else focal_of_field(height, self.vfov_deg)
+
+    def rays_cam(self, points_px: Array, image_size: tuple[int, int]) -> Array:
+        """Return unit rays (n, 3) of points (n, 2), px, by FicTrac's camera, whose axis is in the picture's middle."""
+        aside = points_px - np.array(image_size) / 2
         away = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
-        focal = height / math.radians(self.vfov_deg) if self.fisheye else focal_of_field(height, self.vfov_deg)
-        angle = away / focal if self.fisheye else np.arctan(away / focal)
-        seen = np.hstack([aside / away * np.sin(angle), np.cos(angle)])
-        return _R_of_square(np.array(SQUARES[self.plane]), seen, 1 / focal)
+        angle = away / self.focal_px(image_size)
+        angle = angle if self.fisheye else np.arctan(angle)
+        return np.hstack([aside / away * np.sin(angle), np.cos(angle)])
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
@@ -94,6 +108,7 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
             raise refused(f"{path}, c2a_r", "three numbers, rad, or four corners by c2a_src", got, do)
         turn, used = turn.reshape(4, 2), USED | {"c2a_src", corners}
     rate, limb = _numbers(values.get("src_fps", "")), _points(values.get("roi_circ", ""))
+    ahead = np.array(_numbers(values.get("roi_c", "")))
     return FicTracConfig(
         source=int(values["src_fn"]) if values["src_fn"].isdecimal() else path.parent / values["src_fn"],
         rate_hz=rate[0] if len(rate) == 1 and rate[0] > 0 else None,
@@ -101,6 +116,8 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
         fisheye=fisheye,
         ignored=tuple(np.rint(one).astype(np.int32) for one in _polygons(values.get("roi_ignr", ""))),
         circle_px=fitted_circle(limb) if len(limb) >= 3 else None,
+        limb_px=limb,
+        ahead_cam=ahead if len(ahead) == 3 and ahead.any() and values.get("roi_r") else None,
         turn=turn,
         plane=plane,
         unread=tuple(key for key in values if key not in used),
@@ -130,6 +147,31 @@ def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
         got = f"corners that fit two rotations {apart_deg:.0f} degrees apart"
         raise refused("config.txt, c2a_src", "a square whose perspective shows", got, do)
     return R
+
+
+def fictrac_axes(camera: Camera, config: Path | None) -> FicTracAxes:
+    """Return the axes of FicTrac's table for the camera of an experiment: its lab, or with a config.txt those in which
+    FicTrac itself writes. Its "camera" looks along the line of sight to the ball's middle, and c2a_r turns this frame,
+    not the camera's, to its "lab". Raise ExperimentError: no such file, or one that does not state the ball's limb.
+    Source: FicTrac 2.1.2, Trackball.cpp (roi_to_cam_r, updatePath), geometry.cpp (circleFit_camModel).
+    """
+    R_cam_lab = camera.R_cam_lab.numpy()
+    if config is None:
+        return FicTracAxes.of_lab(R_cam_lab)
+    said = read_fictrac_config(config)
+    ahead = said.ahead_cam
+    if ahead is None:
+        if len(said.limb_px) < 3:
+            got, do = f"{len(said.limb_px)}", "run FicTrac's configGui"
+            raise refused(f"{config}, roi_circ", "three points of the ball's limb or more", got, do)
+        rays = said.rays_cam(said.limb_px, camera.image_size)
+        normal = np.linalg.svd(rays - rays.mean(0))[2][2]  # of the plane through their ends
+        ahead = normal * np.sign(normal @ rays.sum(0))
+    across = np.cross([0.0, 0.0, 1.0], ahead / np.linalg.norm(ahead))
+    sine = float(np.linalg.norm(across))
+    R_cam_roi = rotations((across / max(sine, 1e-12) * np.arcsin(min(sine, 1.0)))[None])[0]
+    R_animal = said.R_animal_cam(camera.image_size).numpy()
+    return FicTracAxes(R_own_lab=R_animal @ R_cam_roi.T @ R_cam_lab, R_cam_own=R_animal.T)
 
 
 def _numbers(text: str) -> list[float]:

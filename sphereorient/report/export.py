@@ -9,13 +9,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.files.provenance import package
 from sphereorient.files.whole_file import put_aside
 from sphereorient.report import columns as table
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
-from sphereorient.trajectory.walk import fictrac_rows
+from sphereorient.trajectory.walk import FicTracAxes, fictrac_rows, walk_of
 
 ROWS = 50_000  # written at once
 TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
@@ -28,15 +27,15 @@ def export_track(
     path: Path,
     to: str | None = None,
     progress: Advance = lambda done, total: None,
-    camera: Camera | None = None,
+    axes: FicTracAxes | None = None,
 ) -> None:
     """Write a track for other programs, whole or not at all; NaN stays NaN.
-    `to` is a key of `FORMATS`; None: by the suffix. `camera`: of the picture, for FicTrac's table. Raise OutputError
-    for an unknown format, a package that is not installed, or a file that cannot be written.
+    `to` is a key of `FORMATS`; None: by the suffix. `axes`: those of FicTrac's table, see `fictrac_axes`. Raise
+    OutputError for an unknown format, a package that is not installed, or a file that cannot be written.
     """
     write, *_ = FORMATS[format_of(path, to)]
     with put_aside(path) as aside:
-        write(Export(track=track, path=aside, progress=progress, camera=camera))
+        write(Export(track=track, path=aside, progress=progress, axes=axes))
 
 
 def format_of(path: Path, to: str | None) -> str:
@@ -63,7 +62,7 @@ class Export:
     track: Trajectory
     path: Path
     progress: Advance
-    camera: Camera | None
+    axes: FicTracAxes | None
 
 
 def _write_csv(job: Export) -> None:
@@ -126,40 +125,41 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
     return arrays
 
 
-def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
-    """Return the 25 columns of FicTrac's table, (N, 25); the lab is the animal's frame, x ahead, y right, z down.
+def fictrac_table(track: Trajectory, axes: FicTracAxes) -> Floats:
+    """Return the 25 columns of FicTrac's table, (N, 25); its lab is the animal's frame, x ahead, y right, z down.
     Column 5, an error of its own, is the root mean square of the stated errors, rad. NaN where there is no pose.
     """
-    R, ms, walk = track.posed, 1e3 * track.time, track.walk()
+    R, ms = axes.R_own_lab @ track.posed, 1e3 * track.time
+    walk = walk_of(track.time, R)
     count, step_s = np.arange(len(R)), np.diff(track.time, prepend=np.nan)
     begin = np.maximum.accumulate(np.where(walk.start, count, 0))
     ahead, right = walk.forward_rad_s * step_s, walk.side_rad_s * step_s
     stretch = np.where(np.isfinite(walk.heading_rad), 0.0, np.nan)
     total = np.nancumsum(np.stack([ahead, right], axis=1), axis=0)
     return fictrac_rows(
-        camera.R_cam_lab.numpy(),
+        axes.R_cam_own,
         R @ R[begin].transpose(0, 2, 1),
         ahead,
         right,
         walk.start,
-        frame=count + 1,
+        frame=count,
         turn_lab=walk.turn_rad,
         error=np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)),
         path=walk.path,
         heading=walk.heading_rad,
         sums=total - total[begin] + stretch[:, None],
         time_ms=ms,
-        sequence=count - begin + 1,
+        sequence=count - begin,
         step_ms=np.diff(ms, prepend=np.nan),
     )
 
 
 def _write_fictrac(job: Export) -> None:
     """Write FicTrac's table of a ball in its place."""
-    if job.camera is None:
+    if job.axes is None:
         do = "add --experiment experiment.yaml: the table has the camera's axes"
         raise OutputError(refusal("--to fictrac", expected="the experiment of the track", got="none", do=do))
-    np.savetxt(job.path, fictrac_table(job.track, job.camera), fmt="%.14g", delimiter=", ")
+    np.savetxt(job.path, fictrac_table(job.track, job.axes), fmt="%.14g", delimiter=", ")
 
 
 def _write_tum(job: Export) -> None:

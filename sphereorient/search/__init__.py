@@ -1,6 +1,6 @@
 """Orientation without history: normalisation, template banks, coarse to fine, candidates."""
 
-from sphereorient.search.candidates import Candidates, FallbackProposer, Proposer
+from sphereorient.search.candidates import Candidates, FallbackProposer, Proposals, Proposer
 from sphereorient.search.grey_search import GreySearch
 from sphereorient.search.normalisation import crop_disk
 from sphereorient.search.settings import GreySearchSettings, OrientSettings, ProposeSettings

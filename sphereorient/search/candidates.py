@@ -137,6 +137,15 @@ def check_disks(disks: Tensor, height: int, width: int) -> None:
         raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proposals:
+    """Possible orientations of disks of any leading shape, best first, padded with NaN; float64."""
+
+    R_view_body: Tensor  # (..., M, 3, 3)
+    score: Tensor  # (..., M), 0 .. 1
+    reason: tuple[Reason, ...]  # of each disk, one after the other: why it has none; `OK` where it has one
+
+
 class DiskSearch(nn.Module, ABC):
     """A proposer as a module: `propose` is its work, a call accepts disks of any leading shape."""
 
@@ -154,18 +163,21 @@ class DiskSearch(nn.Module, ABC):
         """Return how much disks (F, S, S) look like the ball in its best orientation, (F,)."""
         return self.propose(disks).best_score
 
-    def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return R_view_body (..., M, 3, 3) and score (..., M) float64 of the candidates, best first, padded with NaN.
-        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
+    def forward(self, disks: Tensor | NDArray[np.generic]) -> Proposals:
+        """Return the candidates of disks (..., S, S), grey levels of any scale, the outline touching the borders.
 
         Raises:
             ShapeError: the disks are of another size, or not finite.
         """
         grey = tensor_of("disks", disks).float()
         check_finite("disks", grey)
-        R, score, mask = self.propose(grey.reshape(-1, *grey.shape[-2:])).padded(views=True)
+        found = self.propose(grey.reshape(-1, *grey.shape[-2:]))
+        R, score, mask = found.padded(views=True)
         R[~mask], score[~mask] = torch.nan, torch.nan
-        return R.reshape(*grey.shape[:-2], -1, 3, 3), score.reshape(*grey.shape[:-2], -1)
+        lead, most = grey.shape[:-2], mask.shape[1]
+        return Proposals(
+            R_view_body=R.reshape(*lead, most, 3, 3), score=score.reshape(*lead, most), reason=found.reason
+        )
 
 
 class FallbackProposer:

@@ -12,7 +12,8 @@ from sphereorient import so3
 from sphereorient.errors import Reason
 from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.settings import OrientSettings
-from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view, reduced_texture
+from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view
+from sphereorient.sphere.texture import known_paint, reduced_texture
 from sphereorient.sphere.texture_table import STEPS
 from sphereorient.sphere.view import disk_offsets
 
@@ -20,6 +21,7 @@ BINS = 32  # of the histograms; finer ones are empty in the small moving region
 # Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
 LOOKED_UP = 4096  # templates of the fine grid at once
 SEMIFINALISTS = 8  # of the fine grid, the share 1 / 8 that matches every fourth pixel best is matched with all
+LEAST_KNOWN = 0.25  # of the pixels compared: an orientation that shows less known paint is none
 FINALISTS = 4  # best of the fine grid by the table; the renderer chooses among them
 REAL = Sampling(outside=0.5, supersampling=1)  # blurred as by usual optics; 0 outside, as the paint
 HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp: in blurred templates more orientations are possible
@@ -118,7 +120,9 @@ class TemplateBank(DiskSearch):
     Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
 
     Args:
-        texture: (H, 2 H), the texture map, 0 black .. 1 white; an `nn.Parameter` gets gradients through `quality`.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint: pixels that show it are not
+            compared, orientations that show it in most pixels not proposed; an `nn.Parameter` gets gradients through
+            `quality`.
         size_px: side of the disks, rounded up to an even number; the templates of the coarse grid have half of it.
         settings: of the search; None: the defaults.
         bank: that of another search with the same arguments; None: made now.
@@ -127,6 +131,7 @@ class TemplateBank(DiskSearch):
 
     grid: Tensor
     bank: Tensor
+    known_share: Tensor  # (K,), of the pixels compared: those that show known paint
 
     def __init__(
         self,
@@ -136,6 +141,7 @@ class TemplateBank(DiskSearch):
         bank: Tensor | None = None,
     ) -> None:
         super().__init__()
+        texture, hidden = known_paint(texture)
         self._settings = settings = settings or OrientSettings()
         self.size_px = size = size_px + size_px % 2
         self.renderer = SphereRenderer(texture, size_px=size, sampling=REAL)
@@ -152,6 +158,10 @@ class TemplateBank(DiskSearch):
             half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=HALF)
             bank = _templates(half, self._half, self.grid)
         self.register_buffer("bank", bank.float(), persistent=False)
+        self._known: SphereRenderer | None = None
+        if hidden is not None:  # templates are 0 there
+            self._known = SphereRenderer((~hidden).float(), size_px=size // 2, sampling=HALF)
+            self.register_buffer("known_share", self._known_share(self.grid), persistent=False)
 
     def paint(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the paint (..., S, S) of grey disks: -1 black, +1 white, 0 undecided or outside."""
@@ -170,12 +180,19 @@ class TemplateBank(DiskSearch):
         template = 2 * self.renderer(R_view_body) - 1
         product = (paint * template)[..., self._real]
         T: Tensor = 0.5 + product.sum(-1) / (2 * product.shape[-1])
-        return T
+        return T if self._known is None else _of_known(T, self._known_share(R_view_body))
+
+    def _known_share(self, R_view_body: Tensor) -> Tensor:
+        """Return the share of the pixels compared that show known paint, (...), at orientations (..., 3, 3)."""
+        assert self._known is not None  # who asks knows
+        share: Tensor = self._known(R_view_body)[..., self._half].mean(-1)
+        return share
 
     def score(self, paint: Tensor) -> Tensor:
         """Return T (..., K) of paint (..., S, S) at all rotations of the coarse grid, at half size."""
         half = F.avg_pool2d(paint.reshape(-1, 1, *paint.shape[-2:]), 2)[:, 0, self._half]
         T: Tensor = 0.5 + half @ self.bank.T / (2 * STEPS * half.shape[-1])
+        T = T if self._known is None else _of_known(T, self.known_share)
         return T.reshape(*paint.shape[:-2], len(self.bank))
 
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
@@ -195,7 +212,11 @@ class TemplateBank(DiskSearch):
         """Return the group (F, K) int64 of each possible orientation by T (F, K), 0 about the best; -1: not possible.
         The best orientation left opens a group and takes all that are nearer than `group_deg`.
         """
-        left = T.amax(-1, keepdim=True) - self._settings.score_margin < T
+        highest = T.max(-1, keepdim=True)
+        margin = self._settings.score_margin * (
+            1.0 if self._known is None else self.known_share[highest.indices].sqrt()
+        )
+        left = highest.values - margin < T
         group = torch.full_like(T, -1, dtype=torch.int64)
         flat, near = self.grid.flatten(1), 1 + 2 * math.cos(math.radians(self._settings.group_deg))
         for number in range(self._settings.groups_max + 1):  # one group more than allowed is a runaway
@@ -269,6 +290,11 @@ def _matches(template: Tensor, paint: Tensor) -> Tensor:
     # In whole numbers products with the paint of all starts take a third of the time.
     every = torch._int_mm(template.flatten(0, 1), paint.to(torch.int8).T.contiguous())
     return every.float().reshape(*template.shape[:2], len(paint)).diagonal(dim1=0, dim2=2).T
+
+
+def _of_known(T: Tensor, share: Tensor) -> Tensor:
+    """Return T of a share of the pixels, (...), as likely by chance as the same T of all: of few pixels it is lower."""
+    return torch.where(share < LEAST_KNOWN, 0.0, 0.5 + (T - 0.5) / share.clamp_min(LEAST_KNOWN).sqrt())
 
 
 def best_of_each(group: Tensor, value: Tensor, count: int) -> Tensor:

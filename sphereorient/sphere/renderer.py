@@ -10,7 +10,7 @@ from sphereorient.cameras import Camera, Rays
 from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.errors import CameraError, SettingsError, check_tail, refusal, tensor_of
 from sphereorient.so3 import check_rotations
-from sphereorient.sphere.texture import as_texture, reduced_texture
+from sphereorient.sphere.texture import known_paint, reduced_texture
 from sphereorient.sphere.view import paint_seen, smooth_positive, sphere_normals
 
 RIM = 0.02  # rounding of the limb, radii^2: the least depth is 0.1 radii
@@ -67,7 +67,8 @@ class SphereRenderer(nn.Module):
     """Render a painted sphere, differentiable in orientation, position, radius and texture.
 
     Args:
-        texture: (H, 2 H), 0 black .. 1 white; an `nn.Parameter` is trained, anything else becomes a buffer.
+        texture: (H, 2 H), 0 black .. 1 white, NaN of no known paint: it is shown as grey; an `nn.Parameter` is
+            trained, anything else becomes a buffer.
         radius_mm: sphere radius.
         camera: camera of the picture; None for the orthographic view along z (x right, y down).
         size_px: side of the orthographic picture, which a sphere at the origin fills.
@@ -99,7 +100,7 @@ class SphereRenderer(nn.Module):
         if not radius_mm > 0:
             do = "pass the sphere's radius"
             raise SettingsError(refusal("radius_mm", expected="a number above 0", got=f"{radius_mm:g}", do=do))
-        values = as_texture(texture)
+        values = known_paint(texture)[0]
         if isinstance(values, nn.Parameter):
             self.texture = values
         else:

@@ -172,16 +172,19 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
 
 
-def as_texture(texture: Any) -> Tensor:
-    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor; refuse others (ShapeError)."""
+def known_paint(texture: Any) -> tuple[Tensor, Tensor | None]:
+    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor, grey where it is NaN: no paint is
+    known there; and these texels, (H, 2 H) bool, None if there are none. Refuse other maps (ShapeError).
+    """
     values = tensor_of("texture", texture)
     check_texture_shape(values)
-    top = float(values.detach().amax())
+    top = float(values.detach().nan_to_num().amax())
     if not values.is_floating_point() or top > OVERSHOOT:
         got = f"{str(values.dtype).removeprefix('torch.')} up to {top:g}"
         do = "convert it to float and divide it by the level of white, as load_texture does"
         raise ShapeError(refusal("texture", expected="floating-point numbers, 0 black .. 1 white", got=got, do=do))
-    return values
+    hidden = values.detach().isnan()
+    return (torch.where(hidden, 0.5, values), hidden) if bool(hidden.any()) else (values, None)
 
 
 def check_texture_shape(texture: Tensor) -> None:

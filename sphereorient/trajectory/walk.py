@@ -77,11 +77,25 @@ def turned(steps: Floats, heading_rad: Floats) -> Floats:
     return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FicTracAxes:
+    """Axes of FicTrac's table, its "lab" and its "camera": those of an experiment, or those of FicTrac itself."""
+
+    R_own_lab: Floats  # (3, 3), from the experiment's lab to the table's
+    R_cam_own: Floats  # (3, 3), from the table's lab to its camera
+
+    @classmethod
+    def of_lab(cls, R_cam_lab: Floats) -> "FicTracAxes":
+        """Return those of the experiment: its lab is the animal's frame, x ahead, y to the right, z down."""
+        return cls(R_own_lab=np.eye(3), R_cam_own=R_cam_lab)
+
+
 def fictrac_rows(
     R_cam_lab: Floats, R_from_first: Floats, ahead: Floats, right: Floats, start: NDArray[np.bool_], **own: ArrayLike
 ) -> Floats:
-    """Return FicTrac's columns, (N, 25), of rotations since a stretch began, (N, 3, 3), lab, and steps (N,), radii; a
-    frame that is the `start` of a stretch, (N,), has not moved. `own`: the other columns by their names in `FICTRAC`.
+    """Return FicTrac's columns, (N, 25), of rotations since a stretch began, (N, 3, 3), and steps (N,), radii, in the
+    lab of the table; a frame that is the `start` of a stretch, (N,), has not moved. `own`: the other columns by their
+    names in `FICTRAC`.
     """
     # FicTrac's absolute rotations are those since its first frame, in the lab with the camera's pose put before.
     R_cam = R_cam_lab @ R_from_first @ R_cam_lab.T

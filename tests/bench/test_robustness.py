@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from bench_robustness import markdown
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from sphereorient.bench import (
     BenchSettings,
@@ -30,7 +31,7 @@ from sphereorient.bench.run import (
     trackers_of,
 )
 from sphereorient.bench.score import aligned_errors_deg, orientations_at, read_fictrac, true_orientations
-from sphereorient.cli import main
+from sphereorient.cli import app, main
 from sphereorient.errors import BenchError, OutputError, SettingsError, TrackError
 from sphereorient.trajectory import CameraTrack, Trajectory
 
@@ -302,7 +303,7 @@ def test_compare_as_a_command(tmp_path, monkeypatch, capsys):
     assert run_command(monkeypatch, capsys, "compare", tmp_path / "old.json", tmp_path / "old.json")[0] == 0
 
 
-def test_fictracs_file_is_read_and_scored(truth, tmp_path, monkeypatch, capsys):
+def test_fictracs_file_is_read_and_scored(truth, tmp_path):
     path, R = truth
     own = Rotation.from_matrix(R[0]).inv()
     rows = np.zeros((FRAMES, 25))
@@ -314,10 +315,9 @@ def test_fictracs_file_is_read_and_scored(truth, tmp_path, monkeypatch, capsys):
     assert np.median(aligned_errors_deg(measured, true)) > 10
     np.testing.assert_allclose(aligned_errors_deg(measured, true, "both"), 0, atol=1e-5)
     assert aligned_errors_deg(measured, true, "body").max() > 0.3
-    code, told, _ = run_command(monkeypatch, capsys, "score", tmp_path / "out.dat", path, "--format", "fictrac",
-                                "--align", "both")  # fmt: skip
-    assert code == 0
-    assert "24 of 24 frames" in told
+    run = CliRunner().invoke(app, ["score", str(tmp_path / "out.dat"), str(path), "--align", "both"])
+    assert run.exit_code == 0
+    assert "24 of 24 frames" in run.output
     with pytest.raises(BenchError, match="numbers between commas"):
         read_fictrac(path)
 

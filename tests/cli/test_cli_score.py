@@ -18,7 +18,9 @@ from typer.testing import CliRunner
 from sphereorient.bench import score_track
 from sphereorient.cli import app
 from sphereorient.errors import BenchError, TrackError
+from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Tracks, Trajectory
+from sphereorient.trajectory.walk import FicTracAxes
 
 TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"
 
@@ -63,6 +65,32 @@ def test_the_errors_of_a_track_are_printed(track):
     assert "0.3000" in words
     assert "10.00" in words
     assert all(name in words for name in ("acceleration", "omega_body", "alpha_lab", "alpha_body"))
+
+
+def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
+    """As of a learnt map: errors of 150 degrees, and one rotation explains them."""
+    loaded, turn = Trajectory.load(track), Rotation.from_rotvec([2.0, 1.5, -0.8]).as_matrix()
+    with h5py.File(TRUTH) as file:
+        rates = {key: file[key][()] for key in ("omega_lab", "omega_body", "alpha_body") if key in file}
+    rates |= {key: rates[key] @ turn for key in ("omega_body", "alpha_body")}  # components in axes that are turned
+    off = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix() @ loaded.orientation @ turn
+    off[3] = np.nan
+    cov = np.tile(np.eye(3) * 0.01**2, (40, 1, 1))
+    replace(loaded, orientation=off, orientation_cov=cov, **rates).save(track)
+    plain, body = (CliRunner().invoke(app, ["score", str(track), str(TRUTH), *more])
+                   for more in ((), ("--align", "body")))  # fmt: skip
+    assert "--align body" in plain.stderr
+    assert "--align body" not in body.stderr
+    found = score_track(Trajectory.load(track), TRUTH, "body")
+    assert found.percentiles_deg()[3] < 1.2  # 0.01 rad in the lab; the turn takes some of it
+    assert found.over_stated()[0] < 1.2
+    assert found.relative_rms["omega_body"] == pytest.approx(0.0, abs=0.03)
+    assert found.relative_rms["omega_lab"] == pytest.approx(0.0, abs=1e-9)
+    assert score_track(Trajectory.load(track), TRUTH).percentiles_deg()[0] > 100
+
+
+def test_a_right_track_gets_no_such_hint(track):
+    assert "--align" not in CliRunner().invoke(app, ["score", str(track), str(TRUTH)]).stderr
 
 
 def refused(*arguments: object, error: type[Exception] = TrackError) -> str:
@@ -180,6 +208,16 @@ def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_
     assert reversed_["gain"]["value"][1] == pytest.approx(1 / 0.97, abs=1e-6)
 
 
+def test_the_table_that_is_exported_of_a_track_is_that_track(on_a_ball, tmp_path):
+    """Its counter begins at 0, as FicTrac's: from 1 on each frame was compared with the one beside it."""
+    table = fictrac_table(on_a_ball, FicTracAxes.of_lab(TURN))
+    np.savetxt(tmp_path / "own.dat", table, delimiter=", ")
+    found = scored(tmp_path / "track.h5", tmp_path / "own.dat", "--align", "both")
+    assert found["error_deg"]["largest"] < 0.01
+    assert found["pairs"] == 199
+    assert found["end_share"] < 1e-6
+
+
 def test_a_table_whose_counter_begins_anew_is_cut_there(on_a_ball, tmp_path):
     rows = np.loadtxt(tmp_path / "theirs.dat", delimiter=",")
     turned = Rotation.from_rotvec(rows[100:, 8:11]) * Rotation.from_rotvec(rows[100, 8:11]).inv()
@@ -194,8 +232,11 @@ def test_behaviour_is_printed_and_a_short_track_says_why_not(on_a_ball, tmp_path
     told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
     assert "0.9700" in told
     assert all(word in told for word in ("gain, smoothed", "drift (degrees a minute)", "length of the path, ratio"))
-    told = CliRunner().invoke(app, ["bench", "score", str(tmp_path / "theirs.dat"), str(tmp_path / "truth.h5"),
-                                    "--format", "fictrac", "--align", "both"]).output  # fmt: skip
+    told = (
+        CliRunner()
+        .invoke(app, ["score", str(tmp_path / "theirs.dat"), str(tmp_path / "truth.h5"), "--align", "both"])
+        .output
+    )
     assert "1.0000 .. 1.0000" in told
     on_a_ball[:40].save(tmp_path / "short.h5")
     short = scored(tmp_path / "short.h5", tmp_path / "truth.h5")

@@ -14,11 +14,11 @@ from live_examples import rows
 from overlay_examples import true_track
 
 from sphereorient import so3
-from sphereorient.cameras import PinholeCamera
 from sphereorient.live.lines import FicTracLines, Quantities, Told, fictrac_line
 from sphereorient.live.live import Measured
 from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Flag, Trajectory
+from sphereorient.trajectory.walk import FicTracAxes
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +32,9 @@ def track() -> Trajectory:
 
 
 def test_lines_are_the_rows_of_the_exported_table(track):
-    R_cam_lab = so3.exp(torch.tensor([0.7, -0.1, 0.4], dtype=torch.float64))
-    camera = PinholeCamera(
-        image_size=(64, 48),
-        f_px=torch.tensor(90.0),
-        centre_px=torch.tensor([31.5, 23.5]),
-        R_cam_lab=R_cam_lab,
-        T_cam_lab_mm=torch.zeros(3),
-    )
-    table, lines = fictrac_table(track, camera), FicTracLines(camera.R_cam_lab.numpy())
+    R_cam_own, R_own_lab = so3.exp(torch.tensor([[0.7, -0.1, 0.4], [0.2, 0.1, -0.3]], dtype=torch.float64)).numpy()
+    axes = FicTracAxes(R_own_lab=R_own_lab, R_cam_own=R_cam_own)
+    table, lines = fictrac_table(track, axes), FicTracLines(axes)
     found = np.array(
         [
             [
@@ -66,7 +60,7 @@ def test_json_has_null_for_what_is_not_known(track):
 
 
 def forms(frames: Iterable[Measured], known: Quantities) -> list[Told]:
-    table = FicTracLines(np.eye(3))
+    table = FicTracLines(FicTracAxes.of_lab(np.eye(3)))
     return [Told(now, table, known) for now in frames]
 
 

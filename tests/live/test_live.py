@@ -111,7 +111,7 @@ def test_the_command_writes_and_sends_each_frame(tmp_path):
         command = ["live", str(EXCERPT / "experiment.yaml"), "--source", "movie-fast"]
         run = CliRunner().invoke(app, [*command, *(word for one in to for word in ("--to", str(one)))])
         assert run.exit_code == 0, run.output
-        assert reader.recv(2000).startswith(b"FT, 1, ")
+        assert reader.recv(2000).startswith(b"FT, 0, ")
     assert "40 frames, 0 without a pose, 0 dropped" in run.output
     assert np.loadtxt(tmp_path / "a.dat", delimiter=",").shape == (40, 25)
     assert len((tmp_path / "a.jsonl").read_text().splitlines()) == 40

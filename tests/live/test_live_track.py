@@ -28,6 +28,7 @@ from sphereorient.live.sources import movie_frames
 from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Flag, Reason, Trajectory, journal
 from sphereorient.trajectory.datasets import stored_fields
+from sphereorient.trajectory.walk import FicTracAxes
 
 HIDDEN, DROPPED = range(15, 18), range(24, 26)
 OF_FIT = Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT | Flag.AMBIGUOUS
@@ -58,7 +59,10 @@ def test_a_frame_that_one_camera_measured_is_flagged_at_once_and_doubtful_if_the
         found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
     expected = [0, 0, 0, 0, 0, Flag.ONE_CAMERA, 0, Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT, 0]
     assert [now.flags for now in found] == expected
-    lines = [json.loads(Told(now, FicTracLines(np.eye(3)), Quantities(fixed=False)).json) for now in found]
+    lines = [
+        json.loads(Told(now, FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(fixed=False)).json)
+        for now in found
+    ]
     assert [sum(Flag[name] for name in line["flags"]) for line in lines] == expected
 
 

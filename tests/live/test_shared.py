@@ -18,12 +18,14 @@ from sphereorient.errors import MovieError, OutputError
 from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.outputs import open_output
 from sphereorient.live.shared import POSES, shared_poses
+from sphereorient.trajectory.walk import FicTracAxes
 
-NAMES = list(Told(next(rows(true_track())), FicTracLines(np.eye(3)), Quantities(True)).numbers)
+NAMES = list(Told(next(rows(true_track())), FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(True)).numbers)
 READER = """
 import sys
 from pathlib import Path
 from sphereorient.live.shared import shared_poses
+from sphereorient.trajectory.walk import FicTracAxes
 print("begun", flush=True)
 for count, pose in shared_poses(Path(sys.argv[1])):
     print(count, int(pose[0]), pose[1], pose[-1], flush=False)

@@ -15,11 +15,10 @@ from overlay_examples import changed, true_track
 from scipy.spatial.transform import Rotation
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, PinholeCamera
 from sphereorient.errors import OutputError
 from sphereorient.report.export import export_track, fictrac_table
 from sphereorient.trajectory import Trajectory
-from sphereorient.trajectory.walk import walk_of
+from sphereorient.trajectory.walk import FicTracAxes, walk_of
 
 HERTZ = 100.0
 
@@ -35,10 +34,8 @@ def track() -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def camera() -> Camera:
-    R_cam_lab, zero = so3.exp(vector(0.7, -0.1, 0.4)), vector(0, 0, 0)
-    view = {"image_size": (64, 48), "f_px": vector(90.0)[0], "centre_px": vector(31.5, 23.5)}
-    return PinholeCamera(**view, R_cam_lab=R_cam_lab, T_cam_lab_mm=zero)
+def axes() -> FicTracAxes:
+    return FicTracAxes.of_lab(so3.exp(vector(0.7, -0.1, 0.4)).numpy())
 
 
 def rolled(rate: torch.Tensor, frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -88,11 +85,11 @@ def test_the_walk_is_what_fictrac_itself_wrote():
     np.testing.assert_allclose(np.nancumsum(walk.side_rad_s), table[:, 20], atol=1e-9)
 
 
-def test_fictracs_columns_belong_together(track, camera, tmp_path):
-    export_track(track, tmp_path / "t.dat", camera=camera)
+def test_fictracs_columns_belong_together(track, axes, tmp_path):
+    export_track(track, tmp_path / "t.dat", axes=axes)
     table = np.loadtxt(tmp_path / "t.dat", delimiter=",")
     assert table.shape == (40, 25)
-    R_cam_lab = camera.R_cam_lab.numpy()
+    R_cam_lab = axes.R_cam_own
     np.testing.assert_allclose(table[1:7, 1:4], table[1:7, 5:8] @ R_cam_lab.T, atol=1e-12)
     # R_cam(k) = exp(dr_cam(k)) R_cam(k - 1), from the unit rotation; R_lab = C R_cam.
     R_cam, step = (Rotation.from_rotvec(table[:7, part]) for part in (slice(8, 11), slice(1, 4)))
@@ -102,7 +99,8 @@ def test_fictracs_columns_belong_together(track, camera, tmp_path):
     R_lab = Rotation.from_rotvec(table[:7, 11:14]).as_matrix()
     np.testing.assert_allclose(R_lab, R_cam_lab.T @ R_cam.as_matrix(), atol=1e-12)
     assert np.isnan(table[7, 1:21]).all()
-    assert table[8, 22] == 1  # the sequence begins anew
+    np.testing.assert_array_equal(table[:, 0], np.arange(40))  # both counters from 0, as FicTrac's program has them
+    np.testing.assert_array_equal(table[:, 22], [*range(8), *range(32)])  # the sequence begins anew
     np.testing.assert_allclose(table[:, 21], 1e3 * track.time)
 
 
@@ -112,10 +110,10 @@ def test_fictracs_table_needs_the_camera(track, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_smoothed_pose_stands_in_for_one_not_measured(track, camera):
+def test_a_smoothed_pose_stands_in_for_one_not_measured(track, axes):
     smooth = replace(track, orientation_smooth=true_track().orientation)
-    whole = fictrac_table(true_track(), camera)
-    np.testing.assert_allclose(fictrac_table(smooth, camera)[:, 5:21], whole[:, 5:21], atol=1e-12)
+    whole = fictrac_table(true_track(), axes)
+    np.testing.assert_allclose(fictrac_table(smooth, axes)[:, 5:21], whole[:, 5:21], atol=1e-12)
 
 
 def test_tum_has_the_valid_frames_with_w_last(track, tmp_path):

@@ -389,6 +389,14 @@ def test_angles_are_in_degrees_with_their_own_sign_and_cut_where_they_wrap():
     np.testing.assert_allclose([x, y], 0.0, atol=1e-9)
 
 
+def test_the_scale_of_angles_is_that_of_the_motion_and_the_whole_circle_where_they_go_round():
+    rocks = Rotation.from_rotvec(np.deg2rad(3.0) * np.sin(np.arange(60) / 5)[:, None] * [1.0, 0.0, 0.0]).as_matrix()
+    small = replace(planted_track(), orientation=rocks, orientation_smooth=rocks)
+    low, high = plots.track_figure(small).axes[1].get_ylim()
+    assert -10 < low < -3 < 3 < high < 10
+    assert plots.track_figure(planted_track()).axes[1].get_ylim() == (-185, 185)
+
+
 def test_bands_of_angles_agree_with_drawn_orientations():
     """Oracle: errors of the orientation in lab components, drawn and turned into angles one by one."""
     theta_deg, cov = np.array([40.0, 50.0, -70.0]), np.deg2rad(0.2) ** 2 * np.diag([1.0, 9.0, 4.0])

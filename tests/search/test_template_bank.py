@@ -20,7 +20,8 @@ from torch import nn
 from sphereorient import so3
 from sphereorient.errors import ShapeError
 from sphereorient.search import OrientSettings, TemplateBank
-from sphereorient.sphere import SphereRenderer
+from sphereorient.sphere import SphereRenderer, orthographic_view
+from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
 
@@ -190,11 +191,57 @@ def test_the_table_is_pinned_to_the_renderer(kind):
 def test_forward_keeps_the_leading_shape():
     disks = clean_disks("dots", attitudes(4))
     found = search_of("dots").propose(disks)
-    R, T = search_of("dots")(disks.reshape(2, 2, SIZE, SIZE))
-    assert R.shape == (*T.shape, 3, 3)
+    shaped = search_of("dots")(disks.reshape(2, 2, SIZE, SIZE))
+    T = shaped.score
+    assert shaped.R_view_body.shape == (*T.shape, 3, 3)
+    assert shaped.reason == found.reason
     assert T.shape[:2] == (2, 2)
     assert_close(T.flatten(0, 1)[:, 0], found.score[found.offset[:-1]])
     assert torch.equal(torch.isfinite(T).sum(-1).flatten(), found.counts)
+
+
+def test_a_disk_without_a_candidate_has_a_reason_and_the_others_have_theirs():
+    found = search_of("blobs")(torch.cat([clean_disks("blobs", attitudes(1)), noise(1)]))
+    assert found.reason == (Reason.OK, Reason.RUNAWAY)
+    assert bool(found.score[1].isnan().all())
+    assert search_of("blobs")(torch.zeros(0, SIZE, SIZE)).reason == ()
+
+
+# --- a map that is unseen in part
+
+
+def unseen_cap(height: int, share: float = 0.36) -> torch.Tensor:
+    """The texels of a cap about the south pole that covers a share of the sphere."""
+    return map_directions(height)[..., 2] < 2 * share - 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_renderings_of_a_map_that_is_unseen_in_part_are_found(kind):
+    """9 of 20 got no candidate; now all that show half of their paint or more, and the others have a reason."""
+    whole, R = texture_of(kind), attitudes(40)
+    unseen = unseen_cap(len(whole))
+    patchy = torch.where(unseen, torch.nan, whole)
+    bank = TemplateBank(patchy, SIZE)
+    shown = orthographic_view(SIZE).render((~unseen).float(), R.float())
+    enough = shown[:, disk_offsets(SIZE).norm(dim=-1) <= 1].mean(-1) > 0.5
+    assert 20 < int(enough.sum()) < 40
+    own, ball = (bank(disks) for disks in (SphereRenderer(patchy, size_px=SIZE)(R.float()), clean_disks(kind, R)))
+    for found in (own, ball):
+        there = found.score[:, 0].isfinite()
+        assert there.tolist() == [why is Reason.OK for why in found.reason]
+        best = so3.geodesic_distance(found.R_view_body[:, 0], R).rad2deg()
+        assert float(best[enough & there].max()) < 5.0
+    assert bool(own.score[enough, 0].isfinite().all())
+
+
+def test_T_of_known_paint_alone_is_1_of_the_right_picture_and_lower_for_the_same_share_of_fewer_pixels():
+    whole, R = texture_of("patches"), attitudes(12)
+    patchy = torch.where(unseen_cap(len(whole)), torch.nan, whole)
+    bank = TemplateBank(patchy, SIZE, OrientSettings(coarse_step_deg=30))
+    paint = torch.sign(SphereRenderer(whole, size_px=SIZE)(R.float()) - 0.5)
+    T, all_seen = bank.quality(paint, R.float()), search_of("patches").quality(paint, R.float())
+    assert float((T - all_seen).max()) < 0.02
+    assert float(T.max()) > 0.85
 
 
 # --- one disk, many disks

@@ -173,14 +173,23 @@ def _angles(axes: Axes, time: Floats, part: TrackPart) -> None:
     for i in range(3):
         jumps = np.abs(np.diff(smooth[:, i])) > WRAP_DEG
         _curve(axes, time, smooth[:, i], sigma[:, i], part.broken | jumps, i)
-    axes.set(ylim=(-185, 185), yticks=range(-180, 181, 90))
+    known = smooth[np.isfinite(smooth)]
+    if not len(known) or np.ptp(known) > WRAP_DEG:
+        axes.set(ylim=(-185, 185), yticks=range(-180, 181, 90))
+    else:
+        _limit(axes, smooth, sigma)
     axes.set_ylabel(r"angles $\theta_x$, $\theta_y$, $\theta_z$ (degrees)")
 
 
 def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_]) -> None:
-    """Draw three components (N, 3) and limit the axis to them: bands are far wider at the ends of segments."""
+    """Draw three components (N, 3) and limit the axis to them."""
     for i in range(3):
         _curve(axes, time, values[:, i], sigma[:, i], broken, i)
+    _limit(axes, values, sigma)
+
+
+def _limit(axes: Axes, values: Floats, sigma: Floats) -> None:
+    """Limit an axis to values: bands are far wider at the ends of segments."""
     known, errors = values[np.isfinite(values)], sigma[np.isfinite(sigma)]
     if len(known):
         rest = 0.05 * float(np.ptp(known)) + (SIGMAS * float(np.median(errors)) if len(errors) else 0.0)
