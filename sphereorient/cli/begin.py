@@ -70,11 +70,13 @@ def init(given: _InitOptions) -> None:
 
 @app.command()
 def mark(
-    file: Annotated[Path, Argument(metavar="FILE", help="experiment.yaml: masks; calibration.yaml: the fiducials.")],
+    file: Annotated[
+        Path, Argument(metavar="FILE", help="experiment.yaml: outline, masks; calibration.yaml: fiducials.")
+    ],
     port: Annotated[int, Option(min=0, max=65535, help="0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT.")] = 0,
     browser: Annotated[bool, Option(help="Open the page in the browser.")] = True,
 ) -> None:
-    """Mark in the browser what hides the ball in the movies, or the fiducials where `calibrate` does not find them."""
+    """Mark in the browser the ball and what hides it, or the fiducials where `calibrate` does not find them."""
     from sphereorient.preflight.mark import serve
     from sphereorient.preflight.mark_fiducials import FiducialMarking
     from sphereorient.preflight.mark_masks import MaskMarking
@@ -149,7 +151,9 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
         typer.echo(_found(look))
         if not said.rate_hz and not any(one.startswith("frame_rate=") for one in changes):
             rate = f"{rate_hz:g} Hz, as players show it" if rate_hz else "its time stamps"
-            typer.echo(f"src_fps gives no rate, so that of the movie is taken, {rate}: correct it if it is not the camera's")
+            typer.echo(
+                f"src_fps gives no rate, so that of the movie is taken, {rate}: correct it if it is not the camera's"
+            )
         live = [] if isinstance(said.source, Path) else [f"sphereorient live {target} --source camera:{said.source}"]
         _end(target, missing, [*_next(target, cameras, [look]), *live], made)
 

@@ -154,7 +154,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
         with suppress(ExperimentError, MovieError):
             # Of a ball that sinks: in a few frames it nearly stays.
             outline, _ = swaying_ball(stream.spread(SLOW_PICTURES), settings, shown=shown)
-            seen, stays, sways, radius_px = True, True, True, outline.radius_px
+            seen, stays, sways, together, radius_px = True, True, True, True, outline.radius_px
     if stays is None and firm:
         circles = np.array([one.circle for one in outlines])
         (u, v, radius_px), stays = np.median(circles, axis=0).tolist(), True

@@ -182,9 +182,9 @@ class MaskMarking(Marking):
         with self.lock:
             look = self.looks[name]
         if look.outline is None:
-            return {"found": False}
-        u, v, radius = look.outline.circle
-        return {"found": True, "u": u, "v": v, "radius": radius, "stays": look.stays, "frame": look.frame}
+            return {"found": False, "words": look.words()}
+        circle = dict(zip(("u", "v", "radius"), look.outline.circle, strict=True))
+        return circle | {"found": True, "stays": look.stays, "frame": look.frame, "words": look.words()}
 
     def rendered(self, name: str) -> Json:
         """Return the ball of `outline` as the texture map says it looks: a picture, and how much of it is explained.
