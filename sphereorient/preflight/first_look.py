@@ -77,7 +77,7 @@ class FirstLook:
         """Whether the outline of a ball that stays is not sure, and nobody gave the same."""
         if not self.stays or self.sways or self.photograph or self.outline is None:
             return False
-        alone = not self.together or 2 * self.found < self.looked
+        alone = not self.together or self.found < self.looked - 1
         apart = self.apart_px > max(SURE_PX, SURE_SHARE * self.outline.radius_px)
         return self.differs or ((alone or apart) and self.given is None)
 
