@@ -21,7 +21,7 @@ from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import DraftKey
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import GIVEN_PX, CameraScene, fixed_ball, still_ball, swaying_ball, wander_px
+from sphereorient.locate.scene import CameraScene, fixed_ball, given_outline, still_ball, swaying_ball, wander_px
 from sphereorient.movies import Movie, movie_files, open_movie
 from sphereorient.preflight.sample import sample_movie
 
@@ -87,6 +87,7 @@ class FirstLook:
             return "no ball was found: light, or more than one thing that moves?"
         seen = f"found in {self.found} of {self.looked} {'parts of the movie' if self.together else 'frames'}"
         seen += f", {self.apart_px:.1f} px apart" if math.isfinite(self.apart_px) else ""
+        seen = "as given, since the movie shows none surely" if self.given == self.outline.circle else seen
         stays = "sways in its place" if self.sways else f"stays in its place, outline {seen}"
         where = "one picture" if self.photograph else stays if self.stays else f"moves, {seen}"
         told = f"ball of {self.diameter_px:.{int(bool(self.stays))}f} px, {where}"
@@ -103,9 +104,7 @@ def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> F
     """
     if circle is None or look.together:
         return replace(look, stays=True, given=circle)
-    u, v, radius = circle
-    given = Outline(u_px=u, v_px=v, radius_px=radius, rms_px=GIVEN_PX, coverage=1.0)
-    return replace(look, stays=True, sways=False, given=circle, outline=given, diameter_px=2 * radius)
+    return replace(look, stays=True, given=circle, outline=given_outline(circle), diameter_px=2 * circle[2])
 
 
 def look_at(
@@ -185,10 +184,7 @@ def _again(
     """Return in how many parts of pictures (n, H, W) a fixed ball is found, of how many, and by how much these outlines
     differ from that of all, px.
     """
-    parts = min(PARTS, len(pictures) // LEAST)
-    if parts < 2:
-        return 1, 1, math.nan
-    circles = []
+    parts, circles = max(1, min(PARTS, len(pictures) // LEAST)), []
     for k in range(parts):
         with suppress(ExperimentError):
             circles.append(fixed_ball(pictures[k::parts], settings, shown=shown)[0].circle)

@@ -396,7 +396,7 @@ def test_each_commented_line_of_a_draft_can_be_uncommented_alone(clean, tmp_path
 def test_an_uncommented_wall_is_read_and_each_camera_has_its_own(tmp_path):
     folder = plates(tmp_path / "plates", [Scene()])
     for file in list(folder.iterdir()):
-        (folder / file.name.replace("cam1", "cam2")).write_bytes(file.read_bytes())
+        (folder / file.name.replace("left", "right")).write_bytes(file.read_bytes())
     out = tmp_path / "calibration.yaml"
     values = ("pixel_pitch=[0.02, 0.02]", "plate.pitch=8", "plate.dot_diameter=3", "plate.fiducial_diameter=5")
     lab = ("surveyed.R_lab_plate=[[1,0,0],[0,1,0],[0,0,1]]", "surveyed.T_lab_plate=[0,0,0]")
@@ -405,8 +405,8 @@ def test_an_uncommented_wall_is_read_and_each_camera_has_its_own(tmp_path):
     assert "2 pictures of 1 poses" in text
     out.write_text(text.replace("#ports", "ports"))
     walls = yaml.safe_load(out.read_text())["ports"]
-    assert walls["cam1"]["normal"] != walls["cam2"]["normal"]
-    assert set(load_calibration(out).ports) == {"cam1", "cam2"}
+    assert walls["left"]["normal"] != walls["right"]["normal"]
+    assert set(load_calibration(out).ports) == {"left", "right"}
 
 
 @pytest.mark.parametrize("change", ["\ufeff{}", "# mine\n{}", "first line"])
