@@ -123,7 +123,10 @@ def calibration_keys(
         _key("surveyed.pose", "its plate defines the lab; any that was surveyed", min(pictures)),
         _key("surveyed.R_lab_plate", "the plate's x, y, z axes in the lab, as columns", asked=axes),
         _key("surveyed.T_lab_plate", "its origin in the lab, mm", asked=[0, 0, 0]),
-        *(DraftKey(name=f"ports.{name}", comment=behind, example=one) for name, one in walls.items()),
+        *(
+            DraftKey(name=f"ports.{name}", comment="" if k else behind, example=walls[name])
+            for k, name in enumerate(cameras)
+        ),
         _key("pictures", f"{len(seen)} pictures of {len(pictures)} poses, paired by number", entries),
     ]
     return keys, widths

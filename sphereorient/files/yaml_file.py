@@ -103,8 +103,9 @@ def short(value: object) -> str:
 
 
 def flow(value: Any) -> str:
-    """Return a value as YAML in one line."""
-    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=1 << 20, allow_unicode=True)
+    """Return a value as YAML in one line, without aliases."""
+    how: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": 1 << 20, "allow_unicode": True}
+    text: str = yaml.dump(value, Dumper=_PlainDumper, **how)
     return text.strip().removesuffix("...").strip()
 
 
@@ -210,6 +211,11 @@ def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
     end += len(text[end:].partition("\n")[0].rstrip("\r"))
     rest = text[end:] or "\n"
     return f"{text[:end]}\n{indent}{key}: {line}{rest}"
+
+
+class _PlainDumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: object) -> bool:
+        return True
 
 
 class _BoundedLoader(yaml.SafeLoader):
@@ -365,11 +371,11 @@ def _block(keys: Sequence[DraftKey], indent: str) -> list[str]:
 def _line(key: DraftKey, name: str, indent: str) -> list[str]:
     known = key.value is not ...
     values = key.value if known else key.example
-    comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}"
+    comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}" if key.comment else ""
     mark = indent if known else f"{indent}#"  # without the "#" the key stands where it belongs
     if isinstance(values, list) and values and isinstance(values[0], Mapping):
         return [f"{mark}{name}:  {comment}", *(f"{mark}  - {flow(value)}" for value in values)]
     text = f"{mark}{name}: {flow(values)}"
     if len(text) + len(comment) + 2 > WIDTH:
-        return [f"{indent}#{comment}", text]
-    return [f"{text:34}  {comment}"]
+        return [f"{indent}#{comment}", text] if comment else [text]
+    return [f"{text:34}  {comment}".rstrip()]

@@ -296,7 +296,7 @@ def camera_keys(
         field = replace(field, comment="degrees, " + ("by EXIF" if field.value == look.vfov_deg else "as given"))
     values = {"model": model, "image_size": [width, height], field.name.rpartition(".")[2]: field.value}
     values |= {} if R is None else {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
-    comments = {"model": where, "image_size": "W, H px", "R": "from lab to camera", "T": "mm"}
+    comments = {"model": where, "image_size": "W, H px", "R": "rows: the camera's axes in the lab"}
     known = [
         DraftKey(name=f"cameras.{look.name}.{name}", value=value, comment=comments.get(name, ""))
         for name, value in values.items()

@@ -383,6 +383,7 @@ def test_each_commented_line_of_a_draft_can_be_uncommented_alone(clean, tmp_path
     count = 0
     for path in (tmp_path / "experiment.yaml", one, one.with_name("cameras.yaml"), plate):
         plain = yaml.safe_load(path.read_text())
+        assert not re.search(r"[&*]id", path.read_text()), "an alias, of which a change is one of two keys"
         for line, text in one_uncommented(path.read_text()):
             found, count = yaml.safe_load(text), count + 1
             key = re.match(r"\s*#(\w+):", line)
