@@ -115,10 +115,13 @@ def look_at(
     """
     movies = [open_movie(path) for path in paths]
     each = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
-    looks = list(counted("look", each, len(movies), progress))
-    if not all(one.stays for one in looks):  # it moves: in a short movie another camera may see little of that
-        looks = [replace(one, stays=None, sways=False) if one.sways else one for one in looks]
-    return looks
+    return agreed(list(counted("look", each, len(movies), progress)))
+
+
+def agreed(looks: Sequence[FirstLook]) -> list[FirstLook]:
+    """Return looks at one ball: where it moves in a movie, it moves in all; a short one may show little of that."""
+    moves = not all(one.stays for one in looks)
+    return [replace(one, stays=None, sways=False, together=False) if moves and one.sways else one for one in looks]
 
 
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
