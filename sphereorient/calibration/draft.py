@@ -20,6 +20,7 @@ from sphereorient.files.yaml_file import DraftKey
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 NUMBERED = re.compile(r"^(?P<camera>.*?)[-_ ]*(?P<pose>\d+)$")
+NORMALS = ([0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0])  # of walls, examples: cameras look through different ones
 LARGER = 1.25  # of the usual width: a larger dot
 CERTAIN = 30  # dots in a lattice: those of the other polarity need not be sought
 DIAMETERS = {"plate.dot_diameter": "width", "plate.fiducial_diameter": "larger"}  # keys, and parts of `PlateSeen`
@@ -110,9 +111,10 @@ def calibration_keys(
     each = {name: np.array([getattr(one, part) for one in with_dots]) for name, part in DIAMETERS.items()}
     widths = {name: float(np.nanmedian(some)) for name, some in each.items() if np.isfinite(some).any()}
     entries = [{"pose": pose} | {name: f"{where}{file}" for name, file in of.items()} for pose, of in pictures.items()]
-    wall = {"normal": [0, -1, 0], "offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
+    wall = {"offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
+    walls = {name: {"normal": NORMALS[k % len(NORMALS)]} | wall for k, name in enumerate(cameras)}
     axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    behind = "behind a flat wall: see docs/calibration.md; leave it out in air"
+    behind = "of cameras behind a flat wall, each its own; normal points to the camera; leave it out in air"
     keys = [
         _key("image_size", "W, H px, measured", list(seen[0].size)),
         _key("pixel_pitch", "mm, of the sensor, across and down", asked=[0.02, 0.02]),
@@ -121,8 +123,11 @@ def calibration_keys(
         _key("surveyed.pose", "its plate defines the lab; any that was surveyed", min(pictures)),
         _key("surveyed.R_lab_plate", "the plate's x, y, z axes in the lab, as columns", asked=axes),
         _key("surveyed.T_lab_plate", "its origin in the lab, mm", asked=[0, 0, 0]),
-        *(DraftKey(name=f"ports.{name}", comment=behind, example=wall) for name in cameras),
-        _key("pictures", f"{len(seen)} of {len(pictures)} poses, paired by number", entries),
+        *(
+            DraftKey(name=f"ports.{name}", comment="" if k else behind, example=walls[name])
+            for k, name in enumerate(cameras)
+        ),
+        _key("pictures", f"{len(seen)} pictures of {len(pictures)} poses, paired by number", entries),
     ]
     return keys, widths
 

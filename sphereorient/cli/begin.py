@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,11 +70,13 @@ def init(given: _InitOptions) -> None:
 
 @app.command()
 def mark(
-    file: Annotated[Path, Argument(metavar="FILE", help="experiment.yaml: masks; calibration.yaml: the fiducials.")],
+    file: Annotated[
+        Path, Argument(metavar="FILE", help="experiment.yaml: outline, masks; calibration.yaml: fiducials.")
+    ],
     port: Annotated[int, Option(min=0, max=65535, help="0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT.")] = 0,
     browser: Annotated[bool, Option(help="Open the page in the browser.")] = True,
 ) -> None:
-    """Mark in the browser what hides the ball in the movies, or the fiducials where `calibrate` does not find them."""
+    """Mark in the browser the ball and what hides it, or the fiducials where `calibrate` does not find them."""
     from sphereorient.preflight.mark import serve
     from sphereorient.preflight.mark_fiducials import FiducialMarking
     from sphereorient.preflight.mark_masks import MaskMarking
@@ -113,7 +115,7 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
     echo_lines(line for look in looks for line in _found(look))
     if len({len(look.movie) for look in looks}) > 1:
         typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
-    _end(target, missing, _next(target, cameras), [cameras] if alone else [])
+    _end(target, missing, _next(target, cameras, looks), [cameras] if alone else [])
 
 
 def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[str], quiet: bool) -> None:
@@ -134,9 +136,7 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     check_writable(mask)
     hidden = [{"kind": "hide", "points": polygon} for polygon in said.ignored]
     shown = drawn_mask(open_movie(movie).frame_shape, hidden, None)
-    look = _looked([movie], target, quiet, shown)[0]
-    diameter_px = 2 * said.circle_px[2] if said.circle_px else look.diameter_px
-    look = replace(look, stays=True, diameter_px=diameter_px)  # FicTrac follows no other balls
+    (look,) = _looked([movie], target, quiet, shown, said.circle_px)
     height, width = look.movie.frame_shape
     R_cam_lab = said.R_animal_cam((width, height)).mT.tolist()  # the lab is the animal's frame
     made = [cameras]
@@ -150,10 +150,15 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     _write_cameras(cameras, camera_keys(look, field_key(look, said.vfov_deg), R_cam_lab, model))
     if not quiet:
         echo_lines(_found(look))
+        if not said.rate_hz and not any(one.startswith("frame_rate=") for one in changes):
+            rate = f"{rate_hz:g} Hz, as players show it" if rate_hz else "its time stamps"
+            typer.echo(
+                f"src_fps gives no rate, so that of the movie is taken, {rate}: correct it if it is not the camera's"
+            )
         if said.unread:
             typer.echo(f"{config}, not read: {', '.join(said.unread)}")
         live = [] if isinstance(said.source, Path) else [f"sphereorient live {target} --source camera:{said.source}"]
-        _end(target, missing, [*_next(target, cameras), *live], made)
+        _end(target, missing, [*_next(target, cameras, [look]), *live], made)
 
 
 def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:
@@ -174,16 +179,24 @@ def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) ->
 
 
 def _looked(
-    movies: Sequence[Path], target: Path, quiet: bool, shown: "NDArray[np.bool_] | None" = None
+    movies: Sequence[Path],
+    target: Path,
+    quiet: bool,
+    shown: "NDArray[np.bool_] | None" = None,
+    circle: tuple[float, float, float] | None = None,
 ) -> "list[FirstLook]":
-    """Look at movies, and draw what was found beside the file to write; `shown` as in `look_at`."""
+    """Look at movies, and draw what was found beside the file to write; `shown` as in `look_at`, with FicTrac's circle
+    where `shown` is given.
+    """
     picture = target.with_suffix(".png")
     check_writable(picture)
-    from sphereorient.preflight.first_look import look_at
+    from sphereorient.preflight.first_look import look_at, with_circle
     from sphereorient.report.inputs import first_look_figure
 
     with progress_bar(quiet, unit="movies") as advance:
         looks = look_at(movies, advance, shown)
+    if shown is not None:  # FicTrac follows no balls that move
+        looks = [with_circle(look, circle) for look in looks]
     first_look_figure(looks, picture)
     return looks
 
@@ -227,24 +240,12 @@ def _found(look: "FirstLook") -> list[str]:
     """Return what a movie shows, in a line, and the remarks of its reader."""
     remarks = [f"{look.name}: {remark}" for remark in look.movie.remarks]
     height, width = look.movie.frame_shape
-    told = f"{look.name}: {look.movie.path}, {len(look.movie)} frames of {width} x {height} px"
-    if look.rate_hz:
-        told += f", {look.rate_hz:.6g} Hz"
-    if look.diameter_px is None:
-        return [f"{told}; no ball was found: light, or more than one thing that moves?", *remarks]
-    where = (
-        "one picture"
-        if look.photograph
-        else "sways in its place"
-        if look.sways
-        else "stays in its place"
-        if look.stays
-        else f"moves, found in {look.found} of {look.looked} frames"
-    )
-    return [f"{told}; ball of {look.diameter_px:.0f} px, {where}", *remarks]
+    rate = f", {look.rate_hz:.6g} Hz" if look.rate_hz else ""
+    shown = f"{look.name}: {look.movie.path}, {len(look.movie)} frames of {width} x {height} px{rate}; {look.words()}"
+    return [shown, *remarks]
 
 
-def _next(target: Path, cameras: Path) -> list[str]:
+def _next(target: Path, cameras: Path, looks: "Sequence[FirstLook]") -> list[str]:
     """Return the commands that come next."""
     calibrate = [
         "sphereorient init --plate FOLDER  # pictures of a calibration plate",
@@ -252,6 +253,7 @@ def _next(target: Path, cameras: Path) -> list[str]:
     ]
     return [
         *([] if cameras.exists() else calibrate),
+        *([f"sphereorient mark {target}  # the outline is doubtful"] if any(look.doubtful for look in looks) else []),
         f"sphereorient check {target}",
         f"sphereorient track {target} --out {target.parent / 'track.h5'}",
         f"sphereorient report {target.parent / 'track.h5'} --experiment {target} --out {target.parent / 'report'}",

@@ -24,7 +24,8 @@ TEXT_MARK = re.compile(
     rb'|\{\s*(?:"map": .*,\s*)?(?:"command": ?"sphereorient |"schema": ?"sphereorient-robustness)'
 )
 # The first line of a draft for people to go on with, see `sealed`.
-SEAL = re.compile(rb"# Until it is changed, init may replace it: ([0-9a-f]{8})\n")
+SEAL = re.compile(rb"##? Until it is changed, init may replace it: ([0-9a-f]{8})\n")
+DRAFT = b"by `sphereorient init`"  # in the head of each draft, whatever an editor did to its first line
 OLD_PAGE = b'<footer class="faint">sphereorient '
 PNG, PNG_HEAD = b"\x89PNG\r\n\x1a\n", 33  # signature; bytes of it and of the first chunk
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -115,7 +116,7 @@ def _foreign(path: Path) -> str:
     """Return what a file without the mark is."""
     try:
         with path.open("rb") as file:
-            drafted = SEAL.match(file.read(HEAD_BYTES)) is not None
+            drafted = DRAFT in file.read(HEAD_BYTES)
     except OSError:
         drafted = False
     return "one of `sphereorient init` that was changed since" if drafted else "a file without its mark"
@@ -141,7 +142,7 @@ def has_mark(path: Path) -> bool:
 
 def sealed(text: str) -> str:
     """Return a text with a line on top by which `has_mark` knows whether somebody has changed it."""
-    return f"# Until it is changed, init may replace it: {zlib.crc32(text.encode()):08x}\n{text}"
+    return f"## Until it is changed, init may replace it: {zlib.crc32(text.encode()):08x}\n{text}"
 
 
 def _hdf5_has_mark(path: Path) -> bool:

@@ -13,6 +13,8 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
+from yaml.parser import ParserError
+from yaml.scanner import ScannerError
 
 from sphereorient.errors import SettingsError, SphereOrientError, refusal
 from sphereorient.files.whole_file import MARK, TEXT_BYTES, read_text, sealed, write_text
@@ -29,6 +31,13 @@ NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
 FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exist is a ValueError, 1:1:...:1.5 the last
 WIDTH = 120  # characters of a line
+SLIP_LINES = 2  # before the line at which a parser stops: there the slip may be
+SLIPS = {  # in a line of YAML without its comment
+    "a tab, where spaces belong,": re.compile(r"^\s*\t|:\s*\t"),
+    "a quote that is not closed": re.compile(r"""[:\[{,-]\s*(["'])(?:(?!\1).)*$"""),
+    "no space after the colon": re.compile(r"^\s*(?:- )?[\w.]+:[^\s/\\]"),
+    "a text with a colon, which needs quotes,": re.compile(r"^\s*(?:- )?[\w.]+: [^\"'{\[]*: "),
+}
 
 
 def read_document(
@@ -94,8 +103,9 @@ def short(value: object) -> str:
 
 
 def flow(value: Any) -> str:
-    """Return a value as YAML in one line."""
-    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=1 << 20, allow_unicode=True)
+    """Return a value as YAML in one line, without aliases."""
+    how: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": 1 << 20, "allow_unicode": True}
+    text: str = yaml.dump(value, Dumper=_PlainDumper, **how)
     return text.strip().removesuffix("...").strip()
 
 
@@ -112,11 +122,30 @@ def assigned(text: str) -> tuple[str, Any]:
 
 
 def yaml_words(fault: Exception) -> str:
-    """Word the fault of a YAML text in one short line."""
+    """Word the fault of a YAML text in one short line: the likely slip, else what the parser says."""
     mark = getattr(fault, "problem_mark", None)
+    if isinstance(fault, ScannerError | ParserError) and (slip := _slip(fault)):
+        return slip
     problem = " ".join((getattr(fault, "problem", None) or str(fault).partition("\n")[0]).split())
     problem = problem if len(problem) <= 120 else problem[:117] + "..."
     return f"'{problem}'" + (f" in line {mark.line + 1}" if mark else "")
+
+
+def _slip(fault: ScannerError | ParserError) -> str | None:
+    """Return the likely slip behind a fault of a YAML text, with its line; None where none is known."""
+    at, begun = fault.problem_mark, fault.context_mark
+    if at is None or not at.buffer:
+        return None
+    lines = [line.partition(" #")[0] for line in at.buffer.rstrip("\0").split("\n")]
+    for number in range(min(at.line, len(lines) - 1), max(at.line - SLIP_LINES, 0) - 1, -1):
+        slip = next((words for words, pattern in SLIPS.items() if pattern.search(lines[number])), None)
+        if slip:
+            return f"{slip} in line {number + 1}"
+    if begun is not None and "flow" in (fault.context or ""):
+        return f"a bracket that is not closed, or a comma that is missing, in what begins in line {begun.line + 1}"
+    if "block" in (fault.context or "") or "mapping values" in (fault.problem or ""):
+        return f"an indent that fits no line above in line {at.line + 1}"
+    return None
 
 
 def parse_yaml(text: str, most_nodes: int = MAX_NODES) -> Any:
@@ -173,7 +202,7 @@ def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
     if node.flow_style:
         return f"{text[: last.end_mark.index]}, {key}: {line}{text[last.end_mark.index :]}"
     indent = " " * node.start_mark.column
-    commented = re.compile(rf"^{indent}# {re.escape(key)}:.*$", re.MULTILINE)
+    commented = re.compile(rf"^{indent}# ?{re.escape(key)}:.*$", re.MULTILINE)
     if not indent and commented.search(text):
         return commented.sub(lambda _: f"{key}: {line}", text, count=1)
     while isinstance(last, yaml.CollectionNode) and not last.flow_style:  # the end of a block is vague
@@ -182,6 +211,11 @@ def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
     end += len(text[end:].partition("\n")[0].rstrip("\r"))
     rest = text[end:] or "\n"
     return f"{text[:end]}\n{indent}{key}: {line}{rest}"
+
+
+class _PlainDumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: object) -> bool:
+        return True
 
 
 class _BoundedLoader(yaml.SafeLoader):
@@ -311,28 +345,38 @@ def open_keys(keys: Iterable[DraftKey]) -> list[DraftKey]:
 
 
 def draft_yaml(schema: str, keys: Sequence[DraftKey], head: str = "") -> str:
-    """Return the text of a file: keys not known are comments, with an example; those asked for say so."""
-    lines = [f"# {line}" for line in head.splitlines()] + [f"schema: {schema}"]
-    for parent in dict.fromkeys(key.name.partition(".")[0] for key in keys):
-        children = [key for key in keys if key.name.partition(".")[0] == parent]
-        if children[0].name == parent:
-            lines += _line(children[0], parent, "")
-            continue
-        known = any(key.value is not ... for key in children)
-        lines.append(f"{'' if known else '#'}{parent}:")
-        for key in children:
-            lines += _line(key, key.name.partition(".")[2], "  ")
-    return sealed("\n".join([*lines, ""]))
+    """Return the text of a file: keys not known are comments, with an example; those asked for say so. Without its "#"
+    each such line is a key in its place; lines that only explain begin with "##".
+    """
+    lines = [*(f"## {line}" for line in head.splitlines()), f"schema: {schema}", *_block(keys, ""), ""]
+    return sealed("\n".join(lines))
+
+
+def _block(keys: Sequence[DraftKey], indent: str) -> list[str]:
+    """Return the lines of keys; a parent of which nothing is known takes one line."""
+    groups: dict[str, list[DraftKey]] = {}
+    for key in keys:
+        parent, _, name = key.name.partition(".")
+        groups.setdefault(parent, []).append(replace(key, name=name))
+    lines = list[str]()
+    for parent, children in groups.items():
+        first = children[0]
+        if first.name and all(key.value is ... for key in children):
+            first = replace(first, name="", example={key.name: key.example for key in children})
+        lines += (
+            [f"{indent}{parent}:", *_block(children, f"{indent}  ")] if first.name else _line(first, parent, indent)
+        )
+    return lines
 
 
 def _line(key: DraftKey, name: str, indent: str) -> list[str]:
     known = key.value is not ...
     values = key.value if known else key.example
-    comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}"
+    comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}" if key.comment else ""
     mark = indent if known else f"{indent}#"  # without the "#" the key stands where it belongs
     if isinstance(values, list) and values and isinstance(values[0], Mapping):
         return [f"{mark}{name}:  {comment}", *(f"{mark}  - {flow(value)}" for value in values)]
     text = f"{mark}{name}: {flow(values)}"
     if len(text) + len(comment) + 2 > WIDTH:
-        return [f"{indent}{comment}", text]
-    return [f"{text:34}  {comment}"]
+        return [f"{indent}#{comment}", text] if comment else [text]
+    return [f"{text:34}  {comment}".rstrip()]

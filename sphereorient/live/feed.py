@@ -4,7 +4,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Condition, Thread
 
 import numpy as np
@@ -26,7 +26,7 @@ class Arrival:
     number: int  # counts all instants of the source, also those that were dropped
     time_s: float
     pictures: Sequence[Picture | None]
-    arrived_s: float  # by the clock of time.perf_counter
+    arrived_s: float  # by the clock of time.perf_counter; NaN: when the tracking takes it
 
 
 class FrameBytes:
@@ -78,7 +78,7 @@ class Feed:
                         self.dropped, self._overrun = self.dropped + 1, True
                     self._waiting.append(arrival)
                     self.newest_s = self.newest_s if self._wait else arrival.time_s
-                    if self._last_s:
+                    if self._last_s and math.isfinite(arrival.arrived_s):
                         step_s = arrival.arrived_s - self._last_s
                         self._usual_s += (step_s - self._usual_s) / 16 if self._usual_s else step_s
                     self._last_s = arrival.arrived_s
@@ -126,7 +126,8 @@ class Feed:
                         arrival = self._waiting.popleft()
                 self._step, self._since = max(most, 1), self._since + 1
                 self._changed.notify_all()
-            yield arrival
+            taken_s = arrival.arrived_s if math.isfinite(arrival.arrived_s) else time.perf_counter()
+            yield replace(arrival, arrived_s=taken_s)
         if self._fault is not None:
             raise self._fault
 

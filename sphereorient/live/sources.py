@@ -3,6 +3,7 @@
 A new source is a function here or in a file of its own, and a line of `SOURCES`.
 """
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,14 +34,16 @@ class Source:
 
 
 def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
-    """Yield the frames of an experiment's movies; `paced`: at the times of the recording."""
+    """Yield the frames of an experiment's movies; `paced`: at the times of the recording, else when they are taken."""
     pictures = zip(*(stream.pictures() for stream in recording.streams), strict=True)
     begun, first_s = time.perf_counter(), float(recording.timeline.time_s[0])
     for number, (row, time_s) in enumerate(zip(pictures, recording.timeline.time_s.tolist(), strict=True)):
         if paced:
             time.sleep(max(0.0, begun + time_s - first_s - time.perf_counter()))
         shown = [picture for picture, _ in row]
-        yield Arrival(number=number, time_s=time_s, pictures=shown, arrived_s=time.perf_counter())
+        yield Arrival(
+            number=number, time_s=time_s, pictures=shown, arrived_s=time.perf_counter() if paced else math.nan
+        )
 
 
 def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float) -> Iterator[Arrival]:

@@ -185,6 +185,11 @@ def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -
     return covered, found
 
 
+def given_outline(circle: tuple[float, float, float]) -> Outline:
+    """Return a circle u, v, radius, px, that people gave as an outline."""
+    return Outline(u_px=circle[0], v_px=circle[1], radius_px=circle[2], rms_px=GIVEN_PX, coverage=1.0)
+
+
 def fixed_ball(
     pictures: NDArray[Any],
     locating: LocateSettings,
@@ -207,8 +212,7 @@ def fixed_ball(
         scatter = np.where(shown, scatter, np.float32(0))
     full_scale = float(np.iinfo(pictures.dtype).max)
     if circle is not None:
-        u, v, radius = circle
-        given = Outline(u_px=u, v_px=v, radius_px=radius, rms_px=GIVEN_PX, coverage=1.0)
+        given = given_outline(circle)
         scene = _around(middle, scatter, given, full_scale)
         return given, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255

@@ -101,22 +101,22 @@ def fit_map(
     while len(done) < settings.rounds and not (len(done) > least and done[-1].moved_rad < arrived_rad):
         if kept is not None:
             write_kept(kept, _parts(start, state, done))
-        progress("map", len(done), settings.rounds)
+        progress("map", len(done), 0)  # it may end at any: no time left can be said
         state, iteration = iterations.iterate(state, settings, len(done))
         if len(done) in RECOVERY_AFTER:
             state = recovered(start.crops, state, chain)
         done.append(iteration)
-    progress("map", settings.rounds, settings.rounds)
+    progress("map", len(done), len(done))
     if old is not None:
         R_now_old = compare_maps(iterations.sharp_map(state).float(), old).R_other_reference
         state = replace(state, expected=turned_map(old.float(), R_now_old.mT, len(state.texture)))
         for k in range(settings.rounds):
-            progress("map, with the old one", k, settings.rounds)
+            progress("map, with the old one", k, 0)
             state, iteration = iterations.iterate(state, settings, least + k)
             done.append(iteration)
             if k >= iterations.LAB_ITERATIONS and iteration.moved_rad < arrived_rad:
                 break
-        progress("map, with the old one", settings.rounds, settings.rounds)
+        progress("map, with the old one", k + 1, k + 1)
     return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
 
 

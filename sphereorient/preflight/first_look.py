@@ -21,13 +21,17 @@ from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import DraftKey
 from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
-from sphereorient.locate.scene import CameraScene, fixed_ball, still_ball, swaying_ball, wander_px
+from sphereorient.locate.scene import CameraScene, fixed_ball, given_outline, still_ball, swaying_ball, wander_px
 from sphereorient.movies import Movie, movie_files, open_movie
 from sphereorient.movies.stamps import rate_of
 from sphereorient.preflight.sample import sample_movie
 
 WIDE_DEG = 30.0  # field of view that is the example
 STAYS, NEAR = 0.15, 1.0  # of the radius: a ball whose outlines scatter, or lie apart, by less stays in its place
+FIRM = 0.05  # likewise, where the pictures together show no outline
+PARTS, LEAST = 5, 4  # of the pictures, in which the outline of a ball that stays is found again; pictures of one
+SURE_PX, SURE_SHARE = 1.0, 0.03  # px, of the radius: outlines of parts that lie apart by more than both are doubtful
+AGREES = 0.05  # of the radius: a given circle that differs by less
 SEEN, ALWAYS = 0.4, 0.99  # share of the frames in which a ball is found at least, that moves, or that sinks slowly
 PICTURES, SLOW_PICTURES = 40, 100  # all over the movie, for a ball that stays, or sways
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
@@ -45,8 +49,13 @@ class FirstLook:
     diameter_px: float | None  # None: no ball was found
     stays: bool | None  # whether the ball stays in its place; None: not known
     sways: bool = False  # whether it does not stay exactly there
-    found: int  # frames with a ball, of `looked`
+    found: (
+        int  # frames with a ball, of `looked`; parts of the movie, where its outline is that of all pictures together
+    )
     looked: int
+    apart_px: float = math.nan  # by how much these outlines differ in u, v or radius
+    together: bool = False  # whether the outline is that of all pictures together, as `track` finds it
+    given: tuple[float, float, float] | None = None  # a circle of others: u, v, radius, px
     frame: int  # one in which the ball was found, where there is one
     picture: NDArray[Any]  # (H, W), of it
     outline: Outline | None  # of the ball in it
@@ -57,6 +66,47 @@ class FirstLook:
         """Whether the movie is one picture."""
         return len(self.movie) == 1
 
+    @property
+    def differs(self) -> bool:
+        """Whether the outline is not the circle that was given."""
+        if self.given is None or self.outline is None:
+            return False
+        return float(np.abs(np.subtract(self.given, self.outline.circle)).max()) > AGREES * self.outline.radius_px
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the outline of a ball that stays is not sure, and nobody gave the same."""
+        if not self.stays or self.sways or self.photograph or self.outline is None:
+            return False
+        alone = not self.together or self.found < self.looked - 1
+        apart = self.apart_px > max(SURE_PX, SURE_SHARE * self.outline.radius_px)
+        return self.differs or ((alone or apart) and self.given is None)
+
+    def words(self) -> str:
+        """Return what is known of the ball."""
+        if self.diameter_px is None or self.outline is None:
+            return "no ball was found: light, or more than one thing that moves?"
+        seen = f"found in {self.found} of {self.looked} {'parts of the movie' if self.together else 'frames'}"
+        seen += f", {self.apart_px:.1f} px apart" if math.isfinite(self.apart_px) else ""
+        seen = "as given, since the movie shows none surely" if self.given == self.outline.circle else seen
+        stays = "sways in its place" if self.sways else f"stays in its place, outline {seen}"
+        where = "one picture" if self.photograph else stays if self.stays else f"moves, {seen}"
+        told = f"ball of {self.diameter_px:.{int(bool(self.stays))}f} px, {where}"
+        if self.given is not None and self.given != self.outline.circle:
+            u, v, radius = self.given
+            told += f"; the given circle, {2 * radius:.1f} px about ({u:.1f}, {v:.1f}), "
+            told += "differs: the outline found is used" if self.differs else "agrees"
+        return f"{told}; DOUBTFUL: see the picture, draw it with `sphereorient mark`" if self.doubtful else told
+
+
+def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> FirstLook:
+    """Return a look at a ball that stays in its place, with its circle as others gave it (u, v, radius, px), which is
+    taken where the pictures together show none.
+    """
+    if circle is None or look.together:
+        return replace(look, stays=True, given=circle)
+    return replace(look, stays=True, given=circle, outline=given_outline(circle), diameter_px=2 * circle[2])
+
 
 def look_at(
     paths: Sequence[Path | str], progress: Progress = silent, shown: NDArray[np.bool_] | None = None
@@ -66,10 +116,13 @@ def look_at(
     """
     movies = [open_movie(path) for path in paths]
     each = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
-    looks = list(counted("look", each, len(movies), progress))
-    if not all(one.stays for one in looks):  # it moves: in a short movie another camera may see little of that
-        looks = [replace(one, stays=None, sways=False) if one.sways else one for one in looks]
-    return looks
+    return agreed(list(counted("look", each, len(movies), progress)))
+
+
+def agreed(looks: Sequence[FirstLook]) -> list[FirstLook]:
+    """Return looks at one ball: where it moves in a movie, it moves in all; a short one may show little of that."""
+    moves = not all(one.stays for one in looks)
+    return [replace(one, stays=None, sways=False, together=False) if moves and one.sways else one for one in looks]
 
 
 def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
@@ -83,25 +136,33 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
     k, looked = with_ball[len(with_ball) // 2] if with_ball else readable[0], len(readable)
     picture, outline = sample.picture[k], sample.found[k][0]
     assert picture is not None
-    seen, near, sways, stays = len(outlines) >= SEEN * looked, True, False, None
+    seen, near, sways, stays, firm = len(outlines) >= SEEN * looked, True, False, None, False
+    found, apart_px, together = len(outlines), math.nan, False
     if seen:
         places = np.array([(one.u_px, one.v_px) for one in outlines])
         radius_px = float(np.median([one.radius_px for one in outlines]))
         away = np.hypot(*(places - np.median(places, axis=0)).T) / radius_px
-        stays, near = bool(np.median(away) < STAYS), bool(away.max() < NEAR)
+        stays, near, firm = bool(np.median(away) < STAYS), bool(away.max() < NEAR), bool(np.median(away) < FIRM)
     if stays or not seen:
         try:
             outline, background = find(pictures := stream.spread(PICTURES), settings, shown=shown)
             seen, stays, radius_px = True, True, outline.radius_px
             scene = CameraScene(background=background, diameter_px=2 * radius_px)
             sways = not stream.photograph and wander_px(pictures, scene, settings) > 0
+            found, looked, apart_px = _again(pictures, outline, settings, shown)
+            together = True
         except (ExperimentError, MovieError):
             stays = None
     if not (stays or stream.photograph) and near and (not seen or len(outlines) > ALWAYS * looked):
         with suppress(ExperimentError, MovieError):
             # Of a ball that sinks: in a few frames it nearly stays.
             outline, _ = swaying_ball(stream.spread(SLOW_PICTURES), settings, shown=shown)
-            seen, stays, sways, radius_px = True, True, True, outline.radius_px
+            seen, stays, sways, together, radius_px = True, True, True, True, outline.radius_px
+    if stays is None and firm:
+        circles = np.array([one.circle for one in outlines])
+        (u, v, radius_px), stays = np.median(circles, axis=0).tolist(), True
+        apart_px = 1.4826 * float(np.median(np.abs(circles - (u, v, radius_px)), axis=0).max())
+        outline = replace(outlines[0], u_px=u, v_px=v, radius_px=radius_px)
     rate_hz = None if movie.times_s is None or len(movie) < 2 else rate_of(movie.times_s)
     return FirstLook(
         name=name,
@@ -110,13 +171,28 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
         diameter_px=2 * radius_px if seen else None,
         stays=stays,
         sways=sways,
-        found=looked if stays else len(outlines),
+        found=found,
         looked=looked,
+        apart_px=apart_px,
+        together=together,
         frame=int(sample.row[k]),
         picture=picture,
         outline=outline if seen else None,
         vfov_deg=vertical_field_deg(movie_files(movie.path)[0]) if stream.photograph else None,
     )
+
+
+def _again(
+    pictures: NDArray[Any], outline: Outline, settings: LocateSettings, shown: NDArray[np.bool_] | None
+) -> tuple[int, int, float]:
+    """Return in how many parts of pictures (n, H, W) a fixed ball is found, of how many, and by how much these outlines
+    differ from that of all, px.
+    """
+    parts, circles = max(1, min(PARTS, len(pictures) // LEAST)), []
+    for k in range(parts):
+        with suppress(ExperimentError):
+            circles.append(fixed_ball(pictures[k::parts], settings, shown=shown)[0].circle)
+    return len(circles), parts, float(np.abs(np.subtract(circles, outline.circle)).max()) if circles else math.nan
 
 
 def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraStream:
@@ -138,6 +214,11 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
     def each(value: Any) -> dict[str, Any]:
         return {name: value.format(name) if isinstance(value, str) else value for name in cameras}
 
+    circles = {one.name: [round(part, 1) for part in one.outline.circle] for one in looks if one.stays and one.outline}
+    lost = any(one.stays and not one.together for one in looks)  # without a circle `track` does not find it
+    taken = lost and all(one.given for one in looks)
+    found = "DOUBTFUL, `sphereorient mark` draws it" if any(one.doubtful for one in looks) else "found without this key"
+
     def key(name: str, comment: str, value: Any = ..., example: Any = None) -> DraftKey:
         return DraftKey(name=name, value=value, comment=comment, example=example)
 
@@ -152,7 +233,13 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
         key("movies", f"frames: {counts}", movies),
         key("backgrounds", empty, example=each("empty_{}.png")),
         key("masks", hidden, masks or ..., each("mask_{}.png")),
-        key("circles", "outline of a fixed ball, else found: u, v, radius, px", example=each([320.0, 240.0, 90.0])),
+        DraftKey(
+            name="circles",
+            value=circles if taken else ...,
+            comment=f"outline of a fixed ball, u, v, radius, px: {found}",
+            example=circles or each([320.0, 240.0, 90.0]),
+            asked=lost,
+        ),
         key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
         key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
         key("flip", "mirrored movies: vertical, horizontal, both, transpose", example=each("vertical")),
@@ -211,12 +298,14 @@ def camera_keys(
     R: R_cam_lab, where the lab is not the camera's own frame; model: pinhole or fisheye.
     """
     height, width = look.movie.frame_shape
-    entry: dict[str, Any] = {"model": model, "image_size": [width, height]}
-    told = f"WRITE THIS: vfov_deg: N, {field.comment}"
-    if field.value is not ...:
-        entry["vfov_deg"] = field.value
-        told = "field of view by the EXIF tags" if field.value == look.vfov_deg else "field of view as given"
-    if R is not None:
-        entry |= {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
     where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
-    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=f"{told}; {where}")]
+    if field.value is not ...:
+        field = replace(field, comment="degrees, " + ("by EXIF" if field.value == look.vfov_deg else "as given"))
+    values = {"model": model, "image_size": [width, height], field.name.rpartition(".")[2]: field.value}
+    values |= {} if R is None else {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
+    comments = {"model": where, "image_size": "W, H px", "R": "rows: the camera's axes in the lab"}
+    known = [
+        DraftKey(name=f"cameras.{look.name}.{name}", value=value, comment=comments.get(name, ""))
+        for name, value in values.items()
+    ]
+    return [field if key.name == field.name else key for key in known]

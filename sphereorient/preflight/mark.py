@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import SettingsError, SphereOrientError, refusal
 from sphereorient.files.page_server import Answer, Json, PageServer, listen, new_token
 from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text, writing
-from sphereorient.files.yaml_file import FAULTS, parse_yaml, with_value, yaml_words
+from sphereorient.files.yaml_file import read_yaml, with_value
 
 HERE, SHARED = Path(__file__).parent, ("mark.css", "mark.js")  # beside the pages
 
@@ -50,22 +50,17 @@ class Marking(ABC):
 
     def read(self) -> Any:
         """Return the values of the file as it is now."""
-        try:
-            return parse_yaml(self._text())
-        except FAULTS as fault:
-            raise self.refused(str(self.path), "YAML", yaml_words(fault), "correct the file there") from None
+        return read_yaml(self.path, self.error)
 
     def write(self, place: Sequence[str | int], value: Any, by_hand: str) -> None:
         """Write a value in one line of the file, whose other lines stay, see `with_value`; `by_hand`: else to do."""
-        text = with_value(self._text(), place, value)
+        old = read_text(self.path, TEXT_BYTES, "a YAML file", self.error, "correct the path")
+        text = with_value(old, place, value)
         if text is None:
             expected = f"a key {place[-1]} in one line, or a place for it"
             raise self.refused(str(self.path), expected, "another form", by_hand)
         with writing(force=True):
             write_text(self.path, text)
-
-    def _text(self) -> str:
-        return read_text(self.path, TEXT_BYTES, "a YAML file", self.error, "correct the path")
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:

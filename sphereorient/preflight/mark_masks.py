@@ -25,7 +25,7 @@ from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text, wri
 from sphereorient.files.yaml_file import flow, parse_yaml, with_value
 from sphereorient.movies import Movie, flipped_picture
 from sphereorient.preflight.clip import Clip
-from sphereorient.preflight.first_look import FirstLook, look_at_movie
+from sphereorient.preflight.first_look import FirstLook, agreed, look_at_movie
 from sphereorient.preflight.mark import Marking, png
 from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
@@ -50,7 +50,8 @@ class MaskMarking(Marking):
     @cached_property
     def looks(self) -> dict[str, FirstLook]:
         """What each movie shows without any mask drawn here."""
-        return {name: look_at_movie(name, movie, self.masks[name]) for name, movie in self.movies.items()}
+        looks = agreed([look_at_movie(name, movie, self.masks[name]) for name, movie in self.movies.items()])
+        return {look.name: look for look in looks}
 
     @cached_property
     def clip(self) -> Clip:
@@ -182,9 +183,9 @@ class MaskMarking(Marking):
         with self.lock:
             look = self.looks[name]
         if look.outline is None:
-            return {"found": False}
-        u, v, radius = look.outline.circle
-        return {"found": True, "u": u, "v": v, "radius": radius, "stays": look.stays, "frame": look.frame}
+            return {"found": False, "words": look.words()}
+        circle = dict(zip(("u", "v", "radius"), look.outline.circle, strict=True))
+        return circle | {"found": True, "stays": look.stays, "frame": look.frame, "words": look.words()}
 
     def rendered(self, name: str) -> Json:
         """Return the ball of `outline` as the texture map says it looks: a picture, and how much of it is explained.

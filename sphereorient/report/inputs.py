@@ -149,9 +149,13 @@ def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
             continue
         _outlined(whole, look.outline.circle)
         _outlined(near, look.outline.circle, near=True)
-        where = "stays in its place" if look.stays else f"moves; found in {look.found} of {look.looked} frames"
+        if look.differs and look.given is not None:
+            _outlined(near, look.given, lw=1.0, ls="--", color=EXPECTED)
+        where, frame = ("stays", "") if look.stays else ("moves", f" in frame {look.frame}")
+        doubt = "DOUBTFUL outline" if look.doubtful else "outline"
         whole.set_title(f"{look.name}, {Path(look.movie.path).name}: the ball {where}", fontsize=9)
-        near.set_title(f"outline found, {2 * look.outline.radius_px:.1f} px across", fontsize=9)
+        dashed = f"; given (dashed): {2 * look.given[2]:.1f} px" if look.differs and look.given else ""
+        near.set_title(f"{doubt}{frame}, {2 * look.outline.radius_px:.1f} px across{dashed}", fontsize=9)
     write_figure(figure, path, dpi=110)
 
 

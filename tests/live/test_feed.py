@@ -36,6 +36,15 @@ def test_a_feed_that_waits_gives_all_frames_in_order():
     assert feed.dropped == 0
 
 
+def test_a_frame_that_waits_for_the_tracking_arrives_when_it_is_taken():
+    """Frames of movie-fast are read ahead: the time in which they wait is no latency."""
+    with open_recording(EXCERPT / "experiment.yaml") as recording:
+        frames = iter(Feed(movie_frames(recording, paced=False), 4, wait=True))
+        for _ in range(8):
+            before_s = time.perf_counter()
+            assert before_s <= next(frames).arrived_s <= time.perf_counter()
+
+
 def test_of_a_camera_that_is_too_fast_frames_are_passed_over_in_steps_that_grow():
     goes_on, numbers = Semaphore(9), []
     feed = Feed(let(60, goes_on), 64, wait=False)

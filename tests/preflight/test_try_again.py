@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from mark_examples import opened, served
+from mark_examples import opened, place, served
 
 from sphereorient.errors import SphereOrientError
 from sphereorient.experiment import load_experiment
+from sphereorient.experiment.recording import given_mask
 from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
@@ -137,3 +138,31 @@ def test_a_person_tries_another_circle_and_saves_it(marking, browser):
         page.get_by_role("button", name="save these").click()
         page.get_by_text("Wrote").wait_for()
     assert load_experiment(marking.path).circles["cam1"][2] == pytest.approx(found - 3)
+
+
+@pytest.mark.slow  # a browser
+def test_the_circle_of_the_ball_and_the_holder_are_drawn_dragged_and_saved(marking, browser):
+    def drag(page: Any, *path: tuple[float, float]) -> None:
+        page.mouse.move(*place(page, *path[0]))
+        page.mouse.down()
+        for u, v in path[1:]:
+            page.mouse.move(*place(page, u, v))
+        page.mouse.up()
+
+    with served(marking) as address, opened(browser, f"{address}/{marking.token}/") as page:
+        page.get_by_role("button", name="outline of the ball").click()
+        drag(page, (70, 80), (80, 80), (90, 80))
+        page.get_by_role("button", name="circle", exact=True).click()
+        drag(page, (30, 130), (40, 130))  # the holder
+        page.get_by_role("button", name="move", exact=True).click()
+        drag(page, (70, 80), (74, 76), (75, 75))  # by its inside
+        drag(page, (75, 95), (75, 103))  # by its rim
+        drag(page, (30, 130), (75, 140))
+        drag(page, (85, 140), (95, 140))
+        page.get_by_role("button", name="save these").click()
+        page.get_by_text("Wrote").wait_for()
+    saved = load_experiment(marking.path)
+    assert saved.circles["cam1"] == pytest.approx((75, 75, 28), abs=0.6)
+    shown = given_mask(saved, "cam1", (150, 150))
+    v, u = np.nonzero(~shown)
+    assert (u.mean(), u.min(), u.max(), v.min()) == pytest.approx((75, 55, 95, 120), abs=1.5)
