@@ -44,7 +44,9 @@ MARGIN_PX = 3  # about such windows' middles: the occluder's blurred border
 MOST_HIDDEN = 0.5  # of a disk; where more differs, its pose or light is wrong, and all pixels count
 # In half of the pictures: bubbles 0.03, a rod 0.07, a map warped by 3 degrees 0.22. Then the model is wrong in all.
 USUALLY_HIDDEN = 0.15
-NEAR_RAD, NEAR_BLURS = 0.006, 0.4  # rad, and of the blur at the disk's middle: the longest steps that are not long
+# The longest steps that are not long: rad; of the blur at the disk's middle; of one so narrow, px, that edges fall
+# between the pixels: robust weights then leave out what is off by a pixel, and steps fall short.
+NEAR_RAD, NEAR_BLURS, NEAR_NARROW, NARROW_PX = 0.006, 0.4, 0.15, 0.5
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 MORE = 2, 3  # further iterations after a long step: of some pixels, of all
 AGAIN = 3  # times that a fit whose last step is long goes on
@@ -270,6 +272,12 @@ def settle(
         return fit, torch.zeros_like(far)
     near, far = _step(pixels.thinned(FIRST_EVERY), begin, model, some)
     return near.where(far, _step(pixels, begin.after(near), model, more, most_hidden)[0]), far
+
+
+def longest_near_rad(blur_px: float, radius_px: float) -> float:
+    """Return the longest step, rad, after which a fit to a disk of this radius and blur, px, has settled."""
+    share = NEAR_BLURS if blur_px > NARROW_PX else NEAR_NARROW
+    return min(NEAR_RAD, share * blur_px / max(radius_px, 1.0))
 
 
 def further_steps(model: SphereModel) -> tuple[int, int]:

@@ -20,7 +20,7 @@ from sphereorient.pose.camera_view import (
     widest_px,
 )
 from sphereorient.pose.compiled import IN_TORCH, body_of, settle_alone
-from sphereorient.pose.fit import AGAIN, HOPELESS, MOST_HIDDEN, NEAR_BLURS, NEAR_RAD
+from sphereorient.pose.fit import AGAIN, HOPELESS, MOST_HIDDEN, longest_near_rad
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.neighbours import DiskPlaces, Neighbours, Spoilt, spoilt
@@ -72,7 +72,7 @@ class Fitter:
                 light=self.light,
                 shading=FIRST if first else LATER,
                 limb_px=self.limb_px,
-                near_rad=min(NEAR_RAD, NEAR_BLURS * level.blur_px / max(self.widest_px, 1.0)),
+                near_rad=longest_near_rad(level.blur_px, self.widest_px),
             )
         return self._models[level]
 
