@@ -2,7 +2,8 @@
 
     scripts/first_hour.py tank|fictrac|wrong|notebook [--shared ../shared] [--work FOLDER]
 
-`tank`: two movies and plate pictures in a folder, nothing else. `fictrac`: the folder of FicTrac's sample movie.
+`tank`: two movies and plate pictures in a folder, nothing else. `fictrac`: the folder of FicTrac's sample movie. Both
+run the commands that `init` names.
 `wrong`: the first journey with a wrong input at each step. `notebook`: the toolkit's tutorial cell by cell, further
 calls of a user, and mistakes with their messages. What only the user knows is given by `--set`, once. Prints
 Markdown; errors against the truth where there is one, by the shared score_track.py.
@@ -158,7 +159,6 @@ def tank(shared: Path, folder: Path) -> None:
     run(folder, "init", "cam1.mkv", "cam2.mkv", *sets(KNOWN))
     run(folder, "init", "--plate", "plates", *sets(plates))
     run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml")
-    run(folder, "map", "experiment.yaml", "--out", "texture.png")
     run(folder, "check", "experiment.yaml")
     run(folder, "track", "experiment.yaml", "--out", "track.h5")
     run(folder, "report", "track.h5", "--experiment", "experiment.yaml", "--out", "report")
@@ -171,7 +171,6 @@ def fictrac(shared: Path, folder: Path) -> None:
         shutil.copy(shared / "real" / "fictrac" / name, folder)
     head("command")
     run(folder, "init", "--from-fictrac", "config.txt", "--set", "frame_rate=30")
-    run(folder, "map", "experiment.yaml", "--out", "texture.png")
     run(folder, "check", "experiment.yaml")
     run(folder, "track", "experiment.yaml", "--out", "track.h5")
     run(folder, "report", "track.h5", "--experiment", "experiment.yaml", "--out", "report")
