@@ -11,6 +11,7 @@ from sphereorient.cameras.camera import (
     centre_lab_mm,
     holds_disk,
     nearest_point,
+    perspective_centre_lab_mm,
     sphere_disk_px,
     sphere_radius_px,
     triangulate,

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from sphereorient.cameras.checks import camera_error, check_points
 
+PARALLEL = 1e-6  # sine of the angle of two lines of sight a unit apart that are parallel
+ASIDE = 1e-3  # of the distance: lines of sight about a point
 ASYMMETRY = 1e-6  # of the correlation matrix: covariances written with seven digits pass
 
 
@@ -235,6 +237,24 @@ def without_perspective(camera: Camera, uv_px: Tensor, R_lab_body: Tensor) -> Te
 def centre_lab_mm(camera: Camera) -> Tensor:
     """Return the origin (3,) of the camera's frame, lab, mm: the projection centre of a central camera."""
     return -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm)
+
+
+def perspective_centre_lab_mm(camera: Camera, position_lab_mm: Tensor) -> Tensor:
+    """Return where the lines of sight about positions (..., 3), mm, lab, meet, (..., 3): the projection centre, behind
+    a port its image; of parallel lines a point far away.
+    """
+    X = position_lab_mm.double()
+    middle = camera.rays(camera.project(X))
+    helper = torch.eye(3).double()[middle.direction_lab.abs().argmin(-1)]
+    across = torch.nn.functional.normalize(_cross(middle.direction_lab, helper), dim=-1)
+    aside = ASIDE * (X - middle.origin_lab_mm).norm(dim=-1, keepdim=True)
+    around = torch.stack([across, _cross(middle.direction_lab, across)])
+    beside = camera.rays(camera.project(X + aside * around))
+    if torch.equal(beside.origin_lab_mm[0], middle.origin_lab_mm):
+        return middle.origin_lab_mm
+    sine = _cross(middle.direction_lab.expand_as(around), beside.direction_lab).norm(dim=-1).mean(0)
+    distance: Tensor = aside / sine[..., None].maximum(PARALLEL * aside)
+    return X - distance * middle.direction_lab
 
 
 def sphere_disk_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
+from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm, perspective_centre_lab_mm
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import UNKNOWN, TextureMap
 from sphereorient.files.threads import Progress, counted, side_by_side, silent
@@ -271,8 +271,8 @@ def _together(at: Adjustment, seen: Iterable[_Seen]) -> tuple[Tensor, Tensor]:
 
 def sights(place: Crops) -> Tensor:
     """Return the lines of sight from all cameras to a ball's N positions, (C, N, 3) float64, radii, lab."""
-    centres = torch.stack([centre_lab_mm(view.camera) for view in place.views])
-    return (place.position_lab_mm - centres[:, None]) / place.radius_mm
+    X = place.position_lab_mm
+    return torch.stack([X - perspective_centre_lab_mm(view.camera, X) for view in place.views]) / place.radius_mm
 
 
 def place_metric(place: Crops) -> Tensor:

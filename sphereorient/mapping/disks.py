@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import locate
-from sphereorient.cameras import R_cam_view
+from sphereorient.cameras import R_cam_view, perspective_centre_lab_mm
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.files.threads import Progress, counted, side_by_side, silent
@@ -332,7 +332,7 @@ def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
     X = crops.position_lab_mm[frames]
     for c, view in enumerate(crops.views):
         camera = view.camera
-        in_camera = X @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
+        in_camera = (X - perspective_centre_lab_mm(camera, X)) @ camera.R_cam_lab.mT
         far[:, c] = in_camera.norm(dim=-1) / crops.radius_mm
         R[:, c] = camera.R_cam_lab.mT @ R_cam_view(in_camera)
         # The limb lies slightly before the great circle of `radius_px`.

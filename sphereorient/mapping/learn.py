@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.cameras import centre_lab_mm
+from sphereorient.cameras import perspective_centre_lab_mm
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
 from sphereorient.files.threads import Progress, counted
 from sphereorient.files.whole_file import writing
@@ -354,7 +354,7 @@ def times_seen(state: State, direction_body: Tensor) -> Tensor:
         for c, view in enumerate(state.fitter.views):
             if not bool(state.use[k, c]):
                 continue
-            middle = centre_lab_mm(view.camera) - state.position_lab_mm[k]
+            middle = perspective_centre_lab_mm(view.camera, X := state.position_lab_mm[k]) - X
             far = float(middle.norm())
             towards = (direction_body @ (R.mT @ (middle / far))).float()
             # Cosine of the slant where the line of sight meets the ball: (D n.e - r) / |D e - r n|.

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.cameras import Camera, R_cam_view, perspective_centre_lab_mm
 from sphereorient.files.compiled import compiled, record
 from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, octahedral_directions, tangents
 
@@ -33,8 +33,8 @@ class BallView:
     @classmethod
     def of(cls, camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> "BallView":
         """Return the view of a ball at a position (3,), mm."""
-        X, origin = position_lab_mm.double(), camera.rays(camera.project(position_lab_mm.double())).origin_lab_mm
-        in_camera = (X - origin) @ camera.R_cam_lab.mT
+        X = position_lab_mm.double()
+        in_camera = (X - perspective_centre_lab_mm(camera, X)) @ camera.R_cam_lab.mT
         D = float(in_camera.norm()) / radius_mm
         R = R_cam_view(in_camera).mT @ camera.R_cam_lab
         R[2] *= -1

@@ -6,12 +6,24 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import ROTVEC, T_MM, brown, f64, fisheye, openptv, pinhole, tsai, whole_picture
+from camera_examples import (
+    ROTVEC,
+    T_MM,
+    behind_port,
+    brown,
+    f64,
+    fisheye,
+    openptv,
+    pinhole,
+    telecentric,
+    tsai,
+    whole_picture,
+)
 from conftest import assert_close
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sphereorient.cameras import Camera, TsaiCamera
+from sphereorient.cameras import Camera, TsaiCamera, centre_lab_mm, perspective_centre_lab_mm, sphere_radius_px
 from sphereorient.errors import ShapeError
 
 CAMERAS = {
@@ -179,3 +191,22 @@ def test_another_last_axis_is_refused(camera, method):
 def test_whole_numbers_are_refused_because_the_camera_would_be_rounded(camera):
     with pytest.raises(ShapeError, match="floating-point"):
         camera.project(torch.zeros(3, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("kind", ["pinhole", "tsai", "fisheye", "port", "telecentric"])
+def test_lines_of_sight_about_a_point_meet_in_its_perspective_centre(kind):
+    lens = behind_port(pinhole()) if kind == "port" else (CAMERAS | {"telecentric": telecentric()})[kind]
+    X = f64([[4.0, -3.0, 6.0], [0.0, 0.0, 0.0]])
+    centre = perspective_centre_lab_mm(lens, X)
+    assert centre.shape == X.shape
+    if kind in ("pinhole", "tsai", "fisheye"):
+        assert_close(centre, centre_lab_mm(lens).expand_as(centre), atol=1e-9)
+        return
+    towards = torch.nn.functional.normalize(X - centre, dim=-1)
+    assert_close(towards, lens.rays(lens.project(X)).direction_lab, atol=1e-9)
+    if kind == "telecentric":
+        assert (X - centre).norm(dim=-1).min() > 1e5
+        return
+    # A small sphere's picture is as large as from there: the width of a pixel grows with the distance from it.
+    near, far = (sphere_radius_px(lens, X + move * towards, 0.1) for move in (-1.0, 1.0))
+    assert_close(near / far, ((X - centre).norm(dim=-1) + 1) / ((X - centre).norm(dim=-1) - 1), atol=3e-3)
