@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.cameras import Camera, centre_lab_mm, holds_disk, sphere_radius_px
+from sphereorient.cameras import Camera, holds_disk, perspective_centre_lab_mm, sphere_radius_px
 from sphereorient.cameras.response import Response
 from sphereorient.files.picture import OnDemand
 from sphereorient.locate import Background, CameraScene
@@ -89,7 +89,8 @@ class CameraView:
         """Return how far the middle of the disk moves in the picture, (B,), px, of spheres at (B, 3), mm.
         `moved` (B, 6): turn (rad) and move (mm) of the sphere while the shutter is open.
         """
-        sight = torch.nn.functional.normalize(position_lab_mm - centre_lab_mm(self.camera), dim=-1)
+        centre = perspective_centre_lab_mm(self.camera, position_lab_mm)
+        sight = torch.nn.functional.normalize(position_lab_mm - centre, dim=-1)
         front = moved[:, 3:] + torch.linalg.cross(moved[:, :3], -radius_mm * sight)
         across = front - (front * sight).sum(-1, keepdim=True) * sight
         smear: Tensor = across.norm(dim=-1) * self.radius_px(position_lab_mm, radius_mm) / radius_mm

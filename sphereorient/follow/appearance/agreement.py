@@ -11,7 +11,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.comparison import Seen, limits_of
 from sphereorient.calibration.contradictions import compare_cameras, majority
-from sphereorient.cameras import centre_lab_mm, triangulate
+from sphereorient.cameras import perspective_centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, Reason, refusal
 from sphereorient.follow.appearance.presence import nothing, proven, seldom
 from sphereorient.follow.initialise import Initialiser
@@ -150,7 +150,7 @@ def limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     found = torch.zeros(len(fitter.views), dtype=torch.float64)
     for k, view in enumerate(fitter.views):
         told = use[:, k] & (use.sum(1) > 1)
-        to_centre = fit.position_lab_mm - centre_lab_mm(view.camera)
+        to_centre = fit.position_lab_mm - perspective_centre_lab_mm(view.camera, fit.position_lab_mm)
         nearer = -(fit.own_move[:, k] * to_centre).sum(-1) / to_centre.square().sum(-1)
         if int(told.sum()) >= FEWEST_BOTH:
             found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[told].median()
@@ -197,7 +197,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         told = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
         others_px.append(turn * told * radius_px)
     for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
-        centre = centre_lab_mm(one_camera)
+        centre = perspective_centre_lab_mm(one_camera, X)
         sight = torch.nn.functional.normalize(X - centre, dim=-1)
         # The other camera knows the distance by its line of sight; this one by the size of its picture.
         others_px.append((((Y - X) * sight).sum(-1) / (X - centre).norm(dim=-1)).abs() * radius_px)
