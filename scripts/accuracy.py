@@ -6,7 +6,8 @@
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
 movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of
 the truth: the rates' errors by the kernels, applied to the true poses; the rest, which is noise; its sigmas.
-A second table: are the stated errors honest, in all these movies and in the scenes of a robustness benchmark?
+A sentence: are the stated errors honest, in all these movies and in the scenes of a robustness benchmark? A second
+table: in each of these scenes.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ import torch
 
 from sphereorient.bench import Score, score_track
 from sphereorient.bench.results import SceneResult, load_results, summarised
+from sphereorient.bench.scenes import CLEAN
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
 from sphereorient.motion import MotionSettings, datasets_of, measure_motion
@@ -74,55 +76,54 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as name:
                 write_synthetic_experiment(Path(name), SynthSettings.model_validate({"texture": texture, "seed": seed}))
                 stated.append(measured(Path(name), f"synthetic, {texture}", ("cam1", "cam2"), arguments.method))
-    if arguments.benchmark is not None:
-        stated += of_benchmark(arguments.benchmark, arguments.method)
-    print(honesty(stated))
+    print(honesty(stated, of_benchmark(arguments.benchmark, arguments.method) if arguments.benchmark else {}))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stated:
     """How honest the errors are that a track states."""
 
-    pictures: str
     frames: int  # that state an error of the orientation
     inside: int  # of these, with the truth in the stated 95 % region
     over: float  # rms error over the stated sigmas
 
     @property
-    def over_words(self) -> str:
-        """The ratio, or a dash where it was not measured."""
-        return f"{self.over:.2f}" if np.isfinite(self.over) else "–"
+    def words(self) -> str:
+        """Share inside, and the ratio, or a dash where nothing was measured."""
+        return f"{100 * self.inside / self.frames:.0f} %, {self.over:.2f}" if self.frames else "–"
 
 
-def honesty(stated: Sequence[Stated]) -> str:
-    """Word the shares of truths inside, of all pictures together and one by one."""
-    frames, inside = (sum(getattr(one, key) for one in stated) for key in ("frames", "inside"))
-    lines = [f"**{100 * inside / max(frames, 1):.1f} % of {frames} truths lie in the stated 95 %.**\n"]
-    lines += ["| pictures | in the stated 95 % | | errors over the stated ones, rms |", "|---|---|---|---|"]
-    lines += [
-        f"| {one.pictures} | {one.inside} of {one.frames} | {100 * one.inside / one.frames:.0f} % | {one.over_words} |"
-        for one in stated
-        if one.frames
-    ]
+def honesty(stated: Sequence[Stated], cells: Mapping[tuple[str, int], Stated]) -> str:
+    """Word the share of truths inside, of all pictures together; tabulate the cells of the benchmark."""
+    every = [*stated, *cells.values()]
+    frames, inside = (sum(getattr(one, key) for one in every) for key in ("frames", "inside"))
+    lines = [f"**{100 * inside / max(frames, 1):.1f} % of {frames} truths lie in the stated 95 %.**"]
+    levels = sorted({level for kind, level in cells if kind != CLEAN})
+    if cells:
+        lines += ["", f"| degradation | {' | '.join(f'level {level}' for level in levels)} |"]
+        lines += ["|---" * (len(levels) + 1) + "|"]
+    for kind in dict.fromkeys(kind for kind, _ in cells):
+        row = [one.words for (of, _), one in cells.items() if of == kind]
+        row += [""] * (len(levels) - len(row))  # clean movies have one level
+        lines.append(f"| {kind.replace('_', ' ')} | {' | '.join(row)} |")
     return "\n" + "\n".join(lines)
 
 
-def of_benchmark(results: Path, method: str) -> list[Stated]:
+def of_benchmark(results: Path, method: str) -> dict[tuple[str, int], Stated]:
     """Return the honesty of each degradation at each level, of all seeds together."""
     found = load_results(results)
     cells: dict[tuple[str, int], list[SceneResult]] = {}
     for one in found.outcomes:
         if one.method == method:
             cells.setdefault((one.kind, one.level), []).append(one)
-    return [
-        Stated(
-            pictures=f"{kind.replace('_', ' ')}, level {level}",
+    return {
+        cell: Stated(
             frames=sum(one.stated for one in group),
             inside=sum(one.inside for one in group),
             over=summarised(group).over_stated,
         )
-        for (kind, level), group in cells.items()
-    ]
+        for cell, group in cells.items()
+    }
 
 
 def windows(folder: Path, experiment: Experiment, count: int, method: str) -> list[Stated]:
@@ -164,7 +165,7 @@ def measured(
     if method == "paper":
         cells += parts(track, folder / "truth.h5")
     print("| " + " | ".join(cells) + " |", flush=True)
-    return Stated(pictures=label, frames=told, inside=inside, over=score.over_stated()[0])
+    return Stated(frames=told, inside=inside, over=score.over_stated()[0])
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:

@@ -288,7 +288,11 @@ def write_docs(found: Mapping[str, Mapping[str, Found]]) -> None:
     rows = [row(family, one) for family, one in found.items()]
     with (DOCS / "proposer-bench.csv").open("w", newline="") as file:
         csv.writer(file).writerows([header, *rows])
-    lines = ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]
+    short = [
+        [cell.split(" (")[0] for cell in cells[: len(names) + 1]] for cells in [header, *rows]
+    ]  # all is in the CSV
+    short.insert(1, ["---"] * len(short[0]))
+    lines = ["| " + " | ".join(cells) + " |" for cells in short]
     page = DOCS / "proposer.md"
     text = page.read_text("utf-8")
     head, tail = text.split(BEGIN)[0], text.split(END)[1]
