@@ -36,11 +36,10 @@ from sphereorient.trajectory import Trajectory
 COLUMNS = (
     "movie",
     "valid",
-    "orientation p50 / p95 / p99 / max (°)",
+    "orientation p50 / p95 / max (°)",
     "rms (°)",
-    "> 10°",
     "position p50 / p95 (mm)",
-    "omega lab / body",
+    "omega lab",
     "alpha lab",
     "velocity",
     "over the stated errors, rms",
@@ -150,16 +149,15 @@ def measured(
     position = score.percentiles_mm()
     cells = [
         label,
-        f"{score.valid.sum()} of {score.frames}",
-        " / ".join(f"{value:.3f}" for value in score.percentiles_deg()),
+        f"{score.valid.sum()}" if score.valid.all() else f"{score.valid.sum()} of {score.frames}",
+        " / ".join(f"{value:.3f}" for value in np.delete(score.percentiles_deg(), 2)),  # without 99 %
         f"{np.sqrt(np.mean(error**2)):.3f}",
-        str(int((error > 10).sum())),
-        f"{position[0]:.4f} / {position[1]:.4f}" if len(cameras) == 2 else "from the radius",
-        f"{_share(score, 'omega_lab')} / {_share(score, 'omega_body')}",
-        f"{_share(score, 'alpha_lab')}",
+        f"{position[0]:.4f} / {position[1]:.4f}" if len(cameras) == 2 else "",
+        _share(score, "omega_lab"),
+        _share(score, "alpha_lab"),
         _share(score, "velocity") if len(cameras) == 2 else "",
         " / ".join(f"{value:.2f}" if np.isfinite(value) else "–" for value in score.over_stated()),
-        f"{inside} of {told}",
+        f"{inside}" if inside == told else f"{inside} of {told}",
         f"{seconds:.0f}",
     ]
     if method == "paper":
@@ -189,7 +187,8 @@ def parts(track: Trajectory, truth_path: Path) -> list[str]:
 
 
 def _share(score: Score, key: str) -> str:
-    return f"{score.relative_rms[key]:.4f} ({100 * score.coverage[key]:.0f} %)"
+    known = f" ({100 * score.coverage[key]:.0f} %)" if score.coverage[key] < 0.995 else ""
+    return f"{score.relative_rms[key]:.4f}{known}"
 
 
 if __name__ == "__main__":
