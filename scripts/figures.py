@@ -58,7 +58,7 @@ FIGURES: dict[str, Figure] = {
     "faults": Figure(pages=("long-runs.md",), command="faults.py", tables=("faults",)),
     "paper-method": Figure(
         pages=("accuracy.md",),
-        command=f"accuracy.py {SHARED}/experiment --method paper",
+        command=f"accuracy.py {SHARED}/experiment --method paper --no-synth",
         tables=("paper-method",),
     ),
     "robustness": Figure(pages=("robustness.md",), command="bench_robustness.py --out out/robustness"),
