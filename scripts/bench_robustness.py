@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def markdown(results: Results) -> str:
-    """Return the table of docs/robustness.md: error and bad frames of each method and level by degradation."""
+    """Return the table of docs/robustness.md: median error and bad frames of each method and level by degradation."""
     lines = {(line.kind, line.level, line.method): line for line in summaries(results)}
     levels = sorted({level for kind, level, _ in lines if kind != CLEAN})
     head = ["degradation", *(f"{method}, level {level}" for method in results.methods for level in levels)]
@@ -72,8 +72,8 @@ def _cell(line: ResultSummary | None) -> str:
         return ""
     if not math.isfinite(line.p50_deg):
         return "refused" if line.refused else "nothing"
-    bad_ones = f"; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}" if bad(line) else ""
-    return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}{bad_ones}"
+    bad_ones = f" ({100 * line.wrong_after:.0f}, {100 * line.lost:.0f})" if bad(line) else ""
+    return f"{line.p50_deg:.3g}{bad_ones}"
 
 
 def print_methods(found: Results) -> None:
