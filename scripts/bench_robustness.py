@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.bench import BenchSettings, Results, SceneResult, run_benchmark
-from sphereorient.bench.figures import level_labels, robustness_figure, unit_of, write_table
+from sphereorient.bench.figures import robustness_figure, write_table
 from sphereorient.bench.results import WRONG_DEG, ResultSummary, save_results, summaries
 from sphereorient.bench.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.cli.app import progress_bar
@@ -55,22 +55,25 @@ def main() -> None:
 
 
 def markdown(results: Results) -> str:
-    """Return the table of docs/robustness.md: error and bad frames of each method by degradation and level."""
-    methods = results.methods
+    """Return the table of docs/robustness.md: median error and bad frames of each method and level by degradation."""
     lines = {(line.kind, line.level, line.method): line for line in summaries(results)}
-    head = ["", "value", *(f"{m}: median, 95 % (degrees); wrong, lost (%)" for m in methods)]
+    levels = sorted({level for kind, level, _ in lines if kind != CLEAN})
+    head = ["degradation", *(f"{method}, level {level}" for method in results.methods for level in levels)]
     text = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    for kind, level in dict.fromkeys((line.kind, line.level) for line in lines.values()):
-        value = "" if kind == CLEAN else f"{level_labels(kind, [level])[0]} {unit_of(kind)}"
-        cells = [_cell(lines[kind, level, method]) for method in methods if (kind, level, method) in lines]
-        text.append(f"| {kind.replace('_', ' ')} | {value} | {' | '.join(cells)} |")
+    for kind in dict.fromkeys(kind for kind, _, _ in lines):
+        own = [0] + [-1] * (len(levels) - 1) if kind == CLEAN else levels  # clean movies have one level
+        cells = [_cell(lines.get((kind, level, method))) for method in results.methods for level in own]
+        text.append(f"| {kind.replace('_', ' ')} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
 
-def _cell(line: ResultSummary) -> str:
+def _cell(line: ResultSummary | None) -> str:
+    if line is None:
+        return ""
     if not math.isfinite(line.p50_deg):
         return "refused" if line.refused else "nothing"
-    return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"
+    bad_ones = f" ({100 * line.wrong_after:.0f}, {100 * line.lost:.0f})" if bad(line) else ""
+    return f"{line.p50_deg:.3g}{bad_ones}"
 
 
 def print_methods(found: Results) -> None:

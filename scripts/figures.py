@@ -47,7 +47,7 @@ FIGURES: dict[str, Figure] = {
     "walkthrough": Figure(pages=("walkthrough.md",), command="figure_walkthrough.py"),
     "bound": Figure(pages=("errata.md",), command="bound_table.py"),
     "clean": Figure(pages=("accuracy.md",), command="clean_renders.py --count 100", tables=("clean",)),
-    "basin": Figure(pages=("precise.md",), command="basin.py", tables=("basin",)),
+    "basin": Figure(pages=("tracking.md",), command="basin.py", tables=("basin",)),
     "repair": Figure(pages=("assembly.md",), command="figure_repair.py"),
     "assembly": Figure(pages=("assembly.md",), command="bench_assembly.py"),
     "calibration": Figure(pages=("calibration.md",), command="figure_calibration.py"),
@@ -58,7 +58,7 @@ FIGURES: dict[str, Figure] = {
     "faults": Figure(pages=("long-runs.md",), command="faults.py", tables=("faults",)),
     "paper-method": Figure(
         pages=("accuracy.md",),
-        command=f"accuracy.py {SHARED}/experiment --method paper",
+        command=f"accuracy.py {SHARED}/experiment --method paper --no-synth",
         tables=("paper-method",),
     ),
     "robustness": Figure(pages=("robustness.md",), command="bench_robustness.py --out out/robustness"),
@@ -76,7 +76,7 @@ FIGURES: dict[str, Figure] = {
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls"),
     "reliability": Figure(pages=("robustness.md",), command="reliability.py"),
     "cameras": Figure(
-        pages=("accuracy.md",),
+        pages=("accuracy.md", "errors.md"),
         command=f"port_or_not.py {SHARED}/tank --figure docs/port_or_not.png",
         tables=("cameras",),
     ),

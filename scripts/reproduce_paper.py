@@ -200,32 +200,28 @@ def costs(out: Path, plan: Plan) -> str:
 PAGE = """# The paper, redone
 
 `scripts/reproduce_paper.py --out out/paper{option}` films synthetic movies as in the experiment of Zimmermann et al.
-2011, tracks them by the methods `paper` and `precise`, and makes this page. A second call continues where a killed one
-stopped. Processor time per movie: {costs}.
+2011, tracks them by the methods `paper` and `precise`, and makes this page. A second call continues a killed one.
+Processor time per movie: {costs}.
 
 ## The movies
 
-{movies} movies of {frames} frames ({total} frames in all), each of two cameras: 600 Hz, 650 x 650 px, 8 bit, a painted
-sphere of 18 mm that is 70 to 90 px wide. The motion is random with known statistics: velocity, acceleration, omega and
-alpha have the rms values of the paper's Table I; omega and alpha are intermittent, with flatness 4 and 7.6. The sphere
-passes near the middle once in each movie, so it enters and leaves the field. Behind it the driving disks turn, and
-their reflections move. Lamps light the sphere from one side and are mirrored in it; up to four bubbles are before it.
-No background pictures are given: the methods learn the background from the movie, as the paper does.
+- Size: {movies} movies of {frames} frames ({total} in all), two cameras, 600 Hz, 650 x 650 px, 8 bit.
+- Sphere: 18 mm, 70 to 90 px; it enters and leaves the field once in each movie.
+- Motion: random, with the rms values of the paper's Table I; omega and alpha with flatness 4 and 7.6.
+- Scene: driving disks rotate behind the sphere; lamps from one side; up to four bubbles; no background pictures.
 
 ## The numbers
 
-Truth: the exact motion in the frames that `paper` measured (`law`: of the random process, without end). Errors behind
-± are standard errors; whole movies or segments are resampled. Codes such as E6 name rows of [errata.md](errata.md).
-Segments count from {least} frames and {share} T_L on, with T_L = 0.3 s.
+Truth: the exact motion in the frames that `paper` measured (`law`: of the random process, without end). ±: standard
+errors; whole movies or segments are resampled. Codes such as E6: [errata.md](errata.md). Segments count from {least}
+frames and {share} T_L on, with T_L = 0.3 s.
 
 {table}
 
-Where the methods differ from the truth: `paper` computes alpha from averages of omega. This low-pass removes most of
-the strong bursts, so its rms and its flatness are too small. `precise` estimates the spectrum of the motion itself,
-and smooths no more than that allows; it measures more frames than `paper`, so that its truth is of other frames, too.
-The acceleration of these movies is Gaussian; the paper's is not (a = 0.6). The decay time of the durations follows from
-the size of the field and the velocity of the sphere, as in any flow; the paper compares it with T_L. No segment is
-longer than a movie.
+`paper` computes alpha from averages of omega. This low-pass removes most of the strong bursts, so rms and flatness are
+too small. `precise` estimates the spectrum of the motion itself. It measures more frames, so its truth is of other
+frames, too. The acceleration of these movies is Gaussian; the paper's is not (a = 0.6). No segment is longer than a
+movie.
 
 Movies that a method could not track:
 
