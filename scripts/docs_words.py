@@ -1,7 +1,7 @@
 """Print the words of each page of the docs and in all, and each sentence that stands twice (exit code 1).
 
-Words are counted as `wc -w` does, with code and tables; docs/history.md is left out of the sum. A sentence has six
-words or more; headings, code blocks and tables have none.
+A word has a letter or a digit; code and tables count (`wc -w`, in brackets, counts the bars of tables, too).
+docs/history.md is left out of the sum. A sentence has six words or more; headings, code and tables have none.
 """
 
 from __future__ import annotations
@@ -14,6 +14,11 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parent.parent
 NOT_COUNTED = {"history.md"}  # what was, for those who ask
 WORDS_OF_A_SENTENCE = 6
+
+
+def is_word(part: str) -> bool:
+    """Return whether a part between blanks has a letter or a digit."""
+    return any(map(str.isalnum, part))
 
 
 def sentences(text: str) -> list[str]:
@@ -40,10 +45,11 @@ def twice(pages: dict[str, str]) -> dict[str, list[str]]:
 def main() -> int:
     """Print both lists."""
     docs = {path.name: path.read_text("utf-8") for path in sorted((REPO / "docs").glob("*.md"))}
-    words = {name: len(text.split()) for name, text in docs.items()}
-    for name, count in sorted(words.items(), key=lambda item: -item[1]):
-        print(f"{count:7,}  {name}{'  (not counted)' if name in NOT_COUNTED else ''}")
-    print(f"{sum(count for name, count in words.items() if name not in NOT_COUNTED):7,}  in all")
+    counts = {name: (sum(map(is_word, text.split())), len(text.split())) for name, text in docs.items()}
+    for name, (words, parts) in sorted(counts.items(), key=lambda item: -item[1][0]):
+        print(f"{words:7,} ({parts:,})  {name}{'  (not in the sum)' if name in NOT_COUNTED else ''}")
+    words, parts = (sum(counts[name][i] for name in docs if name not in NOT_COUNTED) for i in (0, 1))
+    print(f"{words:7,} ({parts:,})  in all")
     found = twice(docs | {name: (REPO / name).read_text("utf-8") for name in ("README.md", "CONTRIBUTING.md")})
     for sentence, names in found.items():
         print(f"{len(names)} times, {', '.join(dict.fromkeys(names))}: {sentence}")
