@@ -57,7 +57,7 @@ class Port:
 
     def refract(self, air: Rays) -> Rays:
         """Refract rays in air (whole lines) into the liquid, from the wall's liquid side; NaN, gradient 0, if away.
-        Source: Snell's law divides the direction's part along the wall by the index (docs/conventions.md).
+        Source: Snell's law divides the direction's part along the wall by the index (docs/cameras.md).
         """
         d = air.direction_lab
         normal = self.normal_lab.to(d)
