@@ -201,6 +201,7 @@ def wrong(shared: Path, folder: Path) -> None:
     run(folder, "init", "--plate", "plates", *sets(plates), "--force", "-q")
     run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", "-q")
     run(folder, "track", "experiment.yaml", "--out", "track.h5", wrong=True)
+    (folder / "texture_seen.png").unlink()  # of the map that this run has learnt
     picture = cv2.imread(str(folder / "plates" / "cam1_00.png"), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(folder / "texture.png"), cv2.resize(picture, (512, 256)))
     run(folder, "track", "experiment.yaml", "--out", "track.h5", wrong=True)
