@@ -257,8 +257,6 @@ def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.
 
 
 class _Film:
-    """Renders the frames of a scene."""
-
     def __init__(self, scene: BallScene, camera: PinholeCamera, X: Tensor, paint: Floats, rng: np.random.Generator):
         self.scene, self._camera, self._paint, self._rng = scene, camera, paint, rng
         (u, v), (width, height) = camera.project(X).tolist(), scene.size
@@ -305,7 +303,6 @@ class _Film:
         self._glint = (scene.specular * glint.clamp_min(0).numpy() ** 25 * self._hit).astype(np.float32)
 
     def _seen(self, R_lab_body: Tensor) -> Floats:
-        """Return the paint of all samples."""
         x, y, z = (self._normal.float() @ R_lab_body.float()).unbind(-1)
         rows, columns = self._paint.shape
         u = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * columns - 0.5
@@ -347,7 +344,6 @@ class _Film:
         cv2.ellipse(picture, (int(u), int(v - 0.78 * r)), axes, 0, 0, 360, grey, -1, cv2.LINE_AA)
 
     def _put_animal(self, picture: Floats, k: int) -> None:
-        """Draw a body and legs that walk, 12 steps a second."""
         (u, v), r = self.middle, self.radius_px
         for leg in range(self.scene.legs):
             side, rank = (-1) ** (leg + 1), leg // 2

@@ -272,7 +272,6 @@ def info() -> None:
 
 
 def _print_findings(found: dict[str, Any]) -> None:
-    """Print what `doctor` found: lines, and a table of fits."""
     from rich.table import Table
 
     fits = found.pop("live_one_camera", [])

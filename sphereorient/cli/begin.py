@@ -246,7 +246,6 @@ def _found(look: "FirstLook") -> list[str]:
 
 
 def _next(target: Path, cameras: Path, looks: "Sequence[FirstLook]") -> list[str]:
-    """Return the commands that come next."""
     calibrate = [
         "sphereorient init --plate FOLDER  # pictures of a calibration plate",
         f"sphereorient calibrate calibration.yaml --out {cameras}",

@@ -206,7 +206,6 @@ Jobs = Annotated[int, Option("--jobs", "-j", min=1, help="Processes.")]
 
 
 def _numbers_in(option: str, text: str) -> tuple[int, ...]:
-    """Return the numbers in 1,3,5; raise SettingsError for another text."""
     if not names_in(text) or not all(part.isdecimal() for part in names_in(text)):
         expected, got, do = "whole numbers between commas", repr(text)[:40], f"write e.g. {option} 1,3,5"
         raise SettingsError(refusal(option, expected=expected, got=got, do=do))
@@ -352,7 +351,6 @@ def ball_scenes(given: _BallOptions) -> None:
 
 
 def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
-    """Print what was measured of scenes, beside what other programs print of theirs."""
     from rich.table import Table
 
     from sphereorient.bench.ball import SCENES
@@ -444,7 +442,6 @@ def live_delay(given: _LiveDelayOptions) -> None:
 
 
 def _rate_hz(text: str) -> float:
-    """Return a frame rate; raise SettingsError for anything else."""
     try:
         rate_hz = float(text)
     except ValueError:
@@ -484,7 +481,6 @@ def write_scenes(given: _SceneOptions) -> None:
 
 
 def _print(found: "Results") -> None:
-    """Print one line for each degradation, level and method."""
     from rich.table import Table
 
     from sphereorient.bench.results import summaries
@@ -508,7 +504,6 @@ def _print(found: "Results") -> None:
 
 
 def _print_balls(runs: "Sequence[Results]") -> None:
-    """Print one line for each number of cameras and balls."""
     from rich.table import Table
 
     from sphereorient.bench.results import summaries

@@ -127,7 +127,6 @@ def _kept(requests: "Sequence[Request]") -> Iterator[None]:
 def _track_side_by_side(
     requests: "Sequence[Request]", jobs: int, cluster: str | None, resume: bool, quiet: bool
 ) -> None:
-    """Track on worker processes or a cluster, and print a table of the results."""
     from sphereorient.run import run_many
     from sphereorient.run.many import ProcessExecutor, dask_executor
 
@@ -146,7 +145,6 @@ def _track_side_by_side(
 
 
 def _print_table(outcomes: "Sequence[Outcome]") -> None:
-    """Print frames, valid frames and time of each experiment."""
     from rich.table import Column, Table
 
     table = Table("track", *(Column(heading, justify="right") for heading in ("frames", "valid", "s", "frames/s")), "")
@@ -159,7 +157,6 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
 
 
 def _print_summary(result: "Trajectory", name: str) -> None:
-    """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
     from sphereorient.calibration.self_calibration import contradiction_lines
     from sphereorient.trajectory import span_words
 

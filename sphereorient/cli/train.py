@@ -81,7 +81,6 @@ def evaluate(
 
 
 def _print(found: "ProposerBenchmark") -> None:
-    """Print a line for each degradation, then the metrics of the mixed pictures."""
     from rich.table import Table
 
     levels = sorted({one.level for one in found.families})

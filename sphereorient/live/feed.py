@@ -132,8 +132,6 @@ class Feed:
             raise self._fault
 
     def _await(self) -> None:
-        """Wait for a frame or the end."""
-
         def is_there() -> bool:
             return bool(self._waiting) or self._ended
 

@@ -76,7 +76,6 @@ class Instants:
 
     @property
     def _usual_s(self) -> float:
-        """Usual interval; 0: not known."""
         return statistics.median(self._steps) if len(self._steps) >= 8 else min(self._steps, default=0.0)
 
     def restart(self, camera: int) -> None:
@@ -138,7 +137,6 @@ class Instants:
         return offset_s + middle if agree and (abs(middle) < within_s or len(clock.lags) == SURE) else None
 
     def _put(self, camera: int, time_s: float, shot: Shot, step: int, near_s: float) -> None:
-        """Put a picture to its instant."""
         clock = self._clocks[camera]
         found = next((one for one in self._open if abs(one.time_s - time_s) < near_s), None)
         if found is None:

@@ -131,7 +131,6 @@ def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[A
 
 
 def _unknown(place: Crops, follower: FirstPass) -> Appearance:
-    """Return what is known of a ball without a map: where it is seen."""
     fitter = first_fitter(place.views, place.radius_mm, follower.cells.table, FIRST_BLUR_PX)
     lasting = Lasting.none(len(place.views))
     return Appearance(fitter=fitter, still=fitter, lasting=lasting, score_min=0.0, right_score=1.0)

@@ -133,7 +133,6 @@ class Quantities:
 
 
 def _states_errors(now: Measured) -> bool:
-    """Return whether there is a pose with errors."""
     return bool(np.isfinite(now.covariance).all())
 
 

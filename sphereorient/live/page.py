@@ -73,8 +73,6 @@ REASONS = list(Reason)
 
 @dataclass(eq=False)
 class _Absence:
-    """Since when a ball is not found."""
-
     lost: tuple[float, Measured] | None = None  # time of the source, s, and the last frame without a pose
     told: bool = False
     in_a_row: int = 0  # frames with a pose
@@ -113,7 +111,6 @@ class Monitor:
         self._watch(self._absence[now.ball], now)
 
     def _watch(self, of: _Absence, now: Measured) -> None:
-        """Tell a ball that is not found for a while, and that it is found again."""
         of.in_a_row = of.in_a_row + 1 if now.valid else 0
         if now.valid:
             if of.in_a_row >= CONFIRMED:
@@ -184,7 +181,6 @@ class PageWriter:
             pictures.write(now.time_s, [*shown, words, row])
 
     def _listen(self, running: Event, save_map: Callable[[], str] | None) -> None:
-        """Do what the page asks for."""
         with suppress(EOFError, OSError):
             while True:
                 word = self._commands.recv_bytes().decode()
@@ -251,7 +247,6 @@ def _obeyed(word: str, running: Event, save_map: Callable[[], str] | None) -> st
 def _serve(
     experiment: Path, cameras: Sequence[str] | None, folder: Path, token: str, door: socket.socket, commands: Connection
 ) -> None:
-    """Serve the page until the loop's process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
     if hasattr(os, "nice"):
         os.nice(10)  # tracking goes first

@@ -115,7 +115,6 @@ def preflight(
 
 
 def _sample(recording: Recording, stream: CameraStream, size_px: float | None, settings: Settings) -> MovieSample:
-    """Return the sample of a camera, with the background and the place that `track` finds."""
     scene, empty = None, given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     with suppress(SphereOrientError):  # what a tracker would refuse is reported by the findings
         (scene,) = find_scenes(recording, stream, settings.refine.background_frames, settings.locate).values()

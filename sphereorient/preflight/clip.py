@@ -76,7 +76,6 @@ class Clip:
 
 
 def _light(pictures: Sequence[Grey], response: Response | None) -> Sequence[Grey]:
-    """Return pictures as a linear camera shows them, where the response is given."""
     if response is None or response.linear:
         return pictures
     full = float(np.iinfo(pictures[0].dtype).max)

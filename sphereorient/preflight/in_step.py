@@ -117,7 +117,6 @@ def _finite(parts: Sequence[Tensor]) -> Tensor:
 
 
 def _trimmed_rms(values: Tensor) -> float:
-    """Return the rms without the largest tenth, possibly wrong outlines."""
     kept = values.abs().sort().values[: math.ceil(0.9 * len(values))]
     return float(kept.square().mean().sqrt())
 

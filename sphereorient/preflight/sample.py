@@ -144,7 +144,6 @@ def sample_movie(
 
 
 def _read(stream: CameraStream, count: int) -> dict[str, Any]:
-    """Return frames and pictures of a sample."""
     frame = np.asarray(frames_to_sample(len(stream), count), np.int64)
     return {"frame": frame, "picture": tuple(pictures_of(stream.movie, stream.rows[frame]))}
 

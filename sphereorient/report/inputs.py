@@ -213,7 +213,6 @@ def _cameras_part(part: Any, result: Preflight) -> None:
 
 
 def _scene_part(part: Any, result: Preflight) -> None:
-    """Draw a picture of each camera with all disks, and the names of the balls found."""
     for ax, view in zip(part.subplots(1, max(1, len(result.scene)), squeeze=False)[0], result.scene, strict=False):
         _show(ax, view.picture)
         for outline in view.disks:

@@ -35,7 +35,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSelection:
-    """The frames and cameras of an overlay; made by the command."""
+    """The frames and cameras of an overlay."""
 
     cameras: Sequence[str] | None = None  # names; None: those of the track
     first: int | None = None  # the experiment's number; None: from the first frame
@@ -62,10 +62,9 @@ def overlay_movie(
     fps: float = 25.0,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
-    All spheres, by name, are drawn into the same frames. Raise ExperimentError for a camera that track or experiment do
-    not have, TrackError if no frame of the track is in the range, OutputError for a suffix that is not a movie's, or a
-    file that cannot be written.
+    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual, all spheres in the same frames;
+    return the number of pictures. Raise the errors of `prepared` and `write_video`, and TrackError if no frame of the
+    track is in the range.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
@@ -87,7 +86,9 @@ def prepared(
     cameras: Sequence[str] | None,
     opened: ExitStack,
 ) -> tuple[Page, dict[str, CameraStream]]:
-    """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them."""
+    """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them.
+    Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another one.
+    """
     known = list(Tracks.of(tracks).values())
     names = list(known[0].cameras) if cameras is None else list(cameras)
     for name in names:

@@ -127,7 +127,6 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
 
 
 def _each(tracks: Table) -> Grid:
-    """Return the tracks side by side, in the order of their names on the command line."""
     shown = {
         "frames": "frames",
         "valid": "valid",

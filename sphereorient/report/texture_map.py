@@ -225,7 +225,6 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
 
 
 def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
-    """Draw the displacements; return their magnification."""
     known = torch.isfinite(comparison.moved_rad).all(-1)
     if not known.any():
         return 1.0

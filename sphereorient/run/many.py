@@ -246,7 +246,6 @@ def run_many(
 def _next(
     todo: deque[int], jobs: dict[int, _Job], requests: Sequence[Request], resume: bool, workers: int
 ) -> tuple[_Job, Task] | None:
-    """Return the next task: of the experiment that was begun first, else of a new one."""
     for job in jobs.values():
         if job.waiting and not job.over:
             return job, job.waiting.popleft()
@@ -259,7 +258,6 @@ def _next(
 
 
 def _begun(request: Request, resume: bool, workers: int) -> _Job:
-    """Prepare the store of an experiment; a refusal becomes the job's error."""
     job = _Job(request=request, run_id=uuid.uuid4().hex, began=time.monotonic(), held=ExitStack())
     store = FolderStore(request.parts)
     try:

@@ -176,7 +176,6 @@ class Filming:
 
     @property
     def _spread(self) -> int:
-        """How far the lens spreads a pixel, px."""
         return blur_reach(self.values.get("defocus", 0.0))
 
     def _lit_ball(self, exposure: Exposure, disk: Disk, name: str) -> Exposure:

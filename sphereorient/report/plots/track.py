@@ -182,7 +182,6 @@ def _angles(axes: Axes, time: Floats, part: TrackPart) -> None:
 
 
 def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_]) -> None:
-    """Draw three components (N, 3) and limit the axis to them."""
     for i in range(3):
         _curve(axes, time, values[:, i], sigma[:, i], broken, i)
     _limit(axes, values, sigma)
