@@ -1,8 +1,5 @@
-"""A ball under an animal, filmed by one camera, of which nothing is known: scenes as spintrack publishes theirs.
-
-Geometry, paint, light, sensor and motion have the numbers of its benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of
-results and families.py); pictures and motions are drawn anew here. What it prints of its own pictures stands
-beside the results.
+"""A ball under an animal, filmed by one camera, of which nothing is known: scenes with the numbers of spintrack's
+benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of results and families.py); pictures and motions are drawn anew.
 """
 
 import math
@@ -229,16 +226,11 @@ def _camera(scene: BallScene) -> PinholeCamera:
     )
 
 
-def _place(scene: BallScene, camera: PinholeCamera) -> Tensor:
-    """Return the ball's centre, (3,), mm, lab."""
-    a, e = math.radians(scene.azimuth_deg), math.radians(scene.elevation_deg)
-    ahead = torch.tensor([math.sin(a) * math.cos(e), -math.sin(e), math.cos(a) * math.cos(e)], dtype=torch.float64)
-    return (ahead * RADIUS_MM / math.sin(math.radians(scene.half_deg))) @ camera.R_cam_lab
-
-
 def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.Generator) -> Tensor:
     """Return the ball's centres in N frames, (N, 3), mm, lab."""
-    X = _place(scene, camera)
+    a, e = math.radians(scene.azimuth_deg), math.radians(scene.elevation_deg)
+    ahead = torch.tensor([math.sin(a) * math.cos(e), -math.sin(e), math.cos(a) * math.cos(e)], dtype=torch.float64)
+    X = (ahead * RADIUS_MM / math.sin(math.radians(scene.half_deg))) @ camera.R_cam_lab
     if not (scene.sway_px or scene.sink_px):
         return X.expand(count, 3)
     aside = rng.normal(size=(3, count + 8 * SWAY_FRAMES))
@@ -350,10 +342,8 @@ class _Film:
             swing = math.sin(2 * math.pi * 12 * k / RATE_HZ + math.pi * (leg % 2) + 2 * math.pi * rank / 3)
             angle = math.radians(-90 + side * (35 + 25 * rank) + 8 * swing)
             reach = r * (0.55 + 0.12 * rank + 0.06 * swing)
-            hip, foot = (
-                np.array([u, v - 0.78 * r]),
-                np.array([u + reach * math.cos(angle), v + reach * math.sin(angle)]),
-            )
+            hip = np.array([u, v - 0.78 * r])
+            foot = np.array([u + reach * math.cos(angle), v + reach * math.sin(angle)])
             knee = (hip + foot) / 2 + np.array([side * 0.18 * r, -0.12 * r])
             line = np.array([hip, knee, foot], np.int32).reshape(-1, 1, 2)
             cv2.polylines(picture, [line], False, GREY_LEG, max(1, round(0.035 * r)), cv2.LINE_AA)

@@ -158,11 +158,8 @@ class _Writer(Thread):
 
 
 def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
-    """Write an experiment's pictures into memory at a rate, and time the lines of `live`. A truth.h5 beside it tells
-    the errors.
-
-    Raises:
-        SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
+    """Write an experiment's pictures into memory at a rate, and time the lines of `live`; errors by a truth.h5 beside
+    it. Raises SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
     """
     with open_recording(timing.experiment, timing.cameras) as recording:
         pictures = [[part for part in one.pictures if part is not None] for one in movie_frames(recording, paced=False)]

@@ -205,7 +205,7 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     """
     R, start, held = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool), True  # FicTrac knows no other
     if path.suffix.lower() == ".dat":
-        frame, orientation, begins = _fictrac_stretches(path)
+        frame, orientation, begins = read_fictrac(path)
         row, there = _nearest(frame.astype(np.float64), track.time * track.frame_rate)
         R[there], start[there] = orientation[row[there]], begins[row[there]]
     elif not _is_track(path):
@@ -233,7 +233,7 @@ def another_result(path: Path, truth_path: Path) -> Trajectory:
     """Return the orientations of a FicTrac .dat, of a ball in its place, as a track at the times of a truth; raise
     TrackError if the truth has too few frames, BenchError for another file.
     """
-    frame, R = read_fictrac(path)
+    frame, R, _ = read_fictrac(path)
     time_s, _ = _truth_at(truth_path, frame)
     still, cov = np.zeros((len(frame), 3)), np.tile(np.eye(3), (len(frame), 1, 1))
     empty = Trajectory.empty(time_s)
@@ -266,16 +266,11 @@ def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
     return row
 
 
-def read_fictrac(path: Path) -> tuple[Frames, Floats]:
-    """Read frames (N,), from 0, and orientations (N, 3, 3), body to camera axes, of a FicTrac 2 .dat file.
-
-    They are relative to its first frame, in axes of its own: align with "both". Raise BenchError for other files.
+def read_fictrac(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
+    """Read frames (N,), from 0, orientations (N, 3, 3), body to camera axes, and whether the sequence counter begins
+    anew (N,), of a FicTrac 2 .dat file. Orientations are relative to its first frame, in axes of its own: align with
+    "both". Raise BenchError for other files.
     """
-    return _fictrac_stretches(path)[:2]
-
-
-def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
-    """Read the same, and the frames (N,) in which its sequence counter begins anew."""
     do = "pass FicTrac's .dat file"
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
@@ -291,10 +286,8 @@ def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
 
 
 def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats:
-    """Return geodesic distances (N,), degrees, of R (N, 3, 3) from the truth; NaN: not measured.
-
-    `align`: "none"; "body" fits B in R B (arbitrary body axes); "both" fits A and B in A R B (any frame of reference).
-    Raise BenchError for another word.
+    """Return geodesic distances (N,), degrees, of R (N, 3, 3) from the truth; NaN: not measured. `align`: "none";
+    "body" fits B in R B (any body axes); "both" fits A and B in A R B (any lab too). BenchError: another word.
     """
     if align not in ALIGNMENTS:
         raise BenchError(refusal("--align", expected="none, body or both", got=repr(align)[:40], do="choose one"))

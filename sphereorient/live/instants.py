@@ -58,11 +58,9 @@ class _Instant:
 
 
 class Instants:
-    """Puts the pictures together that cameras took at one instant.
-
-    The first camera gives the time. Another one comes into step by its first 16 pictures: those of one instant arrive
-    together, but for delays; the shortest ones count. From there on stamps alone decide, and follow the clock's drift.
-    An instant goes on with None for a camera whose picture is missing, late or not whole; `tell` gets the counts.
+    """Groups the pictures of several cameras by instant. The first camera gives the time; another one is synchronised
+    by its first 16 pictures, by the shortest delays, then by its time stamps with the drift of its clock. An instant
+    has None for a camera whose picture is missing, late or incomplete; `tell` gets the counts.
     """
 
     def __init__(self, names: Sequence[str], tell: Tell) -> None:

@@ -48,7 +48,7 @@ class LearningTracker:
         # Tensors that are sent move to other memory: before fits hold their addresses. Later, arrays alone are sent.
         spawn, begin = multiprocessing.get_context("spawn"), (self._coarse.place,)
         self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
-        self._aside.submit(_ready)
+        self._aside.submit(int)  # the process begins with its first task
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
         self._known = _unknown(place, self._pass)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
@@ -115,10 +115,6 @@ def _begin(place: Crops) -> None:
     torch.set_num_threads(1)
     limit_cores(1)
     _PLACE.append(place)
-
-
-def _ready() -> None:
-    """Do nothing: the process begins with the first that it is asked."""
 
 
 def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[Array, ...]:

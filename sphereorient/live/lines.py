@@ -73,16 +73,10 @@ class FicTracLines:
         return rows.ravel()
 
 
-def fictrac_line(columns: Floats) -> str:
-    """Return the columns of a frame as FicTrac writes them to a file."""
-    return ", ".join(f"{value:.14g}" for value in columns.tolist())
-
-
 class Quantities:
-    """What is known of each frame by name, with units; lengths are in mm or radii (`length_unit`). With the angular
-    velocity, and where the ball is not held in its place (`fixed`) its velocity, from this frame and those before it.
-    These begin anew where the ball was searched for, and are not known where the orientation is relative: its errors
-    grow, and are not stated. A `ball` of several is named.
+    """Quantities of each frame by name, with units; lengths are in mm or radii (`length_unit`); a `ball` of several is
+    named. Angular velocity, and velocity unless the ball is `fixed`, are from this frame and those before it; they
+    start again after a search, and are NaN where no errors are stated (relative orientations).
     """
 
     def __init__(self, fixed: bool, length_unit: str = "mm", ball: str = "") -> None:
@@ -153,7 +147,7 @@ class Told:
     @cached_property
     def fictrac(self) -> str:
         """A line of FicTrac's file."""
-        return fictrac_line(self.columns)
+        return ", ".join(f"{value:.14g}" for value in self.columns.tolist())
 
     @property
     def marked(self) -> str:

@@ -1,6 +1,5 @@
-"""Where frames come from: movies, raw bytes of another program, cameras, a ring in memory.
-
-A new source is a function here or in a file of its own, and a line of `SOURCES`.
+"""Sources of frames: movies, raw bytes of another program, cameras, a ring in memory. A new source is a function, and a
+line of `SOURCES`.
 """
 
 import math

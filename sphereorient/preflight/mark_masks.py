@@ -228,10 +228,9 @@ class MaskMarking(Marking):
         return GreySearch(self._texture)
 
     def save(self, name: str, shapes: Sequence[Mapping[str, Any]], *, keep: bool) -> Json:
-        """Write the mask of a camera and name it in experiment.yaml; return what was done.
-        Shapes hide (`hide`) or are all that is shown (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px.
-        `keep`: what the old mask hides stays hidden. Raises ExperimentError (impossible shapes, or nothing would be
-        shown), OutputError (a file cannot be written).
+        """Write the mask of a camera and name it in experiment.yaml. Shapes hide (`hide`) or are all that is shown
+        (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px; `keep`: the old mask counts too. Raises
+        ExperimentError (impossible shapes, or nothing is shown), OutputError (a file cannot be written).
         """
         shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
         file = self.path.parent / f"{name}_mask.png"

@@ -103,8 +103,8 @@ def sample_movie(
     stays: bool = False,
 ) -> MovieSample:
     """Sample one camera's frames, background and ball; measure its diameter if None. `empty`: a picture without it;
-    `scene`: background and size as a tracker finds them, None where it finds none; `stays`: the ball is in its place.
-    Raises MovieError: no sampled frame can be decoded.
+    `scene`: background and size by the tracker; `stays`: the ball is in its place. Raises MovieError: no frame can be
+    decoded.
     """
     read = _read(stream, SPREAD)
     known = [one for one in read["picture"] if one is not None]

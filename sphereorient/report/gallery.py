@@ -86,9 +86,8 @@ def gallery(
 
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
-    """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
-    The worst frame is first, then the middles of the longest stretches. Two thirds are bad frames; good ones, spread
-    evenly, serve to compare.
+    """Choose at most `count` frames to show; return the reasons by row, in the order of the choice: the worst frame,
+    the middles of the longest stretches, other bad frames, two thirds in all; then good ones, spread evenly.
     """
     status = quality.status_of(track)
     good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status >= quality.DOUBTFUL)

@@ -84,12 +84,10 @@ class Reference:
 
 
 def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -> Behaviour:
-    """Compare the orientations of a track, measured and smoothed, with those of a reference.
-
-    A constant rotation of the body axes is taken off always, one of the lab axes with `align`: the axes are then those
-    of a reference that is `exact`, else those of the track. Against an exact reference a gain is the regression through
-    zero of our turns on its; else the geometric mean of the two regressions.
-    There is a walk where the ball stays in its place by either.
+    """Compare the orientations of a track, measured and smoothed, with those of a reference. A constant rotation of the
+    body axes is removed, with `align` one of the lab axes too: the axes are those of an `exact` reference, else of the
+    track. A gain is the regression through zero of our turns on those of an exact reference, else the geometric mean of
+    the two regressions. A walk needs a fixed ball.
     Raises ShapeError: not the same number of frames. Source: docs/accuracy.md, Behaviour.
     """
     frames, time_s = len(track), track.time

@@ -77,18 +77,12 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     }
 
 
-def write_degraded(
-    folder: Path,
-    base: SynthSettings,
-    applied: Mapping[str, int],
-    progress: Callable[[int], None] = lambda done: None,
-    clean: Clean | None = None,
-) -> Path:
+def write_degraded(folder: Path, base: SynthSettings, applied: Mapping[str, int], clean: Clean | None = None) -> Path:
     """Render as `write_synthetic_experiment` does; `applied` maps degradations to levels 1 .. 5.
     Raises SettingsError: unknown name or level, or impossible scene; OutputError: folder not writable.
     """
     values = {name: severity(name, k) for name, k in applied.items()}
-    return write_synthetic_experiment(folder, base, progress, values, clean)
+    return write_synthetic_experiment(folder, base, values=values, clean=clean)
 
 
 def write_synthetic_experiment(
@@ -98,11 +92,10 @@ def write_synthetic_experiment(
     values: Mapping[str, float] = MappingProxyType({}),
     clean: Clean | None = None,
 ) -> Path:
-    """Render an experiment with exact truth in `folder` and return the path of experiment.yaml.
-    The folder also receives movies, backgrounds, texture.png (of several balls texture_0.png, ... of each paint),
-    cameras.yaml and truth.h5; old files are replaced. `progress` receives the number of frames rendered since the last
-    call. `values` maps degradations to physical values: reported cameras, texture map and diameter may be wrong;
-    truth.h5 describes the filmed cameras and sphere. `clean` is called in place of `clean_movie`.
+    """Render an experiment with exact truth in `folder` and return the path of experiment.yaml. Files: movies,
+    backgrounds, texture.png (of several balls texture_0.png, ... of each paint), cameras.yaml and truth.h5; old ones
+    are replaced. `progress` gets the number of frames rendered since the last call. `values`: degradations by name,
+    physical values; reported cameras, map and diameter may be wrong, truth.h5 never is. `clean` replaces `clean_movie`.
     Raises SettingsError: unknown degradation, one of a single ball for several, or impossible value or scene;
     OutputError: folder not writable.
     """

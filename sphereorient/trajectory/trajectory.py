@@ -244,9 +244,8 @@ class Trajectory:
         return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...).
-        It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
-        Raises OutputError: pandas is not installed.
+        """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...),
+        with quaternions (w >= 0), without covariances and cameras. Raises OutputError: pandas is not installed.
         """
         pandas = package("pandas", "table")
         table: dict[str, NDArray[Any]] = {"time_s": self.time}
@@ -366,9 +365,8 @@ class Tracks(Mapping[str, Trajectory]):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by `save`. Where `live` did not come to its end, or goes on, read the rows that it has
-        written so far.
-        Raises TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.
+        """Read a file written by `save`, or the rows so far of a `live` that goes on or was killed. Raises TrackError:
+        no HDF5 file, another schema, or a dataset missing or of wrong shape.
         """
         with opened_track(path) as file:
             if not isinstance(file, h5py.File):

@@ -50,9 +50,6 @@ def only(name: str, value: float, picture: Tensor, seed: int = 4) -> Tensor:
     return degrade(picture, disk(dtype=picture.dtype), {name: value}, seeded(seed))
 
 
-# The table.
-
-
 def test_every_degradation_gets_harder_from_nothing_on():
     for row in DEGRADATIONS.values():
         steps = row.values if row.nothing is None else (row.nothing, *row.values)
@@ -114,9 +111,6 @@ def test_the_page_is_what_the_table_says():
     for row in DEGRADATIONS.values():
         assert f"| `{row.name}` | {row.unit} |" in text
     assert (REPO / "docs" / "degradations.png").is_file()
-
-
-# What holds for all operations.
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -205,9 +199,6 @@ def test_several_at_once_come_in_the_order_of_the_light():
     for name, value in (("occlusion", 0.3), ("contrast_loss", 0.5), ("read_noise", 6.0)):
         expected = OPERATIONS[name](expected, value, disk(), rng)
     assert torch.equal(got, expected)
-
-
-# The sizes.
 
 
 def test_noise_has_its_standard_deviation_at_each_grey_level():

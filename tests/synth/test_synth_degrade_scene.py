@@ -127,9 +127,6 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
     assert not (tmp_path / "new").exists()
 
 
-# Pictures of a movie.
-
-
 @pytest.mark.slow
 def test_noise_comes_on_top_of_the_cameras_own(tmp_path):
     few = SETTINGS.model_copy(update={"frames": 4, "background": 80.0, "read_noise": 3.0, "shot_noise": 0.0})
@@ -221,9 +218,6 @@ def test_the_ball_in_a_picture_is_where_and_as_large_as_it_is_seen(plain):
     assert disk.radius_px.tolist() == pytest.approx([20 * 520 / 460, 20.0], rel=1e-3)
 
 
-# The scene.
-
-
 @pytest.mark.slow
 def test_the_ball_has_its_size_and_the_scene_stays_the_same(tmp_path):
     for diameter in (20.0, 32.0):
@@ -288,9 +282,6 @@ def test_blur_at_high_spin_needs_no_more_spin():
     assert settings.exposure * settings.frame_rate == pytest.approx(16 / 60)
 
 
-# The paint.
-
-
 @pytest.mark.parametrize(("share", "height"), [(0.05, 128), (0.35, 96), (0.2, 64)])
 def test_worn_and_misdrawn_maps_differ_in_their_share_of_the_area(share, height):
     texture = torch.rand(height, 2 * height, generator=torch.Generator().manual_seed(1)) * 0.4
@@ -335,9 +326,6 @@ def test_worn_paint_is_on_the_filmed_ball_only():
     area = map_directions(512)[..., :2].norm(dim=-1)
     bare = worn(plain.textures[0], 0.25, torch.Generator().manual_seed(6)) == 0.5
     assert float((area * bare).sum() / area.sum()) == pytest.approx(0.25, abs=5e-3)
-
-
-# What the method is told.
 
 
 @pytest.mark.slow

@@ -59,10 +59,9 @@ class TrackPart:
 
 @look.in_style
 def track_figure(track: Trajectory) -> Figure:
-    """Draw position, Tait-Bryan angles, velocities and accelerations against time: smooth with 2 sigma, and measured.
-    Of a ball in its place, the rotation alone. Frames that are not valid are shaded. Of a long track, the part of
-    `shown_part` is drawn, with a note.
-    Source: the paper, figure of a sample track; the angles by docs/errata.md E1.
+    """Draw position, Tait-Bryan angles, velocities and accelerations against time: measured, and smooth with 2 sigma;
+    of a fixed ball the rotation alone; of a long track `shown_part`. Frames that are not valid are shaded. Source: the
+    paper, figure of a sample track; the angles by docs/errata.md E1.
     """
     part = shown_part(track)
     track = part.track
