@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 from typer import Option
 from typer.core import TyperGroup
 
@@ -265,8 +266,6 @@ def doctor(as_json: Annotated[bool, Option("--json", help="Print all of it as on
 
 
 def _print_findings(found: dict[str, Any]) -> None:
-    from rich.table import Table
-
     fits = found.pop("live_one_camera", [])
     for name, value in found.items():
         told = [f"{key}: {_words(one)}" for key, one in value.items()] if isinstance(value, dict) else [_words(value)]

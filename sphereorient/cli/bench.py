@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
@@ -30,8 +31,6 @@ from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import write_text, writing
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from sphereorient.bench import BenchSettings, Results, Score
     from sphereorient.bench.score import Floats
     from sphereorient.statistics import Interval
@@ -147,10 +146,8 @@ def print_errors(errors_deg: "Floats", ball: str, word: str = "error") -> None:
         typer.echo(f"{word}, degrees: {percentiles}; above {WRONG_DEG:g}: {100 * wrong:.3g} %")
 
 
-def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> "Table":
+def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table:
     """Return gain, drift, heading and path against a reference as a table."""
-    from rich.table import Table
-
     of, against = f" of ball {ball}" if ball else "", "the exact truth" if exact else "another tracker"
     title = f"Behaviour{of} against {against}, {found.pairs} turns from frame to frame"
     table = Table("quantity", "x", "y", "z", "along the rotation", title=title)
@@ -176,10 +173,8 @@ def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> "Tabl
     return table
 
 
-def error_table(found: "Score", ball: str | None = None) -> "Table":
+def error_table(found: "Score", ball: str | None = None) -> Table:
     """Return errors of orientation and position, and relative errors of the rates, as a table."""
-    from rich.table import Table
-
     of = f" of ball {ball}" if ball else ""
     title = f"Errors{of} against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
     table = Table("quantity", "median", "95 %", "largest", title=title)
@@ -351,8 +346,6 @@ def ball_scenes(given: _BallOptions) -> None:
 
 
 def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
-    from rich.table import Table
-
     from sphereorient.bench.ball import SCENES
 
     title = (
@@ -412,8 +405,6 @@ class _LiveDelayOptions:
 @bench.command("live")
 def live_delay(given: _LiveDelayOptions) -> None:
     """Time `live`, from a picture in memory to a line on a socket; and its errors, by a truth.h5 beside the movie."""
-    from rich.table import Table
-
     from sphereorient.bench.live import COLUMNS, LiveTiming, delays, neighbours
 
     rates = [_rate_hz(part) for part in names_in(given.rate) or [given.rate]]
@@ -481,8 +472,6 @@ def write_scenes(given: _SceneOptions) -> None:
 
 
 def _print(found: "Results") -> None:
-    from rich.table import Table
-
     from sphereorient.bench.results import summaries
 
     table = Table(
@@ -504,8 +493,6 @@ def _print(found: "Results") -> None:
 
 
 def _print_balls(runs: "Sequence[Results]") -> None:
-    from rich.table import Table
-
     from sphereorient.bench.results import summaries
 
     table = Table(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, print_table, progress_bar
@@ -213,8 +214,6 @@ def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, 
 
 
 def _print_judgement(judgement: "Judgement", title: str) -> None:
-    from rich.table import Table
-
     told = judgement.as_dict()
     table = Table(title, "least", "middle", "most", title="judgement", title_justify="left")
     white, bound = told["white_share"], told["bound_deg"]

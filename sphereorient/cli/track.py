@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Column, Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
@@ -145,8 +146,6 @@ def _track_side_by_side(
 
 
 def _print_table(outcomes: "Sequence[Outcome]") -> None:
-    from rich.table import Column, Table
-
     table = Table("track", *(Column(heading, justify="right") for heading in ("frames", "valid", "s", "frames/s")), "")
     for outcome in outcomes:
         rate = f"{outcome.frames / outcome.seconds:.1f}" if outcome.frames else ""

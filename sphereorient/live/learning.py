@@ -50,7 +50,9 @@ class LearningTracker:
         self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
         self._aside.submit(int)  # the process begins with its first task
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
-        self._known = _unknown(place, self._pass)
+        fitter = first_fitter(place.views, place.radius_mm, self._pass.cells.table, FIRST_BLUR_PX)
+        lasting = Lasting.none(len(place.views))
+        self._known = Appearance(fitter=fitter, still=fitter, lasting=lasting, score_min=0.0, right_score=1.0)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
         self._error = OUTLINE_ERROR  # of the place, radii in pictures
         self._away_rad = 0.0  # farthest turn from the first frame
@@ -124,9 +126,3 @@ def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[A
     cells = FirstPass(found.crops).shown(found.crops, found.R_lab_body).cells
     parts = found.R_lab_body, found.crops.position_lab_mm[:1], cells.mean, cells.weight
     return tuple(part.numpy() for part in parts)
-
-
-def _unknown(place: Crops, follower: FirstPass) -> Appearance:
-    fitter = first_fitter(place.views, place.radius_mm, follower.cells.table, FIRST_BLUR_PX)
-    lasting = Lasting.none(len(place.views))
-    return Appearance(fitter=fitter, still=fitter, lasting=lasting, score_min=0.0, right_score=1.0)

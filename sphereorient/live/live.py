@@ -143,10 +143,13 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
     number: int | None = None  # of the frame before
     for arrival in frames:
         dropped = 0 if number is None else arrival.number - number - 1
-        shots = [
-            _shot(picture, None if before is None else before[c], view)
-            for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
-        ]
+        shots = []
+        for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True)):
+            if picture is None:
+                nothing = np.zeros(view.camera.image_size[::-1], np.uint8)
+                shots.append(Frame(shown=nothing, read=Reason.UNDECODABLE))
+            else:
+                shots.append(screened(picture, None if before is None else before[c].shown, view.background))
         for ball, (poses, searched) in tracker.next(arrival.time_s, shots).items():
             there, appearance = supported(poses), tracker.appearances[ball]
             yield Measured(
@@ -167,13 +170,6 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
             )
         tracker.between()
         before, number = shots, arrival.number
-
-
-def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: CameraView) -> Frame:
-    if picture is None:
-        height, width = view.camera.image_size[::-1]
-        return Frame(shown=np.zeros((height, width), np.uint8), read=Reason.UNDECODABLE)
-    return screened(picture, None if before is None else before.shown, view.background)
 
 
 def _flags(poses: Poses, learnt: Appearance) -> int:
