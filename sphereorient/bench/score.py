@@ -15,6 +15,7 @@ from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.files.hdf5 import UNNAMED, ball_groups
 from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
 from sphereorient.trajectory import Tracks, Trajectory
+from sphereorient.trajectory.datasets import nearest_rows
 from sphereorient.trajectory.rotations import distance_deg, rotation_vectors, rotations
 from sphereorient.trajectory.walk import FICTRAC
 
@@ -206,7 +207,7 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     R, start, held = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool), True  # FicTrac knows no other
     if path.suffix.lower() == ".dat":
         frame, orientation, begins = read_fictrac(path)
-        row, there = _nearest(frame.astype(np.float64), track.time * track.frame_rate)
+        row, there = nearest_rows(frame.astype(np.float64), track.time * track.frame_rate)
         R[there], start[there] = orientation[row[there]], begins[row[there]]
     elif not _is_track(path):
         truth = _read_truth(path, "position", sphere=track.sphere)
@@ -215,7 +216,7 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     else:
         tracks = Tracks.load(path)
         other = next(iter((tracks if len(tracks) == 1 else tracks.picked(track.sphere)).values()))
-        row, there = _nearest(other.time, track.time)
+        row, there = nearest_rows(other.time, track.time)
         R[there], held = other.orientation[row[there]], other.held
     if not np.isfinite(R).any():
         do = "pass a result on the same movie, and frame_rate in experiment.yaml for FicTrac's"
@@ -248,18 +249,9 @@ def _is_track(path: Path) -> bool:
         return False
 
 
-def _nearest(known: Floats, wanted: Floats) -> tuple[Frames, NDArray[np.bool_]]:
-    """Return the rows of increasing known times nearest to the wanted ones, and where they are within half a step."""
-    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
-    before = np.maximum(after - 1, 0)
-    row = np.where(np.abs(known[before] - wanted) < np.abs(known[after] - wanted), before, after)
-    step = float(np.median(np.diff(known))) if len(known) > 1 else np.inf
-    return row, np.abs(known[row] - wanted) <= step / 2
-
-
 def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
     """Return the rows of the truth at the nearest times; refuse times further than half a frame."""
-    row, there = _nearest(known_s, time_s)
+    row, there = nearest_rows(known_s, time_s)
     if not there.all():
         got = f"{time_s[0]:.6g} .. {time_s[-1]:.6g} s"
         raise TrackError(refusal(f"truth {path}", expected="times of the track", got=got, do=DO))

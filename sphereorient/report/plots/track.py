@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from sphereorient.experiment.recording import spread_frames
 from sphereorient.report.plots import style as look
 from sphereorient.trajectory import Trajectory, runs_of
 from sphereorient.trajectory.datasets import in_length
@@ -209,7 +210,7 @@ def _dots(axes: Axes, time: Floats, values: Floats) -> None:
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
-    chosen = known[look.spread(len(known), 14)]
+    chosen = known[spread_frames(range(len(known)), 14)]
     start = track.position_smooth[chosen]
     for i, style in enumerate(look.COMPONENTS):
         tip = start + size * track.orientation_smooth[chosen, :, i]
