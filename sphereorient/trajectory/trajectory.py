@@ -451,11 +451,15 @@ def read_track(group: h5py.Group) -> Trajectory:
     for attribute in (*TEXTS, "frame_rate", "provenance"):
         if attribute not in group.attrs:
             raise TrackError(refusal(f"{name}: attribute {attribute}", expected="a value", got="none", do=AGAIN))
-    cameras = datasets.inside(group, "cameras")
+    cameras = {}
+    for camera in (every := datasets.inside(group, "cameras")) or ():
+        own = datasets.named_group(every, camera)
+        reason = reasons_of(datasets.read_dataset(own, "reason", "S"))
+        cameras[camera] = CameraTrack(reason=reason, **datasets.read_datasets(own, CameraTrack))
     parts: dict[str, Any] = datasets.read_datasets(group, Trajectory)
     parts |= {name: str(group.attrs[name]) for name in TEXTS}
     return Trajectory(
-        cameras={name: read_camera(cameras, name) for name in cameras or ()},
+        cameras=cameras,
         frame_rate=float(group.attrs["frame_rate"]),
         provenance=json.loads(group.attrs["provenance"]),
         length_unit=str(group.attrs.get("length_unit", "mm")),
@@ -485,10 +489,3 @@ def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
     # fixed length: HDF5 stores variable strings outside the dataset
     width = max([16, *map(len, camera.reason)])
     datasets.write_dataset(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), REASON)
-
-
-def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
-    """Read one camera from the group of all."""
-    group = datasets.named_group(cameras, name)
-    reason = reasons_of(datasets.read_dataset(group, "reason", "S"))
-    return CameraTrack(reason=reason, **datasets.read_datasets(group, CameraTrack))
