@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -255,7 +256,7 @@ def robustness(given: _RobustnessOptions) -> None:
     trackers = trackers_of(names_in(given.methods))
     older = None if given.baseline is None else load_results(given.baseline)
     with progress_bar(given.quiet, unit="") as advance:
-        found = run_benchmark(given.out, chosen, trackers, jobs=given.jobs, progress=lambda *at: advance("scenes", *at))
+        found = run_benchmark(given.out, chosen, trackers, jobs=given.jobs, progress=partial(advance, "scenes"))
     with writing(force=True):  # its plan says that the folder is of this run
         write_table([found], given.out / "results.csv")
         write_figure(robustness_figure(found), given.out / "robustness")
@@ -298,9 +299,8 @@ def balls_curve(given: _BallsOptions) -> None:
         for b in _numbers_in("--balls", given.balls)
     }
     with progress_bar(given.quiet, unit="") as advance:
-        runs = run_benchmarks(
-            given.out, plans, trackers_of(["precise"]), jobs=given.jobs, progress=lambda *at: advance("scenes", *at)
-        )
+        trackers = trackers_of(["precise"])
+        runs = run_benchmarks(given.out, plans, trackers, jobs=given.jobs, progress=partial(advance, "scenes"))
     with writing(force=True):  # its plans say that the folder is of this run
         write_table(runs, given.out / "results.csv")
         write_figure(density_figure(runs), given.out / "density")
@@ -348,20 +348,10 @@ def ball_scenes(given: _BallOptions) -> None:
 def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
     from sphereorient.bench.ball import SCENES
 
-    title = (
-        "Nothing known before; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack prints them, of its pictures"
-    )
-    columns = (
-        "scene",
-        "found",
-        "first pass: step",
-        "orientation",
-        "refined: step",
-        "orientation",
-        "gain, axes",
-        "drift/min",
-    )
-    table = Table(*columns, "step / sigma", "CPU ms", "FicTrac", "spintrack", title=title)
+    title = "Nothing known before; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack prints its own"
+    columns = ("scene", "found", "first pass: step", "orientation", "refined: step", "orientation")
+    more = ("gain, axes", "drift/min", "step / sigma", "CPU ms", "FicTrac", "spintrack")
+    table = Table(*columns, *more, title=title)
     table.columns[0].no_wrap = True
     for row in rows:
         first, refined = row["first"], row.get("refined")
@@ -522,8 +512,7 @@ def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:
         for one in some:
             typer.echo(f"{word}: {one.kind} {one.level}, {one.method}: {one.what} {one.before:.4g} -> {one.now:.4g}")
     if not quiet:
-        typer.echo(
-            f"{len(changes)} numbers compared: {len(worse)} worse, {len(better)} better, by more than their scatter"
-        )
+        counts = f"{len(worse)} worse, {len(better)} better, by more than their scatter"
+        typer.echo(f"{len(changes)} numbers compared: {counts}")
     if worse:
         raise typer.Exit(1)
