@@ -188,9 +188,7 @@ def _wandering(rng: np.random.Generator, count: int, sigma: float, frames: float
 
 
 def walked(count: int, rng: np.random.Generator, forward_share: float = 1.0) -> NDArray[np.float64]:
-    """Return the turns (N, 3), rad, of a ball under a fly that walks and stops, lab: forward, right, down. The first is
-    zero. Speeds, turns and saccades as spintrack publishes them.
-    """
+    """Return the turns (N, 3), rad, lab, of a ball under a fly that walks and stops, as spintrack publishes them."""
     walks, k, on = np.zeros(count, bool), 0, True
     speed = np.zeros(count)
     while k < count:

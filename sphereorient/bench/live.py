@@ -223,8 +223,8 @@ def _stall(tracker: psutil.Process, ends_s: list[float]) -> None:
 
 
 def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Callable[[int], None]) -> Floats:
-    """Return of each line, until none comes: number, time (s), rotation since the stretch began (3), rad, in the
-    camera's axes, and place in the stretch; (n, 6).
+    """Return (n, 6) of the lines: number, time (s), rotation since the stretch began (3), rad, camera axes; place in
+    it.
     """
     found: list[tuple[float, ...]] = []
     begin = time.monotonic()

@@ -121,8 +121,8 @@ def named_as_true(tracks: Tracks, truth_path: str | Path, alike: Sequence[str]) 
 
 
 def given_to_others(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[int, int]]:
-    """Return for each sphere in how many valid frames its position is nearer to the true one of another than to its
-    own, and how often the nearest one changes.
+    """Return for each sphere in how many valid frames it is nearest to the truth of another, and how often that
+    changes.
     """
     found = {}
     for k, (name, away_mm) in enumerate(_distances(tracks, truth_path).items()):
@@ -293,9 +293,7 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
 
 
 def _alignment(measured: Floats, true: Floats, align: str) -> tuple[Floats, Floats]:
-    """Return A and B with the least squared chords, fitted in turn; starting from the first frame's B avoids wrong
-    optima.
-    """
+    """Return A and B with the least squared chords, fitted in turn from the first frame's B."""
     left = right = np.eye(3)
     if align == "none":
         return left, right

@@ -344,9 +344,7 @@ def worded(name: str) -> Iterator[None]:
 
 
 def device_frames(cameras: Sequence[Camera], tell: Tell, stopped: Event) -> Iterator[Arrival]:
-    """Yield the instants of cameras until `stopped`, or until the only one ends; see `Instants`.
-    Raise MovieError as `Camera.shots` does, and for one of several whose device has no clock.
-    """
+    """Yield the instants of cameras until `stopped`, or the only one ends; errors: `Camera.shots`, `Instants`."""
     instants, waiting = Instants([one.stream.name for one in cameras], tell), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
     shots: Iterator[Came] = ((0, shot) for shot in cameras[0].shots(stopped))

@@ -72,9 +72,7 @@ class LearningTracker:
         return {"": (poses, searched)}
 
     def _turned(self, poses: Poses) -> Tensor:
-        """Return the covariance (6, 6) of an orientation since the first frame, at a place that is not quite right:
-        all turns are too long or too short by the same share.
-        """
+        """Return the covariance (6, 6) of an orientation since the first frame: a wrong place scales all turns."""
         self._away_rad = max(self._away_rad, float(so3.log(poses.R_lab_body[0]).norm()))
         variance = (self._error * self._away_rad) ** 2 + self._drift_rad**2
         return torch.diag(torch.tensor([variance] * 3 + [0.0] * 3, dtype=torch.float64))

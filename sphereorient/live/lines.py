@@ -23,8 +23,8 @@ AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
 class FicTracLines:
-    """The 25 columns of FicTrac's table frame by frame, as `export --to fictrac` writes them of a whole track: its lab
-    is the animal's frame. A frame without a pose is NaN; after it the sequence counter begins anew.
+    """FicTrac's 25 columns frame by frame, as `export --to fictrac`; NaN without a pose, after which a new stretch
+    begins.
     """
 
     def __init__(self, axes: FicTracAxes) -> None:
@@ -35,9 +35,7 @@ class FicTracLines:
         self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
 
     def columns(self, number: int, time_s: float, R_lab_body: Floats, error_rad: float) -> Floats:
-        """Return the columns (25,) of the next frame: its number, time, orientation (3, 3), NaN without a pose, and
-        stated error.
-        """
+        """Return the columns (25,) of the next frame, R_lab_body (3, 3), NaN without a pose, and its stated error."""
         R_lab_body = self._axes.R_own_lab @ R_lab_body  # from here on the table's lab
         before, self._before = self._before, (time_s, R_lab_body)
         valid = math.isfinite(R_lab_body[0, 0])

@@ -131,8 +131,8 @@ class UdpOutput(Output):
 
 
 class OscOutput(UdpOutput):
-    """OSC over UDP: a message /sphereorient a frame, of all numbers (`Told.numbers`) as int32 or float32, in order.
-    Raise OutputError: the package python-osc is missing, or no such host.
+    """OSC over UDP: a message /sphereorient a frame, all `Told.numbers` as int32 or float32. OutputError: no python-
+    osc, no host.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -187,8 +187,8 @@ class LslOutput(Output):
 
 
 class SharedOutput(Output):
-    """A ring of poses in a file that other programs map into memory (`shared`): all numbers (`lines.Quantities`). A
-    reader that is slow sees by their count that it lost some. Raise OutputError: there is such a file, or no folder.
+    """A ring of poses in memory (`shared`): all numbers of `lines.Quantities`. OutputError: there is such a file, or no
+    folder.
     """
 
     def __init__(self, address: str, tell: Tell) -> None:
@@ -241,9 +241,7 @@ class SerialOutput(Output):
 
 
 class ZmqOutput(Output):
-    """A PUB socket of ZeroMQ: each program that subscribes gets all further lines, less those that it is too slow for.
-    Raise OutputError: the package pyzmq is missing, or the port is in use.
-    """
+    """A PUB socket of ZeroMQ; a slow subscriber loses lines. OutputError: pyzmq is missing, or the port is in use."""
 
     def __init__(self, host: str, port: int) -> None:
         name = f"zmq:{host}:{port}"

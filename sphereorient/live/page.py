@@ -79,9 +79,7 @@ class _Absence:
 
 
 class Monitor:
-    """Hands on the frames of a feed, waiting while it is stopped, and counts what was measured. A frame counts as lost
-    where one of several balls is.
-    """
+    """Yields the frames of a feed unless stopped, and counts them; a frame is lost where one of several balls is."""
 
     def __init__(self, feed: Feed, tell: Tell = lambda line: None) -> None:
         self.count = self.lost = 0
@@ -158,9 +156,7 @@ class PageWriter:
         self._rings: tuple[SharedFrames, SharedFrames] | None = None
 
     def begin(self, recording: Recording, running: Event, save_map: Callable[[], str] | None) -> None:
-        """Begin with the frames of a recording: the page sets and clears `running`; `save_map` writes a map that is
-        learnt meanwhile and says so; None: no button.
-        """
+        """Begin with a recording: the page sets `running`; `save_map` writes a learnt map; None: no button."""
         poses = SharedFrames(self.folder / "poses", WORD * ROW, POSES)
         self._rings = poses, SharedFrames(self.folder / "pictures", _shown_bytes(recording), 4)
         self._blank = [np.zeros(stream.movie.frame_shape, stream.movie.dtype) for stream in recording.streams]

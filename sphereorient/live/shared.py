@@ -35,9 +35,7 @@ POSES, POSE_BYTES = 4096, WORD * 33  # of a ring of poses: slots, and bytes of e
 
 
 class SharedFrames:
-    """Writes into a ring of `slots` of `size` bytes, and never waits; the file is removed at the end.
-    Raise OutputError: there is such a file, or no room for it.
-    """
+    """Writes into a ring of `slots` of `size` bytes, never waits. OutputError: the file exists, or no room for it."""
 
     def __init__(self, path: Path, size: int, slots: int = 16) -> None:
         length = WORD * (HEAD + slots) + slots * size

@@ -123,9 +123,7 @@ def source_of(name: str, tell: Tell) -> Source:
 
 
 def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
-    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none. Pictures lie
-    there as in the experiment's movies: `flip` mirrors them on reading.
-    """
+    """Return a source whose frames are recorded as they come, in all movies or in none, flipped as the movies are."""
 
     def frames(recording: Recording) -> Iterator[Arrival]:
         how = [recording.experiment.flip.get(stream.name, "none") for stream in recording.streams]

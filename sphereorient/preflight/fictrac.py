@@ -57,8 +57,8 @@ class FicTracConfig:
     unread: tuple[str, ...]  # keys of the file that change nothing here
 
     def R_animal_cam(self, image_size: tuple[int, int]) -> Tensor:
-        """Return the rotation (3, 3) to the animal's axes: x ahead, y right, z down; ExperimentError: the corners do
-        not show it.
+        """Return the rotation (3, 3) to the animal's axes: x ahead, y right, z down; ExperimentError: corners do not
+        show it.
         """
         if self.plane is None:
             return so3.exp(torch.from_numpy(self.turn))
@@ -81,8 +81,8 @@ class FicTracConfig:
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
-    """Read config.txt; ExperimentError for another file, one that lacks movie, field of view or the animal's frame, or
-    one of a colour that is not taken over.
+    """Read config.txt; ExperimentError: another file, no movie, field of view or animal's frame, or a colour not
+    supported.
     """
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
     pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith(("#", "%")))

@@ -135,9 +135,7 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
 
 
 def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
-    """Judge whether the movies are synchronised, from scans of each other one against the first; `start` is that of
-    the experiment.
-    """
+    """Judge whether the movies are synchronised, from scans against the first one; `start`: of the experiment."""
     title, moved_px = "movies in step", max(scan.moved_px for scan in scans)
     if moved_px <= MOVES_PX:
         return judged(title, f"unknown: the ball moves {moved_px:.2f} px a frame across the lines of sight")

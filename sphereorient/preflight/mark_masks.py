@@ -98,9 +98,7 @@ class MaskMarking(Marking):
         }
 
     def track(self, name: str, asked: Mapping[str, Any]) -> Json:
-        """Track the clip with the `shapes` of a mask, `keep`, and what else is given: `circle`, u, v, radius, px;
-        `light`, a value of the key response; `vfov_deg`. Raise SphereOrientError where one is impossible.
-        """
+        """Track the clip with `shapes` and `keep` of a mask, and `circle`, `light`, `vfov_deg` if given."""
         with self.lock, tempfile.TemporaryDirectory() as folder:
             return self.clip.tracked(self._changed(name, asked, Path(folder)))
 

@@ -110,8 +110,8 @@ def match_experiments(
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
-    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other. Of spheres of
-    one recording that differ in size, no diameter is known.
+    """Return the properties of sphere and flow; ExperimentError: contradictions. Spheres of one recording that differ
+    in size have no diameter here.
     """
     known: dict[str, float] = {}
     sizes = {(one.path, one.diameter_mm) for one in experiments}

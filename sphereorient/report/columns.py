@@ -96,8 +96,8 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
 
 
 def columns(track: Trajectory) -> Iterator[Dataset]:
-    """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
-    Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
+    """Yield the columns of a track, then of each camera: components (position_x_mm), pairs (position_cov_xy_mm2),
+    quaternions.
     """
     for dataset in frame_wise(track):
         yield from _split(dataset, "")

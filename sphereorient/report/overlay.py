@@ -111,9 +111,7 @@ def prepared(
 def streams_of(
     track: Trajectory, experiment: Experiment, names: Sequence[str], opened: ExitStack
 ) -> tuple[Rows, dict[str, CameraStream]]:
-    """Find a track's frames by time: their numbers (N,), and the streams by camera; `opened` closes them.
-    Raise TrackError if no frame is found.
-    """
+    """Find a track's frames by time: their numbers (N,), and the streams by camera; TrackError if there are none."""
     movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
     known = timeline(experiment, movies)
     at, near = nearest_rows(known.time_s, track.time)

@@ -177,9 +177,7 @@ def _draw_example(rows: Sequence[Axes], example: MapExample, first: bool) -> Non
 
 
 def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
-    """Draw a texture map (H, 2 H), longitude to the right, latitude upwards, degrees, NaN as sand; grey from 0 to 1
-    unless `style` (of `imshow`) differs.
-    """
+    """Draw a texture map (H, 2 H) over degrees, NaN as sand; grey from 0 to 1 unless `style` (of `imshow`) differs."""
     shown = {"cmap": "gray", "extent": EXTENT} | ({} if "norm" in style else {"vmin": 0, "vmax": 1}) | style
     drawn = axes.imshow(np.ma.masked_invalid(values.numpy()), **shown)
     axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:], xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])

@@ -76,8 +76,8 @@ def end_with_parent() -> None:
 
 
 class DaskExecutor:
-    """The workers of a Dask cluster (`distributed.Client`); they must see the same files under the same names.
-    `cluster`: closed together with the connection; None: it continues for others.
+    """The workers of a Dask cluster (`distributed.Client`) with the same files; `cluster`: closed too, None: it goes
+    on.
     """
 
     def __init__(self, client: Any, cluster: Any = None) -> None:
@@ -110,8 +110,8 @@ Executor = ProcessExecutor | DaskExecutor
 
 
 def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
-    """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
-    Raises SettingsError: Dask is not installed, or the scheduler does not answer.
+    """Connect to Dask: tcp://host:8786, its scheduler file (.json), or `local`. SettingsError: not installed, no
+    answer.
     """
     distributed = package("distributed", "cluster", SettingsError)
     local = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}

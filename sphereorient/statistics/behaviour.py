@@ -1,6 +1,4 @@
-"""What an experiment with an animal on a ball asks of a tracker: rotation gain, drift, heading and path, against truth
-or another tracker.
-"""
+"""Behaviour of an animal on a ball: gain, drift, heading and path of a track against truth or another tracker."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -248,8 +246,8 @@ def _slope(time_s: Floats, error: Floats) -> tuple[Floats, Floats]:
 
 
 def _walk(time_s: Floats, R: Floats, R_reference: Floats, use: Mask) -> tuple[float, float, float]:
-    """Return the difference of the headings at the end, rad, the ratio of the paths' lengths, and the distance of their
-    ends over the length; of several stretches the sums, since what happened between them is not known.
+    """Return the headings' difference, rad, the paths' length ratio and end distance over length, summed over
+    stretches.
     """
     masked = [np.where(use[:, None, None], one, np.nan) for one in (R, R_reference)]
     ours, theirs = (walk_of(time_s, one) for one in masked)

@@ -277,9 +277,7 @@ def seeded(*what: str | int) -> torch.Generator:
 def hidden_shares(
     places: Mapping[str, Doubles], cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
 ) -> dict[str, Doubles]:
-    """Return for each ball at places (N, 3), lab, mm, the share of its disk that nearer ones cover, (C, N), all as
-    circles.
-    """
+    """Return for each ball at places (N, 3), lab, mm, the share of its disk (C, N) that nearer disks cover."""
     across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
     grid = torch.cartesian_prod(across, across)
     grid = grid[grid.square().sum(1) < 1]

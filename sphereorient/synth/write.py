@@ -128,9 +128,7 @@ def write_synthetic_experiment(
 
 
 def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
-    """Return what the cameras of `default_cameras` see, before degradations of pictures.
-    Raises SettingsError: no room for a ball.
-    """
+    """Return what the cameras see, before degradations of pictures. Raises SettingsError: no room for a ball."""
     motions = motions_of(settings)
     # Rounded to grey levels, as in the file.
     textures = [
@@ -170,9 +168,7 @@ def instants_s(settings: SynthSettings) -> Tensor:
 
 
 def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
-    """Draw the motion of each ball, by its name; one that meets an earlier ball at a filmed instant is drawn again.
-    Raises SettingsError: no room for a ball.
-    """
+    """Draw the motion of each ball, by name, so that none meets another. Raises SettingsError: no room for a ball."""
     times_s, motions, paths = instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
     for k, name in enumerate(settings.worn):
         for draw in range(DRAWS):

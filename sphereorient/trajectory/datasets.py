@@ -148,9 +148,7 @@ def nearest_rows(known: NDArray[Any], wanted: NDArray[Any]) -> tuple[NDArray[np.
 
 
 def span_words(mask: NDArray[np.bool_], number: NDArray[np.int64] | None = None) -> str:
-    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319": the longest `SPANS` stretches. `number`: that
-    of each frame, None: its index.
-    """
+    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319": the longest; `number`: of each frame."""
     number = np.arange(len(mask)) if number is None else number
     runs = runs_of(mask)
     longest = sorted(sorted(runs, key=lambda run: run[0] - run[1])[:SPANS])

@@ -306,8 +306,8 @@ class Trajectory:
         return np.asarray(~self.valid & none.any(0) & (none | unknown).all(0))
 
     def summary(self) -> dict[str, Any]:
-        """Return numbers of frames: all `frames`, those `valid`, those with `no_ball`, and `lost`: the other ones that
-        each camera lost, by reason, most frequent first.
+        """Return the numbers of `frames`, `valid`, `no_ball`, and `lost`: the rest by camera and reason, frequent ones
+        first.
         """
         lost, none = {}, self.without_ball
         for name, camera in self.cameras.items():
@@ -318,9 +318,7 @@ class Trajectory:
 
 
 class Tracks(Mapping[str, Trajectory]):
-    """Trajectories of the spheres of one recording, by name: `tracks["a"]`. The name of a sphere under the key `sphere`
-    of experiment.yaml is empty. All have the same times.
-    """
+    """Trajectories of the spheres of one recording by name, with the same times; an only sphere's name is empty."""
 
     def __init__(self, tracks: Mapping[str, Trajectory]) -> None:
         times = [track.time for track in tracks.values()]

@@ -108,9 +108,7 @@ def track_figure(track: Trajectory) -> Figure:
 
 @look.in_style
 def path_figure(*tracks: Trajectory) -> Figure:
-    """Draw the path in the lab, to scale, with body axes; of a long track `shown_part`. Several are of one
-    recording, a colour each sphere. Source: the paper, figure.
-    """
+    """Draw the paths of tracks of one recording, lab, to scale, with body axes; of a long track `shown_part`."""
     parts = [shown_part(track) for track in tracks]
     figure = look.new_figure(look.WIDTH_IN, 5.6)
     axes: Any = figure.add_subplot(projection="3d")
