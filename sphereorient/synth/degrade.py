@@ -109,10 +109,11 @@ def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Gene
 def clutter(pictures: Tensor, rms: float, rng: torch.Generator) -> Tensor:
     """Draw structure (..., H, W), uniformly distributed, at least 0, standard deviation `rms` grey levels."""
     field = blurred(_normal(pictures, rng), CLUTTER_PX)
-    field = (field - field.mean((-2, -1), keepdim=True)) / field.std((-2, -1), correction=0, keepdim=True)
+    field = (field - field.mean((-2, -1), keepdim=True)) / _spread(field)
     even = torch.special.ndtr(field)
     even = even - even.amin((-2, -1), keepdim=True)
-    return (rms / even.std((-2, -1), correction=0, keepdim=True)) * even
+    found: Tensor = (rms / _spread(even)) * even
+    return found
 
 
 def add_behind(pictures: Tensor, light: Tensor, disk: Disk) -> Tensor:
@@ -311,3 +312,7 @@ def _uniform(pictures: Tensor, rng: torch.Generator, *tail: int) -> Tensor:
 def _normal(pictures: Tensor, rng: torch.Generator) -> Tensor:
     draw = torch.randn(pictures.shape, generator=rng, dtype=pictures.dtype, device=rng.device)
     return draw.to(pictures.device)
+
+
+def _spread(field: Tensor) -> Tensor:
+    return (field - field.mean((-2, -1), keepdim=True)).square().mean((-2, -1), keepdim=True).sqrt()
