@@ -1,8 +1,5 @@
-"""A ball under an animal, filmed by one camera, of which nothing is known: scenes as spintrack publishes theirs.
-
-Geometry, paint, light, sensor and motion have the numbers of its benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of
-results and families.py); pictures and motions are drawn anew here. What it prints of its own pictures stands
-beside the results.
+"""A ball under an animal, filmed by one camera, of which nothing is known: scenes with the numbers of spintrack's
+benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of results and families.py); pictures and motions are drawn anew.
 """
 
 import math
@@ -191,9 +188,7 @@ def _wandering(rng: np.random.Generator, count: int, sigma: float, frames: float
 
 
 def walked(count: int, rng: np.random.Generator, forward_share: float = 1.0) -> NDArray[np.float64]:
-    """Return the turns (N, 3), rad, of a ball under a fly that walks and stops, lab: forward, right, down. The first is
-    zero. Speeds, turns and saccades as spintrack publishes them.
-    """
+    """Return the turns (N, 3), rad, lab, of a ball under a fly that walks and stops, as spintrack publishes them."""
     walks, k, on = np.zeros(count, bool), 0, True
     speed = np.zeros(count)
     while k < count:
@@ -229,16 +224,11 @@ def _camera(scene: BallScene) -> PinholeCamera:
     )
 
 
-def _place(scene: BallScene, camera: PinholeCamera) -> Tensor:
-    """Return the ball's centre, (3,), mm, lab."""
-    a, e = math.radians(scene.azimuth_deg), math.radians(scene.elevation_deg)
-    ahead = torch.tensor([math.sin(a) * math.cos(e), -math.sin(e), math.cos(a) * math.cos(e)], dtype=torch.float64)
-    return (ahead * RADIUS_MM / math.sin(math.radians(scene.half_deg))) @ camera.R_cam_lab
-
-
 def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.Generator) -> Tensor:
     """Return the ball's centres in N frames, (N, 3), mm, lab."""
-    X = _place(scene, camera)
+    a, e = math.radians(scene.azimuth_deg), math.radians(scene.elevation_deg)
+    ahead = torch.tensor([math.sin(a) * math.cos(e), -math.sin(e), math.cos(a) * math.cos(e)], dtype=torch.float64)
+    X = (ahead * RADIUS_MM / math.sin(math.radians(scene.half_deg))) @ camera.R_cam_lab
     if not (scene.sway_px or scene.sink_px):
         return X.expand(count, 3)
     aside = rng.normal(size=(3, count + 8 * SWAY_FRAMES))
@@ -257,8 +247,6 @@ def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.
 
 
 class _Film:
-    """Renders the frames of a scene."""
-
     def __init__(self, scene: BallScene, camera: PinholeCamera, X: Tensor, paint: Floats, rng: np.random.Generator):
         self.scene, self._camera, self._paint, self._rng = scene, camera, paint, rng
         (u, v), (width, height) = camera.project(X).tolist(), scene.size
@@ -305,7 +293,6 @@ class _Film:
         self._glint = (scene.specular * glint.clamp_min(0).numpy() ** 25 * self._hit).astype(np.float32)
 
     def _seen(self, R_lab_body: Tensor) -> Floats:
-        """Return the paint of all samples."""
         x, y, z = (self._normal.float() @ R_lab_body.float()).unbind(-1)
         rows, columns = self._paint.shape
         u = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * columns - 0.5
@@ -347,17 +334,14 @@ class _Film:
         cv2.ellipse(picture, (int(u), int(v - 0.78 * r)), axes, 0, 0, 360, grey, -1, cv2.LINE_AA)
 
     def _put_animal(self, picture: Floats, k: int) -> None:
-        """Draw a body and legs that walk, 12 steps a second."""
         (u, v), r = self.middle, self.radius_px
         for leg in range(self.scene.legs):
             side, rank = (-1) ** (leg + 1), leg // 2
             swing = math.sin(2 * math.pi * 12 * k / RATE_HZ + math.pi * (leg % 2) + 2 * math.pi * rank / 3)
             angle = math.radians(-90 + side * (35 + 25 * rank) + 8 * swing)
             reach = r * (0.55 + 0.12 * rank + 0.06 * swing)
-            hip, foot = (
-                np.array([u, v - 0.78 * r]),
-                np.array([u + reach * math.cos(angle), v + reach * math.sin(angle)]),
-            )
+            hip = np.array([u, v - 0.78 * r])
+            foot = np.array([u + reach * math.cos(angle), v + reach * math.sin(angle)])
             knee = (hip + foot) / 2 + np.array([side * 0.18 * r, -0.12 * r])
             line = np.array([hip, knee, foot], np.int32).reshape(-1, 1, 2)
             cv2.polylines(picture, [line], False, GREY_LEG, max(1, round(0.035 * r)), cv2.LINE_AA)

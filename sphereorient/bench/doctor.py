@@ -85,9 +85,9 @@ def _torch_is_right() -> bool:
 
 
 def fit_speed(diameter_px: float) -> dict[str, float]:
-    """Render a moving ball at known poses for one camera, measure it as `live` does, and return the largest error of
-    the orientation (NaN: a frame without a pose), times of a frame from picture to pose, by this process and by the
-    clock, and the rates that can be held: by a core that is free, by one shared with another program, and now.
+    """Render a moving ball at known poses for one camera, and measure it as `live` does. Return the largest error of
+    the orientation (NaN: a frame without a pose), the time of a frame by this process and by the clock, and the rates
+    that can be held: by a free core, by a shared one, and now.
     """
     side = 2 * round(0.8 * diameter_px)
     scene = SynthSettings(frames=FRAMES, cameras=1, diameter_px=diameter_px, image_size=(side, side), **TURNS)

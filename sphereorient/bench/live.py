@@ -158,11 +158,8 @@ class _Writer(Thread):
 
 
 def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
-    """Write an experiment's pictures into memory at a rate, and time the lines of `live`. A truth.h5 beside it tells
-    the errors.
-
-    Raises:
-        SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
+    """Write an experiment's pictures into memory at a rate, and time the lines of `live`; errors by a truth.h5 beside
+    it. Raises SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
     """
     with open_recording(timing.experiment, timing.cameras) as recording:
         pictures = [[part for part in one.pictures if part is not None] for one in movie_frames(recording, paced=False)]
@@ -226,8 +223,8 @@ def _stall(tracker: psutil.Process, ends_s: list[float]) -> None:
 
 
 def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Callable[[int], None]) -> Floats:
-    """Return of each line, until none comes: number, time (s), rotation since the stretch began (3), rad, in the
-    camera's axes, and place in the stretch; (n, 6).
+    """Return (n, 6) of the lines: number, time (s), rotation since the stretch began (3), rad, camera axes; place in
+    it.
     """
     found: list[tuple[float, ...]] = []
     begin = time.monotonic()

@@ -68,10 +68,9 @@ def run_benchmark(
     jobs: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Results:
-    """Render all scenes, track each with all methods (None: precise and paper), measure; results.json holds all.
-
-    The folder is created; an interrupted run of the same plan is continued. `jobs` processes do one scene each;
-    `progress` gets finished and all scenes. Raise OutputError if the folder is unwritable, or holds another run.
+    """Render all scenes, track each with all methods (None: precise and paper), and measure; results.json holds all. An
+    interrupted run of the same plan is continued. `jobs` processes do one scene each; `progress` gets finished and all
+    scenes. Raise OutputError if the folder is unwritable, or holds another run.
     """
     chosen = trackers_of(DEFAULT) if trackers is None else trackers
     _prepare(folder, settings)

@@ -108,11 +108,11 @@ def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int
 
 def write_scene(folder: Path, scene: BenchmarkScene) -> Path:
     """Render a scene into a folder, with truth.h5 (docs/data-format.md); return the path of experiment.yaml."""
-    return write_degraded(folder, scene.base, scene.degradations, clean=_clean)
 
+    def clean(settings: SynthSettings, paint_wear: float) -> CleanMovie:
+        return _rendered(settings.model_copy(update={"name": ""}), paint_wear)
 
-def _clean(settings: SynthSettings, paint_wear: float) -> CleanMovie:
-    return _rendered(settings.model_copy(update={"name": ""}), paint_wear)
+    return write_degraded(folder, scene.base, scene.degradations, clean)
 
 
 @lru_cache(maxsize=2)  # most scenes of a seed share their motion: what is seen is rendered once

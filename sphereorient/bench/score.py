@@ -15,6 +15,7 @@ from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.files.hdf5 import UNNAMED, ball_groups
 from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
 from sphereorient.trajectory import Tracks, Trajectory
+from sphereorient.trajectory.datasets import nearest_rows
 from sphereorient.trajectory.rotations import distance_deg, rotation_vectors, rotations
 from sphereorient.trajectory.walk import FICTRAC
 
@@ -120,8 +121,8 @@ def named_as_true(tracks: Tracks, truth_path: str | Path, alike: Sequence[str]) 
 
 
 def given_to_others(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[int, int]]:
-    """Return for each sphere in how many valid frames its position is nearer to the true one of another than to its
-    own, and how often the nearest one changes.
+    """Return for each sphere in how many valid frames it is nearest to the truth of another, and how often that
+    changes.
     """
     found = {}
     for k, (name, away_mm) in enumerate(_distances(tracks, truth_path).items()):
@@ -205,8 +206,8 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     """
     R, start, held = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool), True  # FicTrac knows no other
     if path.suffix.lower() == ".dat":
-        frame, orientation, begins = _fictrac_stretches(path)
-        row, there = _nearest(frame.astype(np.float64), track.time * track.frame_rate)
+        frame, orientation, begins = read_fictrac(path)
+        row, there = nearest_rows(frame.astype(np.float64), track.time * track.frame_rate)
         R[there], start[there] = orientation[row[there]], begins[row[there]]
     elif not _is_track(path):
         truth = _read_truth(path, "position", sphere=track.sphere)
@@ -215,7 +216,7 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     else:
         tracks = Tracks.load(path)
         other = next(iter((tracks if len(tracks) == 1 else tracks.picked(track.sphere)).values()))
-        row, there = _nearest(other.time, track.time)
+        row, there = nearest_rows(other.time, track.time)
         R[there], held = other.orientation[row[there]], other.held
     if not np.isfinite(R).any():
         do = "pass a result on the same movie, and frame_rate in experiment.yaml for FicTrac's"
@@ -233,7 +234,7 @@ def another_result(path: Path, truth_path: Path) -> Trajectory:
     """Return the orientations of a FicTrac .dat, of a ball in its place, as a track at the times of a truth; raise
     TrackError if the truth has too few frames, BenchError for another file.
     """
-    frame, R = read_fictrac(path)
+    frame, R, _ = read_fictrac(path)
     time_s, _ = _truth_at(truth_path, frame)
     still, cov = np.zeros((len(frame), 3)), np.tile(np.eye(3), (len(frame), 1, 1))
     empty = Trajectory.empty(time_s)
@@ -248,34 +249,20 @@ def _is_track(path: Path) -> bool:
         return False
 
 
-def _nearest(known: Floats, wanted: Floats) -> tuple[Frames, NDArray[np.bool_]]:
-    """Return the rows of increasing known times nearest to the wanted ones, and where they are within half a step."""
-    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
-    before = np.maximum(after - 1, 0)
-    row = np.where(np.abs(known[before] - wanted) < np.abs(known[after] - wanted), before, after)
-    step = float(np.median(np.diff(known))) if len(known) > 1 else np.inf
-    return row, np.abs(known[row] - wanted) <= step / 2
-
-
 def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
     """Return the rows of the truth at the nearest times; refuse times further than half a frame."""
-    row, there = _nearest(known_s, time_s)
+    row, there = nearest_rows(known_s, time_s)
     if not there.all():
         got = f"{time_s[0]:.6g} .. {time_s[-1]:.6g} s"
         raise TrackError(refusal(f"truth {path}", expected="times of the track", got=got, do=DO))
     return row
 
 
-def read_fictrac(path: Path) -> tuple[Frames, Floats]:
-    """Read frames (N,), from 0, and orientations (N, 3, 3), body to camera axes, of a FicTrac 2 .dat file.
-
-    They are relative to its first frame, in axes of its own: align with "both". Raise BenchError for other files.
+def read_fictrac(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
+    """Read frames (N,), from 0, orientations (N, 3, 3), body to camera axes, and whether the sequence counter begins
+    anew (N,), of a FicTrac 2 .dat file. Orientations are relative to its first frame, in axes of its own: align with
+    "both". Raise BenchError for other files.
     """
-    return _fictrac_stretches(path)[:2]
-
-
-def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
-    """Read the same, and the frames (N,) in which its sequence counter begins anew."""
     do = "pass FicTrac's .dat file"
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
@@ -291,10 +278,8 @@ def _fictrac_stretches(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
 
 
 def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats:
-    """Return geodesic distances (N,), degrees, of R (N, 3, 3) from the truth; NaN: not measured.
-
-    `align`: "none"; "body" fits B in R B (arbitrary body axes); "both" fits A and B in A R B (any frame of reference).
-    Raise BenchError for another word.
+    """Return geodesic distances (N,), degrees, of R (N, 3, 3) from the truth; NaN: not measured. `align`: "none";
+    "body" fits B in R B (any body axes); "both" fits A and B in A R B (any lab too). BenchError: another word.
     """
     if align not in ALIGNMENTS:
         raise BenchError(refusal("--align", expected="none, body or both", got=repr(align)[:40], do="choose one"))
@@ -308,9 +293,7 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
 
 
 def _alignment(measured: Floats, true: Floats, align: str) -> tuple[Floats, Floats]:
-    """Return A and B with the least squared chords, fitted in turn; starting from the first frame's B avoids wrong
-    optima.
-    """
+    """Return A and B with the least squared chords, fitted in turn from the first frame's B."""
     left = right = np.eye(3)
     if align == "none":
         return left, right

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 from typer import Option
 from typer.core import TyperGroup
 
@@ -272,9 +273,6 @@ def info() -> None:
 
 
 def _print_findings(found: dict[str, Any]) -> None:
-    """Print what `doctor` found: lines, and a table of fits."""
-    from rich.table import Table
-
     fits = found.pop("live_one_camera", [])
     for name, value in found.items():
         told = [f"{key}: {_words(one)}" for key, one in value.items()] if isinstance(value, dict) else [_words(value)]

@@ -185,9 +185,7 @@ def _looked(
     shown: "NDArray[np.bool_] | None" = None,
     circle: tuple[float, float, float] | None = None,
 ) -> "list[FirstLook]":
-    """Look at movies, and draw what was found beside the file to write; `shown` as in `look_at`, with FicTrac's circle
-    where `shown` is given.
-    """
+    """Look at movies, and draw what was found beside the file to write; `shown` (as `look_at`), `circle`: FicTrac's."""
     picture = target.with_suffix(".png")
     check_writable(picture)
     from sphereorient.preflight.first_look import look_at, with_circle
@@ -246,7 +244,6 @@ def _found(look: "FirstLook") -> list[str]:
 
 
 def _next(target: Path, cameras: Path, looks: "Sequence[FirstLook]") -> list[str]:
-    """Return the commands that come next."""
     calibrate = [
         "sphereorient init --plate FOLDER  # pictures of a calibration plate",
         f"sphereorient calibrate calibration.yaml --out {cameras}",

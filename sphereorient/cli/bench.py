@@ -4,10 +4,12 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
@@ -30,8 +32,6 @@ from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import write_text, writing
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from sphereorient.bench import BenchSettings, Results, Score
     from sphereorient.bench.score import Floats
     from sphereorient.statistics import Interval
@@ -147,10 +147,8 @@ def print_errors(errors_deg: "Floats", ball: str, word: str = "error") -> None:
         typer.echo(f"{word}, degrees: {percentiles}; above {WRONG_DEG:g}: {100 * wrong:.3g} %")
 
 
-def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> "Table":
+def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table:
     """Return gain, drift, heading and path against a reference as a table."""
-    from rich.table import Table
-
     of, against = f" of ball {ball}" if ball else "", "the exact truth" if exact else "another tracker"
     title = f"Behaviour{of} against {against}, {found.pairs} turns from frame to frame"
     table = Table("quantity", "x", "y", "z", "along the rotation", title=title)
@@ -176,10 +174,8 @@ def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> "Tabl
     return table
 
 
-def error_table(found: "Score", ball: str | None = None) -> "Table":
+def error_table(found: "Score", ball: str | None = None) -> Table:
     """Return errors of orientation and position, and relative errors of the rates, as a table."""
-    from rich.table import Table
-
     of = f" of ball {ball}" if ball else ""
     title = f"Errors{of} against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
     table = Table("quantity", "median", "95 %", "largest", title=title)
@@ -206,7 +202,6 @@ Jobs = Annotated[int, Option("--jobs", "-j", min=1, help="Processes.")]
 
 
 def _numbers_in(option: str, text: str) -> tuple[int, ...]:
-    """Return the numbers in 1,3,5; raise SettingsError for another text."""
     if not names_in(text) or not all(part.isdecimal() for part in names_in(text)):
         expected, got, do = "whole numbers between commas", repr(text)[:40], f"write e.g. {option} 1,3,5"
         raise SettingsError(refusal(option, expected=expected, got=got, do=do))
@@ -261,7 +256,7 @@ def robustness(given: _RobustnessOptions) -> None:
     trackers = trackers_of(names_in(given.methods))
     older = None if given.baseline is None else load_results(given.baseline)
     with progress_bar(given.quiet, unit="") as advance:
-        found = run_benchmark(given.out, chosen, trackers, jobs=given.jobs, progress=lambda *at: advance("scenes", *at))
+        found = run_benchmark(given.out, chosen, trackers, jobs=given.jobs, progress=partial(advance, "scenes"))
     with writing(force=True):  # its plan says that the folder is of this run
         write_table([found], given.out / "results.csv")
         write_figure(robustness_figure(found), given.out / "robustness")
@@ -304,9 +299,8 @@ def balls_curve(given: _BallsOptions) -> None:
         for b in _numbers_in("--balls", given.balls)
     }
     with progress_bar(given.quiet, unit="") as advance:
-        runs = run_benchmarks(
-            given.out, plans, trackers_of(["precise"]), jobs=given.jobs, progress=lambda *at: advance("scenes", *at)
-        )
+        trackers = trackers_of(["precise"])
+        runs = run_benchmarks(given.out, plans, trackers, jobs=given.jobs, progress=partial(advance, "scenes"))
     with writing(force=True):  # its plans say that the folder is of this run
         write_table(runs, given.out / "results.csv")
         write_figure(density_figure(runs), given.out / "density")
@@ -352,25 +346,12 @@ def ball_scenes(given: _BallOptions) -> None:
 
 
 def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
-    """Print what was measured of scenes, beside what other programs print of theirs."""
-    from rich.table import Table
-
     from sphereorient.bench.ball import SCENES
 
-    title = (
-        "Nothing known before; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack prints them, of its pictures"
-    )
-    columns = (
-        "scene",
-        "found",
-        "first pass: step",
-        "orientation",
-        "refined: step",
-        "orientation",
-        "gain, axes",
-        "drift/min",
-    )
-    table = Table(*columns, "step / sigma", "CPU ms", "FicTrac", "spintrack", title=title)
+    title = "Nothing known before; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack prints its own"
+    columns = ("scene", "found", "first pass: step", "orientation", "refined: step", "orientation")
+    more = ("gain, axes", "drift/min", "step / sigma", "CPU ms", "FicTrac", "spintrack")
+    table = Table(*columns, *more, title=title)
     table.columns[0].no_wrap = True
     for row in rows:
         first, refined = row["first"], row.get("refined")
@@ -414,8 +395,6 @@ class _LiveDelayOptions:
 @bench.command("live")
 def live_delay(given: _LiveDelayOptions) -> None:
     """Time `live`, from a picture in memory to a line on a socket; and its errors, by a truth.h5 beside the movie."""
-    from rich.table import Table
-
     from sphereorient.bench.live import COLUMNS, LiveTiming, delays, neighbours
 
     rates = [_rate_hz(part) for part in names_in(given.rate) or [given.rate]]
@@ -444,7 +423,6 @@ def live_delay(given: _LiveDelayOptions) -> None:
 
 
 def _rate_hz(text: str) -> float:
-    """Return a frame rate; raise SettingsError for anything else."""
     try:
         rate_hz = float(text)
     except ValueError:
@@ -484,9 +462,6 @@ def write_scenes(given: _SceneOptions) -> None:
 
 
 def _print(found: "Results") -> None:
-    """Print one line for each degradation, level and method."""
-    from rich.table import Table
-
     from sphereorient.bench.results import summaries
 
     table = Table(
@@ -508,9 +483,6 @@ def _print(found: "Results") -> None:
 
 
 def _print_balls(runs: "Sequence[Results]") -> None:
-    """Print one line for each number of cameras and balls."""
-    from rich.table import Table
-
     from sphereorient.bench.results import summaries
 
     table = Table(
@@ -540,8 +512,7 @@ def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:
         for one in some:
             typer.echo(f"{word}: {one.kind} {one.level}, {one.method}: {one.what} {one.before:.4g} -> {one.now:.4g}")
     if not quiet:
-        typer.echo(
-            f"{len(changes)} numbers compared: {len(worse)} worse, {len(better)} better, by more than their scatter"
-        )
+        counts = f"{len(worse)} worse, {len(better)} better, by more than their scatter"
+        typer.echo(f"{len(changes)} numbers compared: {counts}")
     if worse:
         raise typer.Exit(1)

@@ -31,7 +31,13 @@ def calibrate(
     check_writable(out)
     picture = out.with_suffix(".png")
     if refine_with is not None:
-        _repair(source, refine_with, out, quiet)
+        from sphereorient.calibration.self_calibration import refine_with_track, repair_lines
+        from sphereorient.cameras import load_cameras, save_cameras
+
+        repaired = refine_with_track(source, refine_with)
+        save_cameras(out, load_cameras(source) | dict(repaired.cameras), f"repaired by {command_line()}")
+        if not quiet:
+            echo_lines([*repair_lines(repaired), f"Wrote {out}. Track again with it; a second repair is finer still."])
         return
     check_writable(picture)
     from sphereorient.calibration.plates import calibrate_cameras
@@ -53,16 +59,6 @@ def calibrate(
     print_table(pictures_table(result))
     print_table(parameters_table(result))
     echo_lines([*summary(result), f"Wrote {out} and {picture}"])
-
-
-def _repair(cameras: Path, track: Path, out: Path, quiet: bool) -> None:
-    from sphereorient.calibration.self_calibration import refine_with_track, repair_lines
-    from sphereorient.cameras import load_cameras, save_cameras
-
-    result = refine_with_track(cameras, track)
-    save_cameras(out, load_cameras(cameras) | dict(result.cameras), f"repaired by {command_line()}")
-    if not quiet:
-        echo_lines([*repair_lines(result), f"Wrote {out}. Track again with it; a second repair is finer still."])
 
 
 @app.command("check-cameras")

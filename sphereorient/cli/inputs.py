@@ -159,7 +159,6 @@ def _facts(opened: "Movie", seen: "Survey") -> list[tuple[str, str]]:
 
 
 def _times(opened: "Movie") -> str:
-    """Return the time stamps of a movie in words."""
     from sphereorient.movies.stamps import spacing
 
     times_s = opened.times_s

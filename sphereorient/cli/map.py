@@ -104,7 +104,6 @@ def _files_of(out: Path) -> list[Path]:
 
 
 def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
-    """Write all files beside the map, and return them."""
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
 
@@ -121,7 +120,6 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
 
 
 def _print(result: "MapResult") -> None:
-    """Print from what the map was learnt, and how well it explains the pictures."""
     from sphereorient.report.texture_map import shares_seen
 
     learnt = result.learnt
@@ -220,7 +218,6 @@ def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json
 
 
 def _print_series(found: "WearSeries", names: list[str]) -> None:
-    """Print the wear of each map, then of each place."""
     width = max(len(name) for name in names)
     typer.echo(f"{'against ' + names[0]:{width + 8}}  known of the ball  worn of it  since the map before  stays worn")
     for name, one in zip(names[1:], found.growth, strict=True):
@@ -247,7 +244,6 @@ def _percent(share: float, sign: str = "", digits: int = 1) -> str:
 
 
 def _series_numbers(found: "WearSeries", names: list[str]) -> dict[str, object]:
-    """Return the figures of a series for JSON."""
     rows = [
         {
             "map": name,
@@ -270,7 +266,6 @@ def _series_numbers(found: "WearSeries", names: list[str]) -> dict[str, object]:
 
 
 def _print_moved(comparison: "MapComparison", against: str) -> None:
-    """Print the displacement of the texture."""
     count = len(comparison.length_rad)
     if not count:
         typer.echo(f"{against}: no patch could be located")
@@ -280,7 +275,6 @@ def _print_moved(comparison: "MapComparison", against: str) -> None:
 
 
 def _numbers(comparison: "MapComparison") -> dict[str, object]:
-    """Return the figures of a displacement for JSON."""
     return {
         "patches": len(comparison.length_rad),
         "moved_rms_deg": math.degrees(comparison.rms_rad),

@@ -129,7 +129,6 @@ def overlay(given: _OverlayOptions) -> None:
 
 
 def _paths(out: Path, tracks: "Tracks") -> dict[str, Path]:
-    """Return the file of each sphere by name, checked."""
     from sphereorient.report.columns import plain_names
 
     plain = plain_names(tracks, "ball")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, print_table, progress_bar
@@ -69,7 +70,6 @@ def spin(given: _SpinOptions) -> None:
 
 
 def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, Any]:
-    """Return the result for JSON; null: not measured."""
     spins, sigma = found.spins, found.spins.rate_sigma()
     rate = spins.omega_view_rad_s.norm(dim=-1)
     return {
@@ -105,7 +105,6 @@ def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, 
 
 
 def _print_spin(result: dict[str, Any]) -> None:
-    """Print each spin, and how well the photographs follow the first."""
     for k, one in enumerate(result["spins"]):
         omega = ", ".join(f"{each:.1f}" for each in one["omega_view_rad_s"])
         rate, sigma = one["rate_rad_s"], one["rate_sigma_rad_s"]
@@ -187,7 +186,6 @@ def design(given: _DesignOptions) -> None:
 
 
 def _check_design(given: _DesignOptions) -> None:
-    """Refuse options that contradict each other, nan and infinity."""
     if given.make == (given.map_ is not None):
         got, do = ("both", "leave one of them away") if given.make else ("neither", "name a map, or say --make")
         raise TextureError(refusal("texture design", expected="a map to judge or --make", got=got, do=do))
@@ -200,7 +198,6 @@ def _check_design(given: _DesignOptions) -> None:
 
 
 def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, make: bool) -> list[Path]:
-    """Write judgement and figure, and the map where it was made; return the files."""
     from sphereorient.report.plots.style import write_figure
     from sphereorient.report.texture_map import write_texture
     from sphereorient.tools.design.judge import design_figure
@@ -217,9 +214,6 @@ def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, 
 
 
 def _print_judgement(judgement: "Judgement", title: str) -> None:
-    """Print the judgement as a table."""
-    from rich.table import Table
-
     told = judgement.as_dict()
     table = Table(title, "least", "middle", "most", title="judgement", title_justify="left")
     white, bound = told["white_share"], told["bound_deg"]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Column, Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
@@ -127,7 +128,6 @@ def _kept(requests: "Sequence[Request]") -> Iterator[None]:
 def _track_side_by_side(
     requests: "Sequence[Request]", jobs: int, cluster: str | None, resume: bool, quiet: bool
 ) -> None:
-    """Track on worker processes or a cluster, and print a table of the results."""
     from sphereorient.run import run_many
     from sphereorient.run.many import ProcessExecutor, dask_executor
 
@@ -146,9 +146,6 @@ def _track_side_by_side(
 
 
 def _print_table(outcomes: "Sequence[Outcome]") -> None:
-    """Print frames, valid frames and time of each experiment."""
-    from rich.table import Column, Table
-
     table = Table("track", *(Column(heading, justify="right") for heading in ("frames", "valid", "s", "frames/s")), "")
     for outcome in outcomes:
         rate = f"{outcome.frames / outcome.seconds:.1f}" if outcome.frames else ""
@@ -159,7 +156,6 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
 
 
 def _print_summary(result: "Trajectory", name: str) -> None:
-    """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
     from sphereorient.calibration.self_calibration import contradiction_lines
     from sphereorient.trajectory import span_words
 
@@ -198,8 +194,7 @@ class _LiveOptions(CameraOptions):
 def live(given: _LiveOptions) -> None:
     """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
 
-    The experiment's movies, of the same set-up, show the empty scene and the light. Without a texture map, that of a
-    ball that stays in its place is learnt meanwhile, from the first frame on.
+    The experiment's movies show the empty scene and the light. Without a map, that of a fixed ball is learnt meanwhile.
     """
     from sphereorient.experiment import load_experiment
     from sphereorient.live.live import TrackBlocks
@@ -210,33 +205,28 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.movies import flipped
     from sphereorient.movies.record import Recorder
 
-    chosen = given.chosen("precise")
-    source, page, movies = source_of(given.source, _tell), None, _movies_of(given)
+    chosen, experiment = given.chosen("precise"), load_experiment(given.experiment)
+    source, page, movies = source_of(given.source, _tell), None, _movies_of(given, experiment)
     with ExitStack() as opened:
         outputs = [open_output(name, _tell) for name in given.to or ()]
         opened.callback(source.close)
         for output, _ in outputs:
             opened.callback(output.close)
-        if len(load_experiment(given.experiment).names) > 1 and any(form != "json" for _, form in outputs):
+        if len(experiment.names) > 1 and any(form != "json" for _, form in outputs):
             got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
             raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
         if given.page is not None:
             page = PageProcess(given.experiment, given.names, given.page, _tell)
             opened.callback(page.close)
             typer.echo(f"page: {page.address}", err=True)
-        set_up = opened.enter_context(open_live(given.experiment, chosen, given.names, given.learnt))
-        blocks = TrackBlocks(
-            recording=set_up.recording,
-            tracker=set_up.tracker,
-            even=source.even,
-            settings=chosen,
-            command=command_line(),
-        )
+        set_up = opened.enter_context(open_live(experiment, chosen, given.names, given.learnt))
+        recording, command = set_up.recording, command_line()
+        blocks = TrackBlocks(recording, set_up.tracker, even=source.even, settings=chosen, command=command)
         for output, _ in outputs:
             output.begin(blocks)
-        recorders, frame_s = [], set_up.recording.timeline.frame_s
-        for stream in set_up.recording.streams if movies else ():
-            filmed = flipped(stream.movie, set_up.recording.experiment.flip.get(stream.name, "none"))
+        recorders, frame_s = [], recording.timeline.frame_s
+        for stream in recording.streams if movies else ():
+            filmed = flipped(stream.movie, experiment.flip.get(stream.name, "none"))
             recorders.append(Recorder(movies[stream.name], filmed, frame_s, _tell, wait=source.waits))
             opened.callback(recorders[-1].close)
         monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell, given.axes)
@@ -250,9 +240,8 @@ def live(given: _LiveOptions) -> None:
         echo_lines([*monitor.summary(), *(one.summary() for one in recorders)])
 
 
-def _movies_of(given: _LiveOptions) -> dict[str, Path]:
+def _movies_of(given: _LiveOptions, experiment: "Experiment") -> dict[str, Path]:
     """Return the movie of each camera to record, of several NAME.CAMERA.mkv; OutputError where one cannot be new."""
-    from sphereorient.experiment import load_experiment
     from sphereorient.live.outputs import check_new
     from sphereorient.movies.write import WRITERS, times_path
 
@@ -261,7 +250,7 @@ def _movies_of(given: _LiveOptions) -> dict[str, Path]:
     check_ending(path, "--record", WRITERS)
     if str(path) in (given.to or ()):
         raise OutputError(refusal("--record", expected="a file of its own", got="that of --to", do="name another one"))
-    names = given.names or tuple(load_experiment(given.experiment).movie_paths)
+    names = given.names or tuple(experiment.movie_paths)
     movies = {name: path.with_name(f"{path.stem}.{name}{path.suffix}") if len(names) > 1 else path for name in names}
     for new in (*movies.values(), *(times_path(movie) for movie in movies.values() if path.suffix.lower() == ".mkv")):
         check_new(new)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, print_table, progress_bar
@@ -81,9 +82,6 @@ def evaluate(
 
 
 def _print(found: "ProposerBenchmark") -> None:
-    """Print a line for each degradation, then the metrics of the mixed pictures."""
-    from rich.table import Table
-
     levels = sorted({one.level for one in found.families})
     table = Table("degradation", *(f"level {level}\nfirst / five" for level in levels))
     for family in dict.fromkeys(one.family for one in found.families):

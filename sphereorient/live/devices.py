@@ -1,7 +1,5 @@
-"""Cameras of makers and of OpenCV: opened, set as experiment.yaml says, and read.
-
-A maker's part is a function here, which opens a device by its serial number, and a line of `MAKERS`. What is set has
-GenICam's names (SFNC).
+"""Cameras of makers and of OpenCV, set as experiment.yaml says. A maker's part is a function here, which opens a device
+by its serial number, and a line of `MAKERS`; features have GenICam's names (SFNC).
 """
 
 import time
@@ -276,9 +274,9 @@ class Camera:
     tell: Tell | None  # gets what is wrong, in one line; None: a movie, which ends
 
     def shots(self, stopped: Event) -> Iterator[Shot | None]:
-        """Yield pictures until `stopped`; None whenever the device is opened: its clock begins anew. One that ends,
-        fails or changes its pictures after the first one is opened again, each second.
-        Raise MovieError: no camera, one that refuses what it is set to, or pictures of another size or type.
+        """Yield pictures until `stopped`; None whenever the device is opened: its clock starts again. After the first
+        picture, a device that ends or fails is opened again each second. Raise MovieError: no camera, one that refuses
+        its settings, or pictures of another size or type.
         """
         fault, seen = "", False
         while not stopped.is_set():
@@ -346,9 +344,7 @@ def worded(name: str) -> Iterator[None]:
 
 
 def device_frames(cameras: Sequence[Camera], tell: Tell, stopped: Event) -> Iterator[Arrival]:
-    """Yield the instants of cameras until `stopped`, or until the only one ends; see `Instants`.
-    Raise MovieError as `Camera.shots` does, and for one of several whose device has no clock.
-    """
+    """Yield the instants of cameras until `stopped`, or the only one ends; errors: `Camera.shots`, `Instants`."""
     instants, waiting = Instants([one.stream.name for one in cameras], tell), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
     shots: Iterator[Came] = ((0, shot) for shot in cameras[0].shots(stopped))

@@ -47,10 +47,9 @@ class FrameBytes:
 
 
 class Feed:
-    """Reads a source in a thread. `most` frames wait at most: then the oldest is dropped, or with `wait` the source
-    waits. While more than `LATE` wait, frames are passed over, in steps that grow from one to the next: so the motion
-    stays known. Iterating yields what is there, in order, and raises what the source raised. `tell` gets a line where
-    no frame comes for ten times the usual interval, a second at least, and one where they come again.
+    """Reads a source in a thread, and yields its frames in order, or its error. At most `most` frames wait: then the
+    oldest is dropped, or with `wait` the source waits. While more than `LATE` wait, frames are skipped, in steps that
+    grow slowly: the motion stays known. `tell` gets a line where the source stalls, and where it goes on.
     """
 
     def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, tell: Tell = lambda line: None) -> None:
@@ -95,9 +94,8 @@ class Feed:
                 self._source.close()  # a device is released
 
     def restart(self) -> None:
-        """Begin with small steps, since of the motion from here nothing is known: with one of up to `GROWS` frames, and
-        where that soon leads to another search with one of a single frame. Where frames behind the last one were
-        dropped meanwhile, none of those that wait is near it, and they are passed over.
+        """Begin with small steps: the motion from here is not known. The first step is one frame where the last search
+        was recent. Where frames after the last one were dropped, those that wait are skipped.
         """
         with self._changed:
             self._step, self._since = int(self._since >= STEADY), 0
@@ -132,8 +130,6 @@ class Feed:
             raise self._fault
 
     def _await(self) -> None:
-        """Wait for a frame or the end."""
-
         def is_there() -> bool:
             return bool(self._waiting) or self._ended
 

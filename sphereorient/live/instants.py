@@ -58,11 +58,9 @@ class _Instant:
 
 
 class Instants:
-    """Puts the pictures together that cameras took at one instant.
-
-    The first camera gives the time. Another one comes into step by its first 16 pictures: those of one instant arrive
-    together, but for delays; the shortest ones count. From there on stamps alone decide, and follow the clock's drift.
-    An instant goes on with None for a camera whose picture is missing, late or not whole; `tell` gets the counts.
+    """Groups the pictures of several cameras by instant. The first camera gives the time; another one is synchronised
+    by its first 16 pictures, by the shortest delays, then by its time stamps with the drift of its clock. An instant
+    has None for a camera whose picture is missing, late or incomplete; `tell` gets the counts.
     """
 
     def __init__(self, names: Sequence[str], tell: Tell) -> None:
@@ -76,7 +74,6 @@ class Instants:
 
     @property
     def _usual_s(self) -> float:
-        """Usual interval; 0: not known."""
         return statistics.median(self._steps) if len(self._steps) >= 8 else min(self._steps, default=0.0)
 
     def restart(self, camera: int) -> None:
@@ -138,7 +135,6 @@ class Instants:
         return offset_s + middle if agree and (abs(middle) < within_s or len(clock.lags) == SURE) else None
 
     def _put(self, camera: int, time_s: float, shot: Shot, step: int, near_s: float) -> None:
-        """Put a picture to its instant."""
         clock = self._clocks[camera]
         found = next((one for one in self._open if abs(one.time_s - time_s) < near_s), None)
         if found is None:

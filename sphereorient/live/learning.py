@@ -48,9 +48,11 @@ class LearningTracker:
         # Tensors that are sent move to other memory: before fits hold their addresses. Later, arrays alone are sent.
         spawn, begin = multiprocessing.get_context("spawn"), (self._coarse.place,)
         self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
-        self._aside.submit(_ready)
+        self._aside.submit(int)  # the process begins with its first task
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
-        self._known = _unknown(place, self._pass)
+        fitter = first_fitter(place.views, place.radius_mm, self._pass.cells.table, FIRST_BLUR_PX)
+        lasting = Lasting.none(len(place.views))
+        self._known = Appearance(fitter=fitter, still=fitter, lasting=lasting, score_min=0.0, right_score=1.0)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
         self._error = OUTLINE_ERROR  # of the place, radii in pictures
         self._away_rad = 0.0  # farthest turn from the first frame
@@ -70,9 +72,7 @@ class LearningTracker:
         return {"": (poses, searched)}
 
     def _turned(self, poses: Poses) -> Tensor:
-        """Return the covariance (6, 6) of an orientation since the first frame, at a place that is not quite right:
-        all turns are too long or too short by the same share.
-        """
+        """Return the covariance (6, 6) of an orientation since the first frame: a wrong place scales all turns."""
         self._away_rad = max(self._away_rad, float(so3.log(poses.R_lab_body[0]).norm()))
         variance = (self._error * self._away_rad) ** 2 + self._drift_rad**2
         return torch.diag(torch.tensor([variance] * 3 + [0.0] * 3, dtype=torch.float64))
@@ -117,10 +117,6 @@ def _begin(place: Crops) -> None:
     _PLACE.append(place)
 
 
-def _ready() -> None:
-    """Do nothing: the process begins with the first that it is asked."""
-
-
 def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[Array, ...]:
     """Return orientations (N, 3, 3), the place (1, 3), mm, and the map's mean and weight of each cell."""
     seen = _PLACE[0].holding(crops, torch.from_numpy(use))
@@ -128,10 +124,3 @@ def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[A
     cells = FirstPass(found.crops).shown(found.crops, found.R_lab_body).cells
     parts = found.R_lab_body, found.crops.position_lab_mm[:1], cells.mean, cells.weight
     return tuple(part.numpy() for part in parts)
-
-
-def _unknown(place: Crops, follower: FirstPass) -> Appearance:
-    """Return what is known of a ball without a map: where it is seen."""
-    fitter = first_fitter(place.views, place.radius_mm, follower.cells.table, FIRST_BLUR_PX)
-    lasting = Lasting.none(len(place.views))
-    return Appearance(fitter=fitter, still=fitter, lasting=lasting, score_min=0.0, right_score=1.0)

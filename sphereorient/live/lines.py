@@ -23,8 +23,8 @@ AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
 class FicTracLines:
-    """The 25 columns of FicTrac's table frame by frame, as `export --to fictrac` writes them of a whole track: its lab
-    is the animal's frame. A frame without a pose is NaN; after it the sequence counter begins anew.
+    """FicTrac's 25 columns frame by frame, as `export --to fictrac`; NaN without a pose, after which a new stretch
+    begins.
     """
 
     def __init__(self, axes: FicTracAxes) -> None:
@@ -35,9 +35,7 @@ class FicTracLines:
         self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
 
     def columns(self, number: int, time_s: float, R_lab_body: Floats, error_rad: float) -> Floats:
-        """Return the columns (25,) of the next frame: its number, time, orientation (3, 3), NaN without a pose, and
-        stated error.
-        """
+        """Return the columns (25,) of the next frame, R_lab_body (3, 3), NaN without a pose, and its stated error."""
         R_lab_body = self._axes.R_own_lab @ R_lab_body  # from here on the table's lab
         before, self._before = self._before, (time_s, R_lab_body)
         valid = math.isfinite(R_lab_body[0, 0])
@@ -73,16 +71,10 @@ class FicTracLines:
         return rows.ravel()
 
 
-def fictrac_line(columns: Floats) -> str:
-    """Return the columns of a frame as FicTrac writes them to a file."""
-    return ", ".join(f"{value:.14g}" for value in columns.tolist())
-
-
 class Quantities:
-    """What is known of each frame by name, with units; lengths are in mm or radii (`length_unit`). With the angular
-    velocity, and where the ball is not held in its place (`fixed`) its velocity, from this frame and those before it.
-    These begin anew where the ball was searched for, and are not known where the orientation is relative: its errors
-    grow, and are not stated. A `ball` of several is named.
+    """Quantities of each frame by name, with units; lengths are in mm or radii (`length_unit`); a `ball` of several is
+    named. Angular velocity, and velocity unless the ball is `fixed`, are from this frame and those before it; they
+    start again after a search, and are NaN where no errors are stated (relative orientations).
     """
 
     def __init__(self, fixed: bool, length_unit: str = "mm", ball: str = "") -> None:
@@ -133,7 +125,6 @@ class Quantities:
 
 
 def _states_errors(now: Measured) -> bool:
-    """Return whether there is a pose with errors."""
     return bool(np.isfinite(now.covariance).all())
 
 
@@ -154,7 +145,7 @@ class Told:
     @cached_property
     def fictrac(self) -> str:
         """A line of FicTrac's file."""
-        return fictrac_line(self.columns)
+        return ", ".join(f"{value:.14g}" for value in self.columns.tolist())
 
     @property
     def marked(self) -> str:

@@ -1,10 +1,10 @@
-"""The loop: each frame of a feed is measured from those before it, and told; and these frames as a track, by blocks."""
+"""Estimate the pose of each frame of a feed from the frames before it; and these frames as a track, by blocks."""
 
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Union
 
 import numpy as np
 import torch
@@ -27,7 +27,11 @@ from sphereorient.pose import CameraView
 from sphereorient.pose.poses import Poses, no_pose, pose_table, supported
 from sphereorient.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from sphereorient.live.learning import LearningTracker
+
 Floats = NDArray[np.float64]
+LiveTracker = Union["OnlineTracker", "LearningTracker"]
 
 SEARCH_S = 1.0  # from one long search to the next: the frames between must not wait for it
 MOST_MISSING = 100_000  # frames between two that are written as missing
@@ -53,9 +57,8 @@ class OnlineTracker:
         self._searched_s = math.nan  # time of the last long search
 
     def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
-        """Return the poses of each ball in the frame of a time, and whether it was searched for: the frames before say
-        nothing of it, or another thing. `shots`: a frame of each view. Where time does not go on, nothing is known
-        from before.
+        """Return the poses of each ball in the frame of a time, and whether it was searched for, since it was not
+        predicted, or not there. `shots`: a frame of each view. Where time does not increase, the history is dropped.
         """
         self.between()
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
@@ -93,7 +96,7 @@ class OnlineTracker:
         return self._look(shots, names, known, past)
 
     def between(self) -> None:
-        """Remember the last frame: what can wait until it was told."""
+        """Update the motion history; deferred until the pose has been sent."""
         for name, poses in self._last.items():
             chunk = self._chunks[name]
             chunk.saw(self._number, poses, self._tracker.balls[name].turns([chunk], [poses])[0])
@@ -134,60 +137,39 @@ class Measured:
         return float(np.sqrt(np.trace((self.covariance + self.lasting)[:3, :3])))
 
 
-class LiveTracker(Protocol):
-    """Follows balls frame by frame."""
-
-    number: int  # of the map in use
-    appearances: Mapping[str, Appearance]
-
-    def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
-        """Return the poses of each ball in the frame of a time, and whether they were searched for."""
-
-    def between(self) -> None:
-        """Do what can wait until the last frame was told."""
-
-
 def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
     """Yield the pose of each ball in each frame; frames of one source, in order."""
     before: Sequence[Frame] | None = None
     number: int | None = None  # of the frame before
     for arrival in frames:
         dropped = 0 if number is None else arrival.number - number - 1
-        shots = [
-            _shot(picture, None if before is None else before[c], view)
-            for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
-        ]
+        shots = []
+        for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True)):
+            if picture is None:
+                nothing = np.zeros(view.camera.image_size[::-1], np.uint8)
+                shots.append(Frame(shown=nothing, read=Reason.UNDECODABLE))
+            else:
+                shots.append(screened(picture, None if before is None else before[c].shown, view.background))
         for ball, (poses, searched) in tracker.next(arrival.time_s, shots).items():
-            yield _told(arrival, ball, poses, searched, dropped, tracker)
+            there, appearance = supported(poses), tracker.appearances[ball]
+            yield Measured(
+                ball=ball,
+                number=arrival.number,
+                time_s=arrival.time_s,
+                position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
+                R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
+                covariance=poses.covariance[0].numpy() if there else np.full((6, 6), np.nan),
+                lasting=appearance.lasting.of_use(poses.use).numpy(),
+                reason=poses.reason,
+                poses=poses,
+                map_number=tracker.number,
+                flags=_flags(poses, appearance) if there else 0,
+                found=searched and there,
+                dropped=dropped,
+                latency_s=time.perf_counter() - arrival.arrived_s,
+            )
         tracker.between()
         before, number = shots, arrival.number
-
-
-def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: CameraView) -> Frame:
-    if picture is None:
-        height, width = view.camera.image_size[::-1]
-        return Frame(shown=np.zeros((height, width), np.uint8), read=Reason.UNDECODABLE)
-    return screened(picture, None if before is None else before.shown, view.background)
-
-
-def _told(arrival: Arrival, ball: str, poses: Poses, found: bool, dropped: int, tracker: LiveTracker) -> Measured:
-    there, appearance = supported(poses), tracker.appearances[ball]
-    return Measured(
-        ball=ball,
-        number=arrival.number,
-        time_s=arrival.time_s,
-        position_lab_mm=poses.position_lab_mm[0].numpy() if there else np.full(3, np.nan),
-        R_lab_body=poses.R_lab_body[0].numpy() if there else np.full((3, 3), np.nan),
-        covariance=poses.covariance[0].numpy() if there else np.full((6, 6), np.nan),
-        lasting=appearance.lasting.of_use(poses.use).numpy(),
-        reason=poses.reason,
-        poses=poses,
-        map_number=tracker.number,
-        flags=_flags(poses, appearance) if there else 0,
-        found=found and there,
-        dropped=dropped,
-        latency_s=time.perf_counter() - arrival.arrived_s,
-    )
 
 
 def _flags(poses: Poses, learnt: Appearance) -> int:
@@ -244,15 +226,11 @@ class TrackBlocks:
             poses.append(now.poses if now.valid else no_pose(cameras, now.reason, now.poses.use))
             marks.append((self._segment if now.valid else -1, flags))
             self._last = now
-        return self._of(time_s, poses, marks)
-
-    def _of(self, time_s: list[float], poses: list[Poses], marks: list[tuple[int, int]]) -> Trajectory:
-        experiment, cameras = self.recording.experiment, self.recording.cameras
-        table = pose_table(poses, len(cameras))
+        table = pose_table(poses, cameras)
         choice = torch.where(table.mask.any(1), 0, -1)
         clock = torch.tensor(time_s, dtype=torch.float64)
         (learnt,) = self.tracker.appearances.values()
-        track = measured_track(experiment, clock, table, choice, learnt)
+        track = measured_track(self.recording.experiment, clock, table, choice, learnt)
         track, _ = with_errors(track, self.recording, learnt.lasting, compared=False)
-        segment, flags = np.array(marks, np.int64).T
-        return replace(track, segment=segment, flags=track.flags | flags.astype(np.uint32))
+        segment, more = np.array(marks, np.int64).T
+        return replace(track, segment=segment, flags=track.flags | more.astype(np.uint32))

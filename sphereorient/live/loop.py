@@ -38,11 +38,10 @@ class LiveSetUp:
 
 @contextmanager
 def open_live(
-    source: Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
+    source: Experiment | Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
 ) -> Iterator[LiveSetUp]:
-    """Open an experiment. Without a texture map, that of a ball that stays in its place is learnt meanwhile.
-    Raises SphereOrientError: missing, unreadable or inconsistent inputs; ExperimentError: cameras that contradict each
-    other, or no map of a ball that moves.
+    """Open an experiment. Without a texture map, that of a fixed ball is learnt meanwhile. Raises SphereOrientError:
+    unusable inputs; ExperimentError: cameras that contradict each other, or no map of a ball that moves.
     """
     experiment = load_experiment(source)
     if experiment.mapless and learnt is None:
@@ -96,9 +95,8 @@ def run_live(
     tell: Tell,
     fictrac: Path | None = None,
 ) -> Monitor:
-    """Track the frames of a source until it ends, or Ctrl-C, and return what was counted. `outputs`: with what each
-    takes of a frame, an attribute of `Told`; `tell` gets what the user must know, in lines; `fictrac`: see
-    `fictrac_axes`.
+    """Track the frames of a source until it ends, or Ctrl-C. `outputs`: each with the attribute of `Told` that it
+    takes; `tell` gets messages for the user; `fictrac`: see `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker
     first = next(iter(tracker.appearances))  # of several balls the page shows this one

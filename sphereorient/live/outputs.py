@@ -1,6 +1,5 @@
-"""Where lines and frames go: sockets, serial ports, LSL, files. A slow or dead reader loses lines; it holds nobody up.
-
-A new output is a class, and a line of `SOCKETS`, `NAMED` or `FILES`.
+"""Outputs: sockets, serial ports, LSL, files. A slow or dead reader loses lines; the loop never waits. A new output is
+a class, and a line of `SOCKETS`, `NAMED` or `FILES`.
 """
 
 import os
@@ -9,7 +8,6 @@ import socket
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
 from typing import IO, Any
@@ -120,7 +118,7 @@ class UdpOutput(Output):
         self._socket.setblocking(False)
 
     def send(self, thing: Any) -> None:
-        """Send a line; nobody may be there."""
+        """Send a line."""
         with suppress(OSError):
             self._socket.sendto(self._bytes(thing), self._to)
 
@@ -133,8 +131,8 @@ class UdpOutput(Output):
 
 
 class OscOutput(UdpOutput):
-    """OSC over UDP: a message /sphereorient a frame, of all numbers (`Told.numbers`) as int32 or float32, in order.
-    Raise OutputError: the package python-osc is missing, or no such host.
+    """OSC over UDP: a message /sphereorient a frame, all `Told.numbers` as int32 or float32. OutputError: no python-
+    osc, no host.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -149,9 +147,8 @@ class OscOutput(UdpOutput):
 
 
 class LslOutput(Output):
-    """A stream of LSL: a sample of float64 a frame, of all numbers (`Told.numbers`), with their names and units; the
-    least delayed of the last frames sets LSL's clock. It is announced on this machine alone, unless the variable
-    LSLAPICFG names a configuration of LSL.
+    """A stream of LSL: a sample of float64 a frame, of all numbers (`Told.numbers`), with names and units; the least
+    delayed of the last frames sets LSL's clock. Only this machine sees it, unless LSLAPICFG names a configuration.
     Raise OutputError: the package pylsl, or its library liblsl, is missing.
     """
 
@@ -190,8 +187,8 @@ class LslOutput(Output):
 
 
 class SharedOutput(Output):
-    """A ring of poses in a file that other programs map into memory (`shared`): all numbers (`lines.Quantities`). A
-    reader that is slow sees by their count that it lost some. Raise OutputError: there is such a file, or no folder.
+    """A ring of poses in memory (`shared`): all numbers of `lines.Quantities`. OutputError: there is such a file, or no
+    folder.
     """
 
     def __init__(self, address: str, tell: Tell) -> None:
@@ -207,8 +204,7 @@ class SharedOutput(Output):
 
 
 class SerialOutput(Output):
-    """A serial port, PORT@BAUD. `tell` gets a line where it fails, after which nothing is sent, and where lines come
-    faster than it takes them: then the oldest are lost.
+    """A serial port, PORT@BAUD. `tell` gets a line where it fails, or is too slow: then the oldest lines are lost.
     Raise OutputError: the package pyserial is missing, or no such port, one in use, or not a baud rate.
     """
 
@@ -245,9 +241,7 @@ class SerialOutput(Output):
 
 
 class ZmqOutput(Output):
-    """A PUB socket of ZeroMQ: each program that subscribes gets all further lines, less those that it is too slow for.
-    Raise OutputError: the package pyzmq is missing, or the port is in use.
-    """
+    """A PUB socket of ZeroMQ; a slow subscriber loses lines. OutputError: pyzmq is missing, or the port is in use."""
 
     def __init__(self, host: str, port: int) -> None:
         name = f"zmq:{host}:{port}"
@@ -293,7 +287,11 @@ class TcpOutput(Output):
                 connection, _ = self._server.accept()
             except OSError:  # closed
                 return
-            spool = Spool(partial(_send_all, connection))
+
+            def write(lines: list[Any], to: socket.socket = connection) -> None:
+                to.sendall(_joined(lines))
+
+            spool = Spool(write)
             self._readers = [*(reader for reader in self._readers if not reader[1].gone), (connection, spool)]
 
     def send(self, line: str) -> None:
@@ -316,18 +314,13 @@ def _taken(name: str, error: Exception) -> OutputError:
     return OutputError(refusal(name, expected="a free port", got=error_words(error), do=do))
 
 
-def _send_all(connection: socket.socket, lines: list[str]) -> None:
-    connection.sendall(_joined(lines))
-
-
 def _joined(lines: list[str]) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode()
 
 
 class FileOutput(Output):
-    """A new text file that grows by a line a frame; what is in it survives the end of the program.
-    `tell` gets one line where the disk takes no more, after which nothing is written, or was too slow.
-    Raise OutputError: there is such a file, or no folder for it.
+    """A new text file, a line a frame, flushed. `tell` gets a line where the disk is full or too slow. Raise
+    OutputError: there is such a file, or no folder for it.
     """
 
     def __init__(self, path: Path, tell: Tell, pause_s: float = 0.0) -> None:

@@ -73,17 +73,13 @@ REASONS = list(Reason)
 
 @dataclass(eq=False)
 class _Absence:
-    """Since when a ball is not found."""
-
     lost: tuple[float, Measured] | None = None  # time of the source, s, and the last frame without a pose
     told: bool = False
     in_a_row: int = 0  # frames with a pose
 
 
 class Monitor:
-    """Hands on the frames of a feed, waiting while it is stopped, and counts what was measured. A frame counts as lost
-    where one of several balls is.
-    """
+    """Yields the frames of a feed unless stopped, and counts them; a frame is lost where one of several balls is."""
 
     def __init__(self, feed: Feed, tell: Tell = lambda line: None) -> None:
         self.count = self.lost = 0
@@ -113,7 +109,6 @@ class Monitor:
         self._watch(self._absence[now.ball], now)
 
     def _watch(self, of: _Absence, now: Measured) -> None:
-        """Tell a ball that is not found for a while, and that it is found again."""
         of.in_a_row = of.in_a_row + 1 if now.valid else 0
         if now.valid:
             if of.in_a_row >= CONFIRMED:
@@ -161,9 +156,7 @@ class PageWriter:
         self._rings: tuple[SharedFrames, SharedFrames] | None = None
 
     def begin(self, recording: Recording, running: Event, save_map: Callable[[], str] | None) -> None:
-        """Begin with the frames of a recording: the page sets and clears `running`; `save_map` writes a map that is
-        learnt meanwhile and says so; None: no button.
-        """
+        """Begin with a recording: the page sets `running`; `save_map` writes a learnt map; None: no button."""
         poses = SharedFrames(self.folder / "poses", WORD * ROW, POSES)
         self._rings = poses, SharedFrames(self.folder / "pictures", _shown_bytes(recording), 4)
         self._blank = [np.zeros(stream.movie.frame_shape, stream.movie.dtype) for stream in recording.streams]
@@ -184,7 +177,6 @@ class PageWriter:
             pictures.write(now.time_s, [*shown, words, row])
 
     def _listen(self, running: Event, save_map: Callable[[], str] | None) -> None:
-        """Do what the page asks for."""
         with suppress(EOFError, OSError):
             while True:
                 word = self._commands.recv_bytes().decode()
@@ -251,7 +243,6 @@ def _obeyed(word: str, running: Event, save_map: Callable[[], str] | None) -> st
 def _serve(
     experiment: Path, cameras: Sequence[str] | None, folder: Path, token: str, door: socket.socket, commands: Connection
 ) -> None:
-    """Serve the page until the loop's process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
     if hasattr(os, "nice"):
         os.nice(10)  # tracking goes first

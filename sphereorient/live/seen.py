@@ -1,5 +1,5 @@
-"""Which cameras this machine sees. Drivers may hang, or end the program that asks them: each kind is asked by a process
-of its own, this file run as a program.
+"""Which cameras this machine sees. Drivers may hang, or end the program: each kind is asked by a process of its own,
+this file run as a program.
 """
 
 import os

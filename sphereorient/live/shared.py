@@ -35,9 +35,7 @@ POSES, POSE_BYTES = 4096, WORD * 33  # of a ring of poses: slots, and bytes of e
 
 
 class SharedFrames:
-    """Writes into a ring of `slots` of `size` bytes, and never waits; the file is removed at the end.
-    Raise OutputError: there is such a file, or no room for it.
-    """
+    """Writes into a ring of `slots` of `size` bytes, never waits. OutputError: the file exists, or no room for it."""
 
     def __init__(self, path: Path, size: int, slots: int = 16) -> None:
         length = WORD * (HEAD + slots) + slots * size
@@ -155,9 +153,8 @@ def shared_poses(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
 
 
 def shared_slots(path: Path, size: int) -> Iterator[Slot]:
-    """Yield the slots of a ring from the newest one on, each once; of those that were written over before they were
-    read the numbers are left out. Where another ring of this name takes its place, the numbers go on with that.
-    Raise MovieError: no such ring, or one of slots of another size.
+    """Yield the slots of a ring, from the newest one on; overwritten slots leave gaps in the numbering, which goes on
+    where another ring of this name replaces it. Raise MovieError: no such ring, or one of slots of another size.
     """
     before = 0  # slots of former rings
     while True:

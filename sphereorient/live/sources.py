@@ -1,6 +1,5 @@
-"""Where frames come from: movies, raw bytes of another program, cameras, a ring in memory.
-
-A new source is a function here or in a file of its own, and a line of `SOURCES`.
+"""Sources of frames: movies, raw bytes of another program, cameras, a ring in memory. A new source is a function, and a
+line of `SOURCES`.
 """
 
 import math
@@ -124,9 +123,7 @@ def source_of(name: str, tell: Tell) -> Source:
 
 
 def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
-    """Return a source whose frames are recorded as they come, tracked or not: in all movies, or in none. Pictures lie
-    there as in the experiment's movies: `flip` mirrors them on reading.
-    """
+    """Return a source whose frames are recorded as they come, in all movies or in none, flipped as the movies are."""
 
     def frames(recording: Recording) -> Iterator[Arrival]:
         how = [recording.experiment.flip.get(stream.name, "none") for stream in recording.streams]

@@ -56,9 +56,7 @@ NOT_TRACKED = Tracked()
 def track_stretch(
     experiment: Experiment, settings: Settings, learning: Future[Learnt], stretch: Sequence[MovieSample], first: int
 ) -> Tracked:
-    """Track a stretch of consecutive frames from the first one on with what was learnt, and judge cameras and balls.
-    `stretch` holds the frames of each camera.
-    """
+    """Track consecutive frames (of each camera) from the first one on with what was learnt; judge cameras and balls."""
     try:
         learnt = learning.result()
         # Each camera alone: a pose of both lies between what they say.
@@ -91,9 +89,7 @@ def track_stretch(
 
 
 def unsure(finding: Finding, experiment: Experiment, total: int) -> Finding:
-    """Return a fault as one that cannot be told where fewer than `ENOUGH` frames (`total`) give their own background.
-    They leave a trace of the ball in it, which moves outlines and poses.
-    """
+    """Downgrade a fault to "cannot tell" if too few frames (`total`) give a background: it shows the ball."""
     given = experiment.movie_paths.keys() <= experiment.background_paths.keys()
     if finding.severity is not FAULT or total >= ENOUGH or given:
         return finding

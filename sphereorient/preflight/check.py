@@ -16,7 +16,7 @@ from sphereorient.locate import expected_diameter_px, find_scenes
 from sphereorient.methods.proposers import as_near
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import cameras, movies, texture_map
-from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning, worst
+from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning
 from sphereorient.preflight.in_step import OffsetScan, liveliest_stretches, scan_offsets
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
 from sphereorient.preflight.scene import SceneView, look_at_scene
@@ -47,19 +47,15 @@ class Preflight:
 
     @property
     def severity(self) -> Severity:
-        """The worst of all findings."""
-        return worst(self.findings)
+        """The worst of all findings; OK if there are none."""
+        return max((one.severity for one in self.findings), key=list(Severity).index, default=Severity.OK)
 
 
 def preflight(
     experiment: Experiment | Path | str, settings: Settings | None = None, progress: Progress = silent
 ) -> Preflight:
-    """Check an experiment before a run: files, cameras, movies, ball, paint, light.
-
-    `settings` of the planned run, None: the defaults; `progress` gets stage, done, total.
-
-    Raises:
-        SphereOrientError: a file is missing or unreadable, or contradicts the others.
+    """Check an experiment before a run: files, cameras, movies, ball, paint, light; `settings`: of the planned run.
+    Raises SphereOrientError: a file is missing or unreadable, or contradicts the others.
     """
     settings = settings or Settings()
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
@@ -78,9 +74,7 @@ def preflight(
         planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
         both = image is not None and len(recording.streams) > 1
         learning = pool.submit(cameras.study, experiment, planned) if both else None
-        sampling = []
-        for stream in recording.streams:
-            sampling.append(pool.submit(_sample, recording, stream, sizes[stream.name], settings))
+        sampling = [pool.submit(_sample, recording, one, sizes[one.name], settings) for one in recording.streams]
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
         samples = tuple(one.result() for one in sampling)
@@ -115,7 +109,6 @@ def preflight(
 
 
 def _sample(recording: Recording, stream: CameraStream, size_px: float | None, settings: Settings) -> MovieSample:
-    """Return the sample of a camera, with the background and the place that `track` finds."""
     scene, empty = None, given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     with suppress(SphereOrientError):  # what a tracker would refuse is reported by the findings
         (scene,) = find_scenes(recording, stream, settings.refine.background_frames, settings.locate).values()

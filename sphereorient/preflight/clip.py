@@ -38,9 +38,9 @@ class Clip:
             self._pictures = {name: [one for one, _ in each if one is not None] for name, each in read.items()}
 
     def tracked(self, experiment: Experiment) -> Json:
-        """Track the clip as an experiment that differs in circles, masks, response and cameras says, without a map, by
-        the first pass of `track` and `live`, and what it shows adjusted together. Return counts and figures for people.
-        Raises SphereOrientError: nothing is found, or the ball does not turn.
+        """Track the clip with the circles, masks, response and cameras of another experiment, without a map, by the
+        first pass of `track` and `live`; adjust place and map. Return the numbers for the page. Raises
+        SphereOrientError: nothing is found, or the ball does not turn.
         """
         begun, settings = time.perf_counter(), Settings()
         with tempfile.TemporaryDirectory() as folder:
@@ -76,7 +76,6 @@ class Clip:
 
 
 def _light(pictures: Sequence[Grey], response: Response | None) -> Sequence[Grey]:
-    """Return pictures as a linear camera shows them, where the response is given."""
     if response is None or response.linear:
         return pictures
     full = float(np.iinfo(pictures[0].dtype).max)

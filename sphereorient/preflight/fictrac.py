@@ -57,8 +57,8 @@ class FicTracConfig:
     unread: tuple[str, ...]  # keys of the file that change nothing here
 
     def R_animal_cam(self, image_size: tuple[int, int]) -> Tensor:
-        """Return the rotation (3, 3) to the animal's axes: x ahead, y to the right, z down; ExperimentError where the
-        corners do not show it.
+        """Return the rotation (3, 3) to the animal's axes: x ahead, y right, z down; ExperimentError: corners do not
+        show it.
         """
         if self.plane is None:
             return so3.exp(torch.from_numpy(self.turn))
@@ -81,8 +81,8 @@ class FicTracConfig:
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
-    """Read config.txt; ExperimentError for another file, one that lacks movie, field of view or the animal's frame, or
-    one of a colour that is not taken over.
+    """Read config.txt; ExperimentError: another file, no movie, field of view or animal's frame, or a colour not
+    supported.
     """
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
     pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith(("#", "%")))
@@ -150,10 +150,10 @@ def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
 
 
 def fictrac_axes(camera: Camera, config: Path | None) -> FicTracAxes:
-    """Return the axes of FicTrac's table for the camera of an experiment: its lab, or with a config.txt those in which
-    FicTrac itself writes. Its "camera" looks along the line of sight to the ball's middle, and c2a_r turns this frame,
-    not the camera's, to its "lab". Raise ExperimentError: no such file, or one that does not state the ball's limb.
-    Source: FicTrac 2.1.2, Trackball.cpp (roi_to_cam_r, updatePath), geometry.cpp (circleFit_camModel).
+    """Return the axes of FicTrac's table for a camera: the experiment's lab, or with a config.txt FicTrac's own: its
+    "camera" looks at the ball's middle, and c2a_r turns that frame to its "lab". Raise ExperimentError: no such file,
+    or no limb in it. Source: FicTrac 2.1.2, Trackball.cpp (roi_to_cam_r, updatePath), geometry.cpp
+    (circleFit_camModel).
     """
     R_cam_lab = camera.R_cam_lab.numpy()
     if config is None:

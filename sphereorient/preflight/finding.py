@@ -1,4 +1,3 @@
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -33,8 +32,3 @@ def judged(title: str, measured: str, *complaints: tuple[bool, Severity, str]) -
 def warning(title: str, measured: str, advice: str) -> Finding:
     """Return a warning."""
     return judged(title, measured, (True, WARNING, advice))
-
-
-def worst(findings: Sequence[Finding]) -> Severity:
-    """Return the worst severity; OK if there are no findings."""
-    return max((finding.severity for finding in findings), key=list(Severity).index, default=Severity.OK)

@@ -100,9 +100,7 @@ class FirstLook:
 
 
 def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> FirstLook:
-    """Return a look at a ball that stays in its place, with its circle as others gave it (u, v, radius, px), which is
-    taken where the pictures together show none.
-    """
+    """Return a look at a fixed ball with a given circle (u, v, radius, px), used where the pictures show none."""
     if circle is None or look.together:
         return replace(look, stays=True, given=circle)
     return replace(look, stays=True, given=circle, outline=given_outline(circle), diameter_px=2 * circle[2])
@@ -111,8 +109,8 @@ def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> F
 def look_at(
     paths: Sequence[Path | str], progress: Progress = silent, shown: NDArray[np.bool_] | None = None
 ) -> list[FirstLook]:
-    """Look at the movies of one ball; raise MovieError for a movie that cannot be read.
-    `shown` (H, W) is False where something hides the ball of the only movie.
+    """Look at the movies of one ball; `shown` (H, W): False where something hides the ball of a single movie.
+    MovieError.
     """
     movies = [open_movie(path) for path in paths]
     each = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
@@ -185,8 +183,8 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
 def _again(
     pictures: NDArray[Any], outline: Outline, settings: LocateSettings, shown: NDArray[np.bool_] | None
 ) -> tuple[int, int, float]:
-    """Return in how many parts of pictures (n, H, W) a fixed ball is found, of how many, and by how much these outlines
-    differ from that of all, px.
+    """Return in how many parts of pictures (n, H, W) a fixed ball is found, of how many, and their largest distance,
+    px.
     """
     parts, circles = max(1, min(PARTS, len(pictures) // LEAST)), []
     for k in range(parts):
@@ -294,9 +292,7 @@ def field_key(look: FirstLook, vfov_deg: float | None) -> DraftKey:
 def camera_keys(
     look: FirstLook, field: DraftKey, R: Sequence[Sequence[float]] | None = None, model: str = "pinhole"
 ) -> list[DraftKey]:
-    """Return the keys of cameras.yaml for one camera of which at most the field of view, `field_key`, is known.
-    R: R_cam_lab, where the lab is not the camera's own frame; model: pinhole or fisheye.
-    """
+    """Return the keys of cameras.yaml for one camera, with the field of view of `field_key`; R: R_cam_lab, if known."""
     height, width = look.movie.frame_shape
     where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
     if field.value is not ...:

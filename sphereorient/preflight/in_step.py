@@ -117,7 +117,6 @@ def _finite(parts: Sequence[Tensor]) -> Tensor:
 
 
 def _trimmed_rms(values: Tensor) -> float:
-    """Return the rms without the largest tenth, possibly wrong outlines."""
     kept = values.abs().sort().values[: math.ceil(0.9 * len(values))]
     return float(kept.square().mean().sqrt())
 
@@ -135,22 +134,16 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
     return k - LATEST + 0.5 * (before - after) / bend, math.sqrt(max(0.0, here - (before - after) ** 2 / (8 * bend)))
 
 
-def shifts_of(scans: Sequence[OffsetScan]) -> dict[str, float]:
-    """Return by how many frames each movie is late, NaN: unknown: of two against the first, of more against most."""
-    late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
-    usual = median_low(value for value in late.values() if not math.isnan(value)) if len(scans) > 1 else 0.0
-    return {name: value - usual for name, value in late.items()}
-
-
 def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
-    """Judge whether the movies are synchronised, from scans of each other one against the first; `start` is that of
-    the experiment.
-    """
+    """Judge whether the movies are synchronised, from scans against the first one; `start`: of the experiment."""
     title, moved_px = "movies in step", max(scan.moved_px for scan in scans)
     if moved_px <= MOVES_PX:
         return judged(title, f"unknown: the ball moves {moved_px:.2f} px a frame across the lines of sight")
     scans = [scan for scan in scans if scan.moved_px > MOVES_PX]
-    late = shifts_of(scans)
+    late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
+    # Two movies: against the first; more: against most of them.
+    usual = median_low(value for value in late.values() if not math.isnan(value)) if len(scans) > 1 else 0.0
+    late = {name: value - usual for name, value in late.items()}
     if any(math.isnan(value) for value in late.values()):
         measured = f"unknown: within {LATEST} frames no shift makes the lines of sight meet"
         return warning(title, measured, "correct the findings on ball and lines of sight first, then check again")

@@ -1,5 +1,5 @@
-"""The server of the pages on which people mark what pictures show: masks, or fiducials of a plate.
-It answers this machine alone, to who knows the random token of its address.
+"""The server of the pages on which people mark what pictures show: masks, or fiducials of a plate. It answers this
+machine alone, to requests with the random token of its address.
 """
 
 from abc import ABC, abstractmethod

@@ -71,8 +71,8 @@ class FiducialMarking(Marking):
         }
 
     def view(self, picture: Picture, clicked: NDArray[np.float64] | None) -> Json:
-        """Return what a picture shows with these clicked places, None or (2 or 3, 2) px: all dots with their radii,
-        those that are identified, the fiducials among them, and why it is not tied.
+        """Return dots, identified points and fiducials of a picture with clicked places, None or (2 or 3, 2) px, as
+        JSON.
         """
         with self.lock:
             if picture not in self.dots:

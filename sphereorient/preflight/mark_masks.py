@@ -98,9 +98,7 @@ class MaskMarking(Marking):
         }
 
     def track(self, name: str, asked: Mapping[str, Any]) -> Json:
-        """Track the clip with the `shapes` of a mask, `keep`, and what else is given: `circle`, u, v, radius, px;
-        `light`, a value of the key response; `vfov_deg`. Raise SphereOrientError where one is impossible.
-        """
+        """Track the clip with `shapes` and `keep` of a mask, and `circle`, `light`, `vfov_deg` if given."""
         with self.lock, tempfile.TemporaryDirectory() as folder:
             return self.clip.tracked(self._changed(name, asked, Path(folder)))
 
@@ -228,10 +226,9 @@ class MaskMarking(Marking):
         return GreySearch(self._texture)
 
     def save(self, name: str, shapes: Sequence[Mapping[str, Any]], *, keep: bool) -> Json:
-        """Write the mask of a camera and name it in experiment.yaml; return what was done.
-        Shapes hide (`hide`) or are all that is shown (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px.
-        `keep`: what the old mask hides stays hidden. Raises ExperimentError (impossible shapes, or nothing would be
-        shown), OutputError (a file cannot be written).
+        """Write the mask of a camera and name it in experiment.yaml. Shapes hide (`hide`) or are all that is shown
+        (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px; `keep`: the old mask counts too. Raises
+        ExperimentError (impossible shapes, or nothing is shown), OutputError (a file cannot be written).
         """
         shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
         file = self.path.parent / f"{name}_mask.png"

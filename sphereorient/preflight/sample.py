@@ -103,10 +103,10 @@ def sample_movie(
     stays: bool = False,
 ) -> MovieSample:
     """Sample one camera's frames, background and ball; measure its diameter if None. `empty`: a picture without it;
-    `scene`: background and size as a tracker finds them, None where it finds none; `stays`: the ball is in its place.
-    Raises MovieError: no sampled frame can be decoded.
+    `scene`: background and size by the tracker; `stays`: the ball is in its place. Raises MovieError: no frame can be
+    decoded.
     """
-    read = _read(stream, SPREAD)
+    read = _read(stream, frames_to_sample(len(stream)))
     known = [one for one in read["picture"] if one is not None]
     shown = [one for one in known if not uniform(one)] or known
     if not shown:
@@ -133,7 +133,7 @@ def sample_movie(
         for times in MORE:  # it may pass by in a few frames
             if first.balls or len(first.frame) >= len(stream):
                 break
-            first = _searched(replace(first, **_read(stream, times * SPREAD)), settings)
+            first = sample_more(first, frames_to_sample(len(stream), times * SPREAD), settings)
     if (scene is not None or diameter_px is not None) and len(first.balls) > FEW * len(shown):
         return first
     # The size is unknown or wrong: take whatever is as round as a ball.
@@ -143,17 +143,14 @@ def sample_movie(
     return other if len(other.balls) > len(first.balls) else first
 
 
-def _read(stream: CameraStream, count: int) -> dict[str, Any]:
-    """Return frames and pictures of a sample."""
-    frame = np.asarray(frames_to_sample(len(stream), count), np.int64)
+def _read(stream: CameraStream, frames: Sequence[int]) -> dict[str, Any]:
+    frame = np.asarray(frames, np.int64)
     return {"frame": frame, "picture": tuple(pictures_of(stream.movie, stream.rows[frame]))}
 
 
 def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSettings) -> MovieSample:
     """Read other frames of the same camera, with the same background and size of the ball."""
-    frame = np.asarray(frames, np.int64)
-    picture = tuple(pictures_of(sample.stream.movie, sample.stream.rows[frame]))
-    return _searched(replace(sample, frame=frame, picture=picture), settings)
+    return _searched(replace(sample, **_read(sample.stream, frames)), settings)
 
 
 def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:

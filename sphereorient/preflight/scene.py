@@ -109,7 +109,6 @@ def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Findi
 
 
 def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:
-    """Return the disks in the pictures of one instant."""
     each, found = list(balls.values()), []
     for c, shot in enumerate(shots):
         sizes = [one.fitter.views[c].diameter_px for one in each]

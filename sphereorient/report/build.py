@@ -54,11 +54,9 @@ def write_report(
     command: str = "",
     behaviours: Mapping[str, Behaviour] | None = None,
 ) -> list[Verdict]:
-    """Write the report of tracks, by file name, whole or not at all, and return its findings.
-    `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
-    `behaviours`: those of tracks that have a reference.
-    Raises TrackError (no valid frame, or tracks of kernels and of smoothers together), ExperimentError (one without a
-    track, or two that contradict each other), OutputError (`out` cannot be written, or contains something else).
+    """Write the report of tracks, by file name, whole or not at all, and return its findings. `behaviours`: those of
+    tracks that have a reference. Raises TrackError (no valid frame, or tracks of kernels and of smoothers together),
+    ExperimentError (see `match_experiments`, `surroundings_of`), OutputError (see `check_report_folder`).
     """
     known = match_experiments(tracks, experiments)
     around = surroundings_of([experiment for experiment in known.values() if experiment is not None])
@@ -88,7 +86,7 @@ def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
     """Return the experiment of each track, of its sphere alone, or None; a single one belongs to a single track.
-    Raises ExperimentError: an experiment without a track or without its sphere, or two of one name.
+    Raises ExperimentError: one without a track or without its sphere, or two of one name.
     """
     if len(tracks) == 1 and len(experiments) == 1:
         return {name: experiments[0].of(track.sphere) for name, track in tracks.items()}
@@ -112,8 +110,8 @@ def match_experiments(
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
-    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other. Of spheres of
-    one recording that differ in size, no diameter is known.
+    """Return the properties of sphere and flow; ExperimentError: contradictions. Spheres of one recording that differ
+    in size have no diameter here.
     """
     known: dict[str, float] = {}
     sizes = {(one.path, one.diameter_mm) for one in experiments}
@@ -141,17 +139,15 @@ def uncorrected(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, N
 
 
 def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> Iterator[Plan]:
-    """Yield a figure of the paint that was not used, for each ball on which there is any."""
     drawn = set()
     for name, track in tracks.items():
         text, experiment = track.provenance.get(UNUSED_PAINT), experiments[name]
-        if text is None or text in drawn:
-            continue
-        drawn.add(text)
-        path = None if experiment is None else experiment.texture_path
-        draw = partial(worn_figure, worn_of_text(text), None if path is None else load_texture(path))
-        title = f"Paint{of_tracks([name], tracks)} that was not used"
-        yield f"unused_paint_{len(drawn)}", title, "It differs from the map.", draw
+        if text is not None and text not in drawn:
+            drawn.add(text)
+            path = None if experiment is None else experiment.texture_path
+            draw = partial(worn_figure, worn_of_text(text), None if path is None else load_texture(path))
+            title = f"Paint{of_tracks([name], tracks)} that was not used"
+            yield f"unused_paint_{len(drawn)}", title, "It differs from the map.", draw
 
 
 def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:

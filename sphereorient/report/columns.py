@@ -20,14 +20,11 @@ if TYPE_CHECKING:
 
 REASON = "why this camera has no orientation in the frame; ok where it has one"
 AXES: dict[tuple[int, ...], str] = {(3,): "xyz", (2,): "uv"}  # names of the components, by the shape of a frame's value
-PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of a symmetric matrix: xx xy xz yy yz zz
 FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadsheet programs compute
 
 
 def to_arrow(track: Trajectory) -> "pa.Table":
-    """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
-    Raise OutputError if pyarrow is not installed.
-    """
+    """Return a track as an Arrow table, a row a frame, with units and descriptions; OutputError without pyarrow."""
     arrow = package("pyarrow", "table")
     parts = list(columns(track))
     text = arrow.string()
@@ -42,35 +39,26 @@ def to_arrow(track: Trajectory) -> "pa.Table":
 def to_xarray(track: Trajectory) -> "xr.Dataset":
     """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
     Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
-    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN. Raise
-    OutputError if xarray is not installed.
+    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON. OutputError without xarray.
     """
     xarray = package("xarray", "table")
     own = {dataset.name: dataset for dataset in frame_wise(track)}
     time = own.pop("time")
-    made = {name: (_dims(dataset), dataset.values, dataset.about) for name, dataset in own.items()}
+    made = {name: (dataset.dims, dataset.values, dataset.about) for name, dataset in own.items()}
     for same in zip(*(frame_wise(camera) for camera in track.cameras.values()), strict=True):
         values = np.stack([each.values for each in same])
-        made[f"camera_{same[0].name}"] = (("camera", *_dims(same[0])), values, same[0].about)
+        made[f"camera_{same[0].name}"] = (("camera", *same[0].dims), values, same[0].about)
     if track.cameras:
         reason = np.array([[str(why) for why in camera.reason] for camera in track.cameras.values()])
         made["camera_reason"] = (("camera", "time"), reason, {"units": "1", "description": REASON})
     coordinates = {
         "time": (("time",), track.time, time.about),
-        "axis": list("xyz"),
-        "axis_2": list("xyz"),
-        "body_axis": list("xyz"),
+        **{axis: list("xyz") for axis in ("axis", "axis_2", "body_axis")},
         **({"camera": list(track.cameras), "image_axis": list("uv")} if track.cameras else {}),
     }
     about = {key: value if isinstance(value, str | float) else as_text(value) for key, value in metadata(track).items()}
     named: xr.Dataset = xarray.Dataset(made, coords=coordinates, attrs=about)
     return named
-
-
-def _dims(dataset: "Dataset") -> tuple[str, ...]:
-    second = "body_axis" if dataset.rotation else "axis_2"
-    named = {(): (), (2,): ("image_axis",), (3,): ("axis",), (3, 3): ("axis", second)}
-    return ("time", *named[dataset.values.shape[1:]])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,6 +76,12 @@ class Dataset:
         return self.values.shape[1:] == (3, 3) and self.units == "1"
 
     @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of its axes."""
+        first = "image_axis" if self.values.shape[1:] == (2,) else "axis"
+        return ("time", first, "body_axis" if self.rotation else "axis_2")[: self.values.ndim]
+
+    @property
     def about(self) -> dict[str, str]:
         """Units and description, for the attributes of other formats."""
         return {"units": self.units, "description": self.description}
@@ -102,8 +96,8 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
 
 
 def columns(track: Trajectory) -> Iterator[Dataset]:
-    """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
-    Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
+    """Yield the columns of a track, then of each camera: components (position_x_mm), pairs (position_cov_xy_mm2),
+    quaternions.
     """
     for dataset in frame_wise(track):
         yield from _split(dataset, "")
@@ -120,7 +114,8 @@ def _split(dataset: Dataset, prefix: str) -> Iterator[Dataset]:
         stem = prefix + dataset.name.replace("orientation", "quat", 1)
         parts = {f"{stem}_{axis}": column for axis, column in zip("wxyz", quaternions_wxyz(values).T, strict=True)}
     elif tail == (3, 3):
-        parts = {f"{name}_{'xyz'[i]}{'xyz'[j]}": values[:, i, j] for i, j in PAIRS}
+        pairs = combinations_with_replacement(range(3), 2)  # of a symmetric matrix: xx xy xz yy yz zz
+        parts = {f"{name}_{'xyz'[i]}{'xyz'[j]}": values[:, i, j] for i, j in pairs}
     elif tail in AXES:
         parts = {f"{name.removesuffix('_px')}_{axis}": values[:, k] for k, axis in enumerate(AXES[tail])}
     for stem, column in parts.items():

@@ -1,7 +1,6 @@
 """A track for other programs: tables, MATLAB; of poses FicTrac's table, TUM's, VTK for ParaView, NWB, netCDF."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.walk import FicTracAxes, fictrac_rows, walk_of
 
 ROWS = 50_000  # written at once
-TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
 Floats = NDArray[np.float64]
 Advance = Callable[[int, int], None]
 
@@ -35,7 +33,7 @@ def export_track(
     """
     write, *_ = FORMATS[format_of(path, to)]
     with put_aside(path) as aside:
-        write(Export(track=track, path=aside, progress=progress, axes=axes))
+        write(track, aside, progress, axes)
 
 
 def format_of(path: Path, to: str | None) -> str:
@@ -55,52 +53,39 @@ def format_of(path: Path, to: str | None) -> str:
     return to or str(by_name)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Export:
-    """A track on its way into a file."""
-
-    track: Trajectory
-    path: Path
-    progress: Advance
-    axes: FicTracAxes | None
-
-
-def _write_csv(job: Export) -> None:
-    parts = list(table.columns(job.track))
-    about = table.metadata(job.track)
+def _write_csv(track: Trajectory, path: Path, progress: Advance, _: object) -> None:
+    parts, about = list(table.columns(track)), table.metadata(track)
     settings = about.pop("settings")
     lines = [f"{key}: {' '.join(table.as_text(value).split())}" for key, value in about.items()]
     lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
     lines = ["made by sphereorient", *lines, *(f"  {line}" for line in settings.splitlines())]
     # Every program reads 1 and 0.
     values = [part.values.astype(np.int8) if part.values.dtype == bool else part.values for part in parts]
-    with job.path.open("w", encoding="utf-8", newline="\n") as file:
+    with path.open("w", encoding="utf-8", newline="\n") as file:
         for line in lines:
             file.write(table.FORMULA.sub(r"\1'\2", f"# {line}".rstrip()) + "\n")
         file.write(",".join(part.name for part in parts) + "\n")
-        for first in range(0, len(job.track), ROWS):
+        for first in range(0, len(track), ROWS):
             rows = zip(*(column[first : first + ROWS].tolist() for column in values), strict=True)
             file.writelines(",".join(map(str, row)) + "\n" for row in rows)
-            job.progress(min(first + ROWS, len(job.track)), len(job.track))
+            progress(min(first + ROWS, len(track)), len(track))
 
 
-def _write_parquet(job: Export) -> None:
-    content = table.to_arrow(job.track)
+def _write_parquet(track: Trajectory, path: Path, progress: Advance, _: object) -> None:
+    content = table.to_arrow(track)
     import pyarrow.parquet as arrow_parquet
 
-    with arrow_parquet.ParquetWriter(job.path, content.schema, compression="zstd") as writer:
+    with arrow_parquet.ParquetWriter(path, content.schema, compression="zstd") as writer:
         for first in range(0, max(len(content), 1), ROWS):
             part = content.slice(first, ROWS)
             writer.write_table(part)
-            job.progress(first + len(part), len(content))
+            progress(first + len(part), len(content))
 
 
-def _write_mat(job: Export) -> None:
+def _write_mat(track: Trajectory, path: Path, *_: object) -> None:
     """Write MATLAB 5: arrays with the frames along their first axis, structs for cameras and metadata."""
     from scipy.io import savemat
 
-    track = job.track
-    job.progress(0, len(track))  # SciPy writes in one step
     content = _mat_arrays(track)
     seen = table.safe_names(track).items()
     content["cameras"] = {name: _mat_arrays(camera) | {"reason": table.reasons(camera)} for name, camera in seen}
@@ -111,12 +96,10 @@ def _write_mat(job: Export) -> None:
         "provenance": table.as_text(about["provenance"]),
         "units": {table.with_unit(each.name, each.units): each.units for each in table.frame_wise(track)},
     }
-    savemat(job.path, content, long_field_names=True, do_compression=True, oned_as="column")
-    job.progress(len(track), len(track))
+    savemat(path, content, long_field_names=True, do_compression=True, oned_as="column")
 
 
 def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
-    """Return arrays by name with unit; rotations as matrices and quaternions (quat_wxyz for orientation)."""
     arrays: dict[str, Any] = {}
     for dataset in table.frame_wise(record):
         arrays[table.with_unit(dataset.name, dataset.units)] = dataset.values
@@ -154,28 +137,26 @@ def fictrac_table(track: Trajectory, axes: FicTracAxes) -> Floats:
     )
 
 
-def _write_fictrac(job: Export) -> None:
-    """Write FicTrac's table of a ball in its place."""
-    if job.axes is None:
+def _write_fictrac(track: Trajectory, path: Path, _: object, axes: FicTracAxes | None) -> None:
+    if axes is None:
         do = "add --experiment experiment.yaml: the table has the camera's axes"
         raise OutputError(refusal("--to fictrac", expected="the experiment of the track", got="none", do=do))
-    np.savetxt(job.path, fictrac_table(job.track, job.axes), fmt="%.14g", delimiter=", ")
+    np.savetxt(path, fictrac_table(track, axes), fmt="%.14g", delimiter=", ")
 
 
-def _write_tum(job: Export) -> None:
+def _write_tum(track: Trajectory, path: Path, *_: object) -> None:
     """Write time, position and quaternion x y z w of each valid frame, as evo and rpg_trajectory_evaluation read it."""
-    track = job.track
     w, xyz = np.split(quaternions_wxyz(track.orientation[track.valid]), [1], axis=1)
     rows = np.column_stack([track.time[track.valid], track.position[track.valid], xyz, w])
     header = f"time_s x_{track.length_unit} y z qx qy qz qw (R_lab_body); made by sphereorient"
-    np.savetxt(job.path, rows, fmt="%.17g", header=header)
+    np.savetxt(path, rows, fmt="%.17g", header=header)
 
 
-def _write_vtk(job: Export) -> None:
+def _write_vtk(track: Trajectory, path: Path, *_: object) -> None:
     """Write VTKHDF, a time series for ParaView: the ball's centre, a point in each valid frame, with its vectors.
     Source: the file format of VTK 9.3, transient poly data.
     """
-    track, some = job.track, job.track.valid
+    some = track.valid
     count, R = int(some.sum()), track.orientation[some]
     parts = {
         **{f"body_{axis}": R[:, :, k] for k, axis in enumerate("xyz")},
@@ -186,7 +167,7 @@ def _write_vtk(job: Export) -> None:
         "flags": track.flags[some].astype(np.int64),
     }
     frame, zeros = np.arange(count), np.zeros(count, np.int64)
-    with h5py.File(job.path, "w") as file:
+    with h5py.File(path, "w") as file:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array([2, 0])
         root.attrs.create("Type", np.bytes_("PolyData"), dtype=h5py.string_dtype("ascii", 8))
@@ -200,7 +181,7 @@ def _write_vtk(job: Export) -> None:
         # Each part has one vertex, and nothing else.
         vertex = np.stack([frame, zeros, zeros, zeros], axis=1)
         steps["CellOffsets"], steps["ConnectivityIdOffsets"] = vertex, vertex
-        for topology in TOPOLOGIES:
+        for topology in ("Vertices", "Lines", "Polygons", "Strips"):
             group, one = root.create_group(topology), int(topology == "Vertices")
             group["NumberOfCells"] = group["NumberOfConnectivityIds"] = np.full(count, one, np.int64)
             group["Offsets"] = np.tile([0, 1], count) if one else np.zeros(count, np.int64)
@@ -210,12 +191,12 @@ def _write_vtk(job: Export) -> None:
             data[name], offsets[name] = values, frame
 
 
-def _write_nwb(job: Export) -> None:
+def _write_nwb(track: Trajectory, path: Path, *_: object) -> None:
     """Write Neurodata Without Borders: rotation, angular velocity, position and the walk as time series; SI units."""
     pynwb = package("pynwb", "nwb")
     from datetime import UTC, datetime
 
-    track, walk = job.track, job.track.walk()
+    walk = track.walk()
     about = f"{track.title}: {track.method} method of sphereorient"
     # The recording's date is not in a track: the epoch says so.
     begin = datetime(1970, 1, 1, tzinfo=UTC)
@@ -235,18 +216,18 @@ def _write_nwb(job: Export) -> None:
     }
     for name, (values, units, description) in series.items():
         module.add(pynwb.TimeSeries(name=name, data=values, unit=units, timestamps=track.time, description=description))
-    with pynwb.NWBHDF5IO(str(job.path), "w") as io:
+    with pynwb.NWBHDF5IO(str(path), "w") as io:
         io.write(file)
 
 
-def _write_netcdf(job: Export) -> None:
+def _write_netcdf(track: Trajectory, path: Path, *_: object) -> None:
     """Write netCDF 3, all arrays with named axes and units."""
-    data = table.to_xarray(job.track)
+    data = table.to_xarray(track)
     data = data.assign({name: data[name].astype("int32") for name in ("flags", "segment", "valid")})
-    data.to_netcdf(job.path, engine="scipy")
+    data.to_netcdf(path, engine="scipy")
 
 
-FORMATS: dict[str, tuple[Any, ...]] = {  # what writes it (of an `Export`), and the suffixes of its files
+FORMATS: dict[str, tuple[Any, ...]] = {  # what writes it, of track, path, progress and axes; the suffixes of its files
     "csv": (_write_csv, ".csv"),
     "parquet": (_write_parquet, ".parquet", ".pq"),
     "mat": (_write_mat, ".mat"),

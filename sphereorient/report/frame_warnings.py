@@ -106,7 +106,6 @@ def choose_worst(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
 
 
 def _kinds(track: Trajectory) -> Iterator[Ranked]:
-    """Yield the bad frames of each kind of problem."""
     yield _gaps(track)
     yield _flags(track)
     apart = _cameras_apart_deg(track)
@@ -203,13 +202,12 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
     codes, words = _reason_codes(track)
     apart = _cameras_apart_deg(track)
 
-    def first(wanted: NDArray[np.bool_]) -> Ints:
-        """Return the first such frame of every bin; else the first of the bin."""
-        found = np.minimum.reduceat(np.where(wanted, rows, len(track)), starts)
-        return np.where(found < len(track), found, starts)
-
     def largest(values: Floats) -> Floats:
         return np.asarray(np.fmax.reduceat(values, starts), np.float64)
+
+    def first(wanted: NDArray[np.bool_]) -> Ints:  # else the first of the bin
+        found = np.minimum.reduceat(np.where(wanted, rows, len(track)), starts)
+        return np.where(found < len(track), found, starts)
 
     row = first(status == np.repeat(np.maximum.reduceat(status, starts), size)[: len(track)])
     return {
@@ -259,9 +257,8 @@ def bad_stretches(track: Trajectory) -> list[BadStretch]:
         inside = slice(first, last + 1)
         *_, doubtful, not_valid = np.bincount(status[inside], minlength=len(STATUS_WORDS)).tolist()
         shown = status[inside] != NO_BALL
-        counts = {words: int(there[inside][shown].sum()) for words, there in doubts.items()}
-        counted = Counter({words: count for words, count in counts.items() if count})
-        reasons = tuple(counted.most_common())
+        counts = Counter({words: int(there[inside][shown].sum()) for words, there in doubts.items()})
+        reasons = tuple((words, count) for words, count in counts.most_common() if count)
         found.append(BadStretch(first=first, last=last, doubtful=doubtful, not_valid=not_valid, reasons=reasons))
     return sorted(found, key=lambda stretch: (-stretch.frames, -stretch.not_valid, stretch.first))
 

@@ -67,8 +67,7 @@ def gallery(
     track: Trajectory, experiment: Experiment, count: int, progress: Progress = lambda done, total: None
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
-    Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another
-    experiment, MovieError for a movie that cannot be opened.
+    Raise the errors of `overlay.prepared`.
     """
     why = chosen_frames(track, count)
     rows, frames = np.array(sorted(why), dtype=np.int64), {}
@@ -87,9 +86,8 @@ def gallery(
 
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
-    """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
-    The worst frame is first, then the middles of the longest stretches. Two thirds are bad frames; good ones, spread
-    evenly, serve to compare.
+    """Choose at most `count` frames to show; return the reasons by row, in the order of the choice: the worst frame,
+    the middles of the longest stretches, other bad frames, two thirds in all; then good ones, spread evenly.
     """
     status = quality.status_of(track)
     good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status >= quality.DOUBTFUL)
@@ -138,7 +136,7 @@ def worst_frames(
     progress: Progress = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
     """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
-    Raise the errors of `gallery`, and OutputError for another suffix or a file that cannot be written.
+    Raise the errors of `overlay.prepared`, and OutputError for another suffix or a file that cannot be written.
     """
     check_ending(path, "--worst", SUFFIXES)
     bad = quality.choose_worst(track, count)
@@ -172,7 +170,6 @@ def worst_frames(
 
 
 def _pairs_size(page: Page) -> tuple[int, int]:
-    """Return width and height of the drawing of `_draw_pairs`, px."""
     return 2 * len(page.cameras) * (TILE + GAP) - GAP, TILE
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sphereorient.calibration.calibrated import Calibrated, PictureReport
 from sphereorient.calibration.comparison import LATEST
+from sphereorient.experiment.recording import spread_frames
 from sphereorient.files.picture import decoded_grey
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import BRIGHT_QUANTILE, Survey, SurveyedFrame
@@ -20,7 +21,7 @@ from sphereorient.preflight import Finding, Preflight, Severity
 from sphereorient.preflight.cameras import expected_outline_px, sample_positions
 from sphereorient.preflight.first_look import FirstLook
 from sphereorient.preflight.sample import MovieSample
-from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, say_empty, spread, write_figure
+from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, say_empty, write_figure
 from sphereorient.report.texture_map import draw_map
 
 Floats = NDArray[np.float64]
@@ -84,7 +85,7 @@ def calibration_figure(result: Calibrated, path: Path) -> None:
     axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)
     for row, name in zip(axes, names, strict=True):
         used = [one for one in result.pictures if one.picture.camera == name and not one.reason]
-        chosen = [used[k] for k in spread(len(used), SHOWN)]
+        chosen = [used[k] for k in spread_frames(range(len(used)), SHOWN)]
         for ax in row:
             ax.grid(visible=False)
         for ax, one in zip(row, chosen, strict=False):
@@ -213,7 +214,6 @@ def _cameras_part(part: Any, result: Preflight) -> None:
 
 
 def _scene_part(part: Any, result: Preflight) -> None:
-    """Draw a picture of each camera with all disks, and the names of the balls found."""
     for ax, view in zip(part.subplots(1, max(1, len(result.scene)), squeeze=False)[0], result.scene, strict=False):
         _show(ax, view.picture)
         for outline in view.disks:

@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, OutputError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
-from sphereorient.experiment.recording import CameraStream, given_mask, pictures_of
+from sphereorient.experiment.recording import CameraStream, given_mask, pictures_of, spread_frames
 from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Movie
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
-from sphereorient.report.plots.style import spread
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Tracks, Trajectory
+from sphereorient.trajectory.datasets import nearest_rows
 
 SAMPLE = 16  # frames from which light and brightness are taken
-NEAR_FRAMES = 0.5  # frames: largest distance in time of a picture from the track's frame
 DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures that are shown black and white
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 Rows = NDArray[np.int64]
@@ -35,7 +34,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSelection:
-    """The frames and cameras of an overlay; made by the command."""
+    """The frames and cameras of an overlay."""
 
     cameras: Sequence[str] | None = None  # names; None: those of the track
     first: int | None = None  # the experiment's number; None: from the first frame
@@ -62,10 +61,9 @@ def overlay_movie(
     fps: float = 25.0,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
-    All spheres, by name, are drawn into the same frames. Raise ExperimentError for a camera that track or experiment do
-    not have, TrackError if no frame of the track is in the range, OutputError for a suffix that is not a movie's, or a
-    file that cannot be written.
+    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual, all spheres in the same frames;
+    return the number of pictures. Raise the errors of `prepared` and `write_video`, and TrackError if no frame of the
+    track is in the range.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
@@ -87,7 +85,9 @@ def prepared(
     cameras: Sequence[str] | None,
     opened: ExitStack,
 ) -> tuple[Page, dict[str, CameraStream]]:
-    """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them."""
+    """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them.
+    Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another one.
+    """
     known = list(Tracks.of(tracks).values())
     names = list(known[0].cameras) if cameras is None else list(cameras)
     for name in names:
@@ -111,16 +111,10 @@ def prepared(
 def streams_of(
     track: Trajectory, experiment: Experiment, names: Sequence[str], opened: ExitStack
 ) -> tuple[Rows, dict[str, CameraStream]]:
-    """Find a track's frames by time: their numbers (N,), and the streams by camera; `opened` closes them.
-    Raise TrackError if no frame is found.
-    """
+    """Find a track's frames by time: their numbers (N,), and the streams by camera; TrackError if there are none."""
     movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
     known = timeline(experiment, movies)
-    after = np.searchsorted(known.time_s, track.time).clip(1, max(len(known) - 1, 1))
-    low, high = after - 1, np.minimum(after, len(known) - 1)
-    at = np.where(np.abs(known.time_s[high] - track.time) < np.abs(known.time_s[low] - track.time), high, low)
-    step = known.frame_s if len(known) > 1 else np.inf
-    near = np.abs(known.time_s[at] - track.time) <= NEAR_FRAMES * step
+    at, near = nearest_rows(known.time_s, track.time)
     if not near.any():
         got = "none" if not len(track) else f"times {track.time[0]:.4g} .. {track.time[-1]:.4g} s"
         expected = f"frames at {known.time_s[0]:.4g} .. {known.time_s[-1]:.4g} s as in {experiment.path}"
@@ -156,7 +150,7 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
     readable = stream.rows != NONE
     good = np.flatnonzero(readable & track.valid & model.path.whole)
     sampled = good if len(good) else np.flatnonzero(readable)
-    chosen = sampled[spread(len(sampled), SAMPLE)]
+    chosen = sampled[spread_frames(range(len(sampled)), SAMPLE)]
     pictures = [(k, found[stream.name]) for k, found in pictures_by_row({stream.name: stream}, chosen)]
     known = [(k, picture) for k, picture in pictures if picture is not None]
     greys = np.concatenate([np.zeros(0), *(picture[::3, ::3].ravel() for _, picture in known)])

@@ -161,9 +161,7 @@ def lit_picture(light: DiskLight, seen: SeenDisk, filmed: NDArray[np.float32] | 
 
 
 def fit_light(pairs: Iterable[tuple[SeenDisk, NDArray[np.float32]]]) -> DiskLight | None:
-    """Fit one light to all given frames of one camera (model, crop in grey levels); None if too few pixels are known.
-    It has no noise, glints or stray light, which a crop is not compared with.
-    """
+    """Fit one light to all frames of one camera (model, crop in grey levels); None if too few pixels are known."""
     # One light for all frames: a fit of each frame would hide a part of a wrong orientation.
     light, count = DiskLight.unknown(1, torch.zeros(1, 4)), 0
     unknowns = 2 * light.difference.shape[1]

@@ -191,9 +191,7 @@ class Ball:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Page:
-    """Draws frames of the tracks of a recording, all in one layout; made by `overlay.prepared`.
-    Beside the frame of each camera, every sphere has a row of panels: crop, re-rendered, residual.
-    """
+    """Draws each camera's frame of a recording, with crop, re-rendered picture and residual of every sphere."""
 
     numbers: NDArray[np.int64]  # (N,), the experiment's numbers of the frames
     balls: Sequence[Ball]  # with the same times and cameras
@@ -370,8 +368,8 @@ def draw_pictures(
     window: CropWindow,
     others: Sequence[OverlayView] = (),
 ) -> bool:
-    """Show crop, re-rendered sphere and, in a third panel, residual; return whether the sphere could be rendered.
-    `others`: of the same camera, spheres that may hide it or stand behind it.
+    """Show crop, re-rendered sphere (with `others` of the camera) and, in a third panel, residual; return whether
+    rendered.
     """
     grey = None if picture is None else crop(picture, window)
     if grey is not None:

@@ -27,9 +27,8 @@ Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells;
 
 
 def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, **parts: Any) -> str:
-    """Return the page of a report, from statistics, tracks by the name of their file, and the command that made it.
-    `parts`: verdicts; figures (name, title, caption, png in base64, width in px); tables that were written, and the
-    suffixes of their files; strips, HTML of `strip_html`.
+    """Return the page of a report, from statistics, tracks by file name, and the command. `parts`: verdicts; figures
+    (name, title, caption, png in base64, width in px); tables, and the suffixes of their files; strips (HTML).
     """
     css, js = strip_assets()
     tables = {table.name: table for table in parts["tables"]}
@@ -127,7 +126,6 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
 
 
 def _each(tracks: Table) -> Grid:
-    """Return the tracks side by side, in the order of their names on the command line."""
     shown = {
         "frames": "frames",
         "valid": "valid",

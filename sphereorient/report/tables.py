@@ -74,9 +74,8 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
 def behaviour_tables(found: Mapping[str, Behaviour]) -> list[Table]:
     """Return the table of gain, drift and walk against a reference, by file name; none where there is none."""
     rows = [row for name, one in found.items() for row in _rows(file=name, **one.columns())]
-    return (
-        [Table(name="behaviour", about="gain, drift and walk against the reference, 95 %", rows=rows)] if rows else []
-    )
+    about = "gain, drift and walk against the reference, 95 %"
+    return [Table(name="behaviour", about=about, rows=rows)] if rows else []
 
 
 def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import TextureMap
+from sphereorient.experiment.recording import TextureMap, spread_frames
 from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
@@ -25,7 +25,7 @@ from sphereorient.pose.worn import worn_share, worn_texels
 from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import contrast, crop, lit_picture
 from sphereorient.report.overlay_page import RESIDUAL_REACH, crop_side
-from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note, spread
+from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure, note
 from sphereorient.sphere.compare import MapComparison
 from sphereorient.sphere.texture import seen_path, texel_areas
 from sphereorient.trajectory import Trajectory
@@ -110,7 +110,7 @@ def compare_pictures(learnt: LearntMap, track: Trajectory, experiment: Experimen
         page, streams = prepared(track, experiment.with_sphere(texture_path=texture), None, opened)
         rows = np.flatnonzero(learnt.paint.isfinite().any(1).numpy() & track.valid)
         rows = rows if len(rows) else np.flatnonzero(track.valid)
-        for k, pictures in pictures_by_row(streams, rows[spread(len(rows), EXAMPLES)]):
+        for k, pictures in pictures_by_row(streams, rows[spread_frames(range(len(rows)), EXAMPLES)]):
             for view in page.balls[0].views:
                 picture = pictures[view.name]
                 if picture is None or view.light is None:
@@ -149,7 +149,7 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
     axes.semilogy(np.arange(1, len(moved) + 1), moved, color="black", marker="o")
     axes.set(xlabel="round", ylabel="degrees", title="attitudes' moves, rms")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    for column, chosen in enumerate(spread(len(compared), EXAMPLES).tolist()):
+    for column, chosen in enumerate(spread_frames(range(len(compared)), EXAMPLES)):
         _draw_example([figure.add_subplot(grid[row, column]) for row in (1, 2, 3)], compared[chosen], column == 0)
     note(
         figure,
@@ -177,9 +177,7 @@ def _draw_example(rows: Sequence[Axes], example: MapExample, first: bool) -> Non
 
 
 def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
-    """Draw a texture map (H, 2 H), longitude to the right, latitude upwards, degrees, NaN as sand; grey from 0 to 1
-    unless `style` (of `imshow`) differs.
-    """
+    """Draw a texture map (H, 2 H) over degrees, NaN as sand; grey from 0 to 1 unless `style` (of `imshow`) differs."""
     shown = {"cmap": "gray", "extent": EXTENT} | ({} if "norm" in style else {"vmin": 0, "vmax": 1}) | style
     drawn = axes.imshow(np.ma.masked_invalid(values.numpy()), **shown)
     axes.set(xlim=EXTENT[:2], ylim=EXTENT[2:], xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])
@@ -225,7 +223,6 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
 
 
 def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
-    """Draw the displacements; return their magnification."""
     known = torch.isfinite(comparison.moved_rad).all(-1)
     if not known.any():
         return 1.0

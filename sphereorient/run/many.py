@@ -76,8 +76,8 @@ def end_with_parent() -> None:
 
 
 class DaskExecutor:
-    """The workers of a Dask cluster (`distributed.Client`); they must see the same files under the same names.
-    `cluster`: closed together with the connection; None: it continues for others.
+    """The workers of a Dask cluster (`distributed.Client`) with the same files; `cluster`: closed too, None: it goes
+    on.
     """
 
     def __init__(self, client: Any, cluster: Any = None) -> None:
@@ -110,21 +110,17 @@ Executor = ProcessExecutor | DaskExecutor
 
 
 def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
-    """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
-    Raises SettingsError: Dask is not installed, or the scheduler does not answer.
+    """Connect to Dask: tcp://host:8786, its scheduler file (.json), or `local`. SettingsError: not installed, no
+    answer.
     """
     distributed = package("distributed", "cluster", SettingsError)
-    join = distributed.Client
+    local = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
     try:
         if cluster == "local":
-            count = workers or os.cpu_count() or 1
-            here = distributed.LocalCluster(
-                n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-            )
-            return DaskExecutor(join(here), here)
-        if cluster.endswith(".json"):
-            return DaskExecutor(join(scheduler_file=cluster, timeout=20))
-        return DaskExecutor(join(cluster, timeout=20))
+            here = distributed.LocalCluster(n_workers=workers or os.cpu_count() or 1, **local)
+            return DaskExecutor(distributed.Client(here), here)
+        file = "scheduler_file" if cluster.endswith(".json") else "address"
+        return DaskExecutor(distributed.Client(**{file: cluster}, timeout=20))
     except (OSError, TimeoutError, ValueError) as error:
         do = "start one (docs/long-runs.md), and name its scheduler's address"
         name, got = f"--cluster {cluster}", error_words(error)
@@ -204,10 +200,10 @@ def do_task(request: Request, run_id: str, task: Task) -> Any:
 def run_many(
     requests: Sequence[Request], executor: Executor, *, resume: bool = False, progress: Progress = silent
 ) -> list[Outcome]:
-    """Track experiments on the workers of an executor; return the outcomes in the order of the requests.
-    Each track equals that of a single process to the last bit; failures and dead workers do not stop the others. The
-    executor is closed. `resume` continues from stores; `progress` gets a track's name, frames done and all frames.
-    Raises SettingsError: two requests have the same track.
+    """Track experiments on the workers of an executor, which is closed; return the outcomes in the order of the
+    requests. Tracks equal those of a single process to the last bit; failures and dead workers do not stop the others.
+    `resume` continues from stores; `progress` gets a track's name, frames done and all frames. Raises SettingsError:
+    two requests have the same track.
     """
     outs = [request.track.resolve() for request in requests]
     if twice := [str(out) for k, out in enumerate(outs) if out in outs[:k]]:
@@ -235,7 +231,12 @@ def run_many(
             for number, job in list(jobs.items()):
                 progress(job.request.track.stem, *job.done())
                 if job.over and not job.running:
-                    outcomes[number] = _outcome(jobs.pop(number))
+                    del jobs[number]
+                    job.held.close()
+                    took_s, (frames, valid) = time.monotonic() - job.began, job.counts or (0, 0)
+                    outcomes[number] = Outcome(
+                        request=job.request, seconds=took_s, frames=frames, valid=valid, error=job.error
+                    )
     finally:
         executor.close()
         for job in jobs.values():
@@ -246,7 +247,6 @@ def run_many(
 def _next(
     todo: deque[int], jobs: dict[int, _Job], requests: Sequence[Request], resume: bool, workers: int
 ) -> tuple[_Job, Task] | None:
-    """Return the next task: of the experiment that was begun first, else of a new one."""
     for job in jobs.values():
         if job.waiting and not job.over:
             return job, job.waiting.popleft()
@@ -259,7 +259,6 @@ def _next(
 
 
 def _begun(request: Request, resume: bool, workers: int) -> _Job:
-    """Prepare the store of an experiment; a refusal becomes the job's error."""
     job = _Job(request=request, run_id=uuid.uuid4().hex, began=time.monotonic(), held=ExitStack())
     store = FolderStore(request.parts)
     try:
@@ -294,13 +293,6 @@ def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker
     if task.stage == "learn":
         job.batches = result
     job.results.append(result)
-
-
-def _outcome(job: _Job) -> Outcome:
-    job.held.close()
-    seconds = time.monotonic() - job.began
-    frames, valid = job.counts or (0, 0)
-    return Outcome(request=job.request, seconds=seconds, frames=frames, valid=valid, error=job.error)
 
 
 def tracks_of(experiments: Sequence[Path], out: Path) -> list[Path]:

@@ -49,8 +49,7 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
 def run_tracks(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Tracks:
     """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
     `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
-    Raises SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store
-    stays).
+    Raises SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written.
     """
     check_out(request)
     with opened(request, store, progress) as work, store.held(request, resume=resume):
@@ -171,15 +170,9 @@ def track_movies(
 ) -> Trajectory | Tracks:
     """Measure position (mm) and orientation of the sphere in every frame; see docs/data-format.md for the result.
     `run` with a `Request` does the same from what another run learnt, and writes files.
-
-    Args:
-        experiment: as loaded, or the path of its experiment.yaml.
-        method: "precise", fitted poses with covariances; "paper", Zimmermann et al. 2011, corrected (docs/errata.md).
-        settings: None: the defaults.
-        cameras: names of the cameras to use; None: all.
-        device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
-        progress: called with stage, frames done and frames in all.
-
+    `experiment`: as loaded, or the path of its experiment.yaml; `method`: "precise", fitted poses with covariances, or
+    "paper", Zimmermann et al. 2011, corrected (docs/errata.md); `cameras`: their names, None: all; `device`: as torch
+    names it; `progress` gets stage, frames done and frames in all.
     Raises SphereOrientError: missing, unreadable or inconsistent inputs.
     """
     try:

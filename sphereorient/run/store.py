@@ -145,9 +145,8 @@ class FolderStore:
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
-        """Create the folder, or resume from it, and lock it against other runs.
-        Raises TrackError: the folder to resume from belongs to a run with other inputs or settings; OutputError: it
-        cannot be written, it is not of a run, or another run is writing it.
+        """Create the folder, or resume from it, and lock it against other runs. Raises TrackError: it belongs to a run
+        with other inputs or settings; OutputError: it cannot be written, is not of a run, or another run is writing it.
         """
         with self._locked():
             now, before = fingerprint(request), self._fingerprint()

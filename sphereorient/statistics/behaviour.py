@@ -1,6 +1,4 @@
-"""What an experiment with an animal on a ball asks of a tracker: rotation gain, drift, heading and path, against truth
-or another tracker.
-"""
+"""Behaviour of an animal on a ball: gain, drift, heading and path of a track against truth or another tracker."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -84,12 +82,10 @@ class Reference:
 
 
 def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -> Behaviour:
-    """Compare the orientations of a track, measured and smoothed, with those of a reference.
-
-    A constant rotation of the body axes is taken off always, one of the lab axes with `align`: the axes are then those
-    of a reference that is `exact`, else those of the track. Against an exact reference a gain is the regression through
-    zero of our turns on its; else the geometric mean of the two regressions.
-    There is a walk where the ball stays in its place by either.
+    """Compare the orientations of a track, measured and smoothed, with those of a reference. A constant rotation of the
+    body axes is removed, with `align` one of the lab axes too: the axes are those of an `exact` reference, else of the
+    track. A gain is the regression through zero of our turns on those of an exact reference, else the geometric mean of
+    the two regressions. A walk needs a fixed ball.
     Raises ShapeError: not the same number of frames. Source: docs/accuracy.md, Behaviour.
     """
     frames, time_s = len(track), track.time
@@ -250,8 +246,8 @@ def _slope(time_s: Floats, error: Floats) -> tuple[Floats, Floats]:
 
 
 def _walk(time_s: Floats, R: Floats, R_reference: Floats, use: Mask) -> tuple[float, float, float]:
-    """Return the difference of the headings at the end, rad, the ratio of the paths' lengths, and the distance of their
-    ends over the length; of several stretches the sums, since what happened between them is not known.
+    """Return the headings' difference, rad, the paths' length ratio and end distance over length, summed over
+    stretches.
     """
     masked = [np.where(use[:, None, None], one, np.nan) for one in (R, R_reference)]
     ours, theirs = (walk_of(time_s, one) for one in masked)

@@ -53,17 +53,15 @@ class Correlation:
     reached_zero: NDArray[np.bool_]  # (4,); False: the segments are too short, the time is a lower bound
 
 
-def correlation(
-    ensemble: Ensemble, quantity: str, longest_s: float | None = None, settings: BootstrapSettings | None = None
-) -> Correlation:
+def correlation(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Correlation:
     """Return the autocorrelation of a quantity (a name in UNITS) about its ensemble mean, and its integral times.
     A value is the mean product of pairs over their mean square: unbiased by the lengths of segments. Pairs over a gap
-    count at their true lag. `longest_s` None: the longest lag at which a fiftieth of the samples has a partner.
+    count at their true lag. At the longest lag a fiftieth of the samples has a partner.
     Source: textbook; the paper's T_L is the integral time of `velocity`, up to the first zero.
     """
     pairs = Pairs(ensemble)
     x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
-    sums, counts, lags = [], [], _correlation_lags(pairs, ensemble, longest_s)
+    sums, counts, lags = [], [], _correlation_lags(pairs, ensemble)
     for lag in lags.tolist():
         first, second = pairs.at(lag)
         a, b = x[first], x[second]
@@ -79,13 +77,10 @@ def correlation(
     )
 
 
-def _correlation_lags(pairs: Pairs, ensemble: Ensemble, longest_s: float | None) -> Rows:
-    if longest_s is None:
-        length = np.bincount(ensemble.segment)
-        reached = np.array([np.maximum(length - k, 0).sum() for k in range(pairs.longest + 1)])
-        most = max(1, int(np.flatnonzero(reached >= LEAST_PAIRS * len(ensemble))[-1]))
-    else:
-        most = min(pairs.longest, int(longest_s / ensemble.step_s))
+def _correlation_lags(pairs: Pairs, ensemble: Ensemble) -> Rows:
+    length = np.bincount(ensemble.segment)
+    reached = np.array([np.maximum(length - k, 0).sum() for k in range(pairs.longest + 1)])
+    most = max(1, int(np.flatnonzero(reached >= LEAST_PAIRS * len(ensemble))[-1]))
     sparse = np.geomspace(EVERY_LAG, max(most, EVERY_LAG), MORE_LAGS).round().astype(np.int64)
     lags = np.unique(np.concatenate([np.arange(EVERY_LAG), sparse]))
     return np.asarray(lags[lags <= most], np.int64)

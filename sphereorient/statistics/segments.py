@@ -134,7 +134,6 @@ def _usable(track: Trajectory, number: int, settings: SegmentSettings) -> dict[s
 
 
 def _first_rows(whole: dict[str, NDArray[Any]], longest_s: float | None) -> NDArray[np.bool_]:
-    """Mark the first row of each segment (M,), or of its equal pieces of at most longest_s."""
     time_s = whole["time_s"]
     first = np.ones(len(time_s), dtype=bool)
     first[1:] = (np.diff(whole["label"]) != 0) | (np.diff(whole["track"]) != 0)

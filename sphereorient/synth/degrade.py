@@ -164,7 +164,6 @@ def _reached(near: Tensor) -> slice:
 
 
 def _glow(right: Tensor, down: Tensor, sigma: Tensor) -> Tensor:
-    """Return a Gaussian of peak 1."""
     across, along = (torch.exp(-0.5 * (offset / sigma).square()) for offset in (right, down))
     return across * along
 

@@ -156,9 +156,7 @@ class Filming:
         return misdrawn(texture, self.values.get("texture_error", 0.0), rng)
 
     def picture(self, exposure: Exposure, disk: Disk, name: str, frame: int) -> NDArray[np.float32]:
-        """Return degraded grey levels (H, W) of a camera's frame, before the camera's own noise.
-        `disk` is the place of the sphere. What the sphere cannot change is taken from the empty picture.
-        """
+        """Return degraded grey levels (H, W) of a camera's frame, without camera noise; `disk`: place of the sphere."""
         exposure = self._lit_ball(exposure, disk, name)
         beyond = max((BEYOND.get(what, 0.0) for what in self.optics), default=0.0) * float(disk.radius_px)
         changed = exposure.within(math.ceil(beyond) + self._spread)
@@ -176,7 +174,6 @@ class Filming:
 
     @property
     def _spread(self) -> int:
-        """How far the lens spreads a pixel, px."""
         return blur_reach(self.values.get("defocus", 0.0))
 
     def _lit_ball(self, exposure: Exposure, disk: Disk, name: str) -> Exposure:

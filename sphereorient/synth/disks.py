@@ -44,10 +44,9 @@ class DiskSettings(BaseModel, frozen=True, extra="forbid"):
 def film_disks(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: DiskSettings
 ) -> Tensor:
-    """Film a sphere with random light per picture; return crops (F, S, S) float32, grey levels.
-    `texture` is the worn map (H, 2 H), `R_view_body` (F, 3, 3); `values` maps `DISK_DEGRADATIONS` to physical values,
-    values of maps are ignored.
-    Raises SettingsError: unknown name or impossible value.
+    """Film a sphere with random light per picture; return crops (F, S, S) float32, grey levels. `texture` is the worn
+    map (H, 2 H), `R_view_body` (F, 3, 3), `values` of `DISK_DEGRADATIONS`, physical; those of maps are ignored. Raises
+    SettingsError: unknown name or impossible value.
     """
     check_values(values, DISK_DEGRADATIONS, "film a movie: write_degraded")
     scale = settings.scale

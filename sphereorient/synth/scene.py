@@ -202,7 +202,6 @@ def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tupl
 
 
 def _around(windows: Sequence[Window]) -> Window:
-    """Return the smallest window that holds some."""
     down, right = (
         slice(min(s.start for s in sides), max(s.stop for s in sides)) for sides in zip(*windows, strict=True)
     )
@@ -210,7 +209,6 @@ def _around(windows: Sequence[Window]) -> Window:
 
 
 def _inside(part: Window, window: Window) -> Window:
-    """Return where a part of a window is in it."""
     down, right = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(part, window, strict=True))
     return down, right
 
@@ -279,9 +277,7 @@ def seeded(*what: str | int) -> torch.Generator:
 def hidden_shares(
     places: Mapping[str, Doubles], cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
 ) -> dict[str, Doubles]:
-    """Return for each ball at places (N, 3), lab, mm, the share of its disk that nearer ones cover, (C, N), all as
-    circles.
-    """
+    """Return for each ball at places (N, 3), lab, mm, the share of its disk (C, N) that nearer disks cover."""
     across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
     grid = torch.cartesian_prod(across, across)
     grid = grid[grid.square().sum(1) < 1]

@@ -77,18 +77,12 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     }
 
 
-def write_degraded(
-    folder: Path,
-    base: SynthSettings,
-    applied: Mapping[str, int],
-    progress: Callable[[int], None] = lambda done: None,
-    clean: Clean | None = None,
-) -> Path:
+def write_degraded(folder: Path, base: SynthSettings, applied: Mapping[str, int], clean: Clean | None = None) -> Path:
     """Render as `write_synthetic_experiment` does; `applied` maps degradations to levels 1 .. 5.
     Raises SettingsError: unknown name or level, or impossible scene; OutputError: folder not writable.
     """
     values = {name: severity(name, k) for name, k in applied.items()}
-    return write_synthetic_experiment(folder, base, progress, values, clean)
+    return write_synthetic_experiment(folder, base, values=values, clean=clean)
 
 
 def write_synthetic_experiment(
@@ -98,11 +92,10 @@ def write_synthetic_experiment(
     values: Mapping[str, float] = MappingProxyType({}),
     clean: Clean | None = None,
 ) -> Path:
-    """Render an experiment with exact truth in `folder` and return the path of experiment.yaml.
-    The folder also receives movies, backgrounds, texture.png (of several balls texture_0.png, ... of each paint),
-    cameras.yaml and truth.h5; old files are replaced. `progress` receives the number of frames rendered since the last
-    call. `values` maps degradations to physical values: reported cameras, texture map and diameter may be wrong;
-    truth.h5 describes the filmed cameras and sphere. `clean` is called in place of `clean_movie`.
+    """Render an experiment with exact truth in `folder` and return the path of experiment.yaml. Files: movies,
+    backgrounds, texture.png (of several balls texture_0.png, ... of each paint), cameras.yaml and truth.h5; old ones
+    are replaced. `progress` gets the number of frames rendered since the last call. `values`: degradations by name,
+    physical values; reported cameras, map and diameter may be wrong, truth.h5 never is. `clean` replaces `clean_movie`.
     Raises SettingsError: unknown degradation, one of a single ball for several, or impossible value or scene;
     OutputError: folder not writable.
     """
@@ -135,9 +128,7 @@ def write_synthetic_experiment(
 
 
 def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
-    """Return what the cameras of `default_cameras` see, before degradations of pictures.
-    Raises SettingsError: no room for a ball.
-    """
+    """Return what the cameras see, before degradations of pictures. Raises SettingsError: no room for a ball."""
     motions = motions_of(settings)
     # Rounded to grey levels, as in the file.
     textures = [
@@ -177,9 +168,7 @@ def instants_s(settings: SynthSettings) -> Tensor:
 
 
 def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
-    """Draw the motion of each ball, by its name; one that meets an earlier ball at a filmed instant is drawn again.
-    Raises SettingsError: no room for a ball.
-    """
+    """Draw the motion of each ball, by name, so that none meets another. Raises SettingsError: no room for a ball."""
     times_s, motions, paths = instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
     for k, name in enumerate(settings.worn):
         for draw in range(DRAWS):

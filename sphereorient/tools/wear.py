@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note, spread
+from sphereorient.experiment.recording import spread_frames
+from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
 from sphereorient.report.texture_map import CHANGE_REACH, EXTENT, draw_map
 from sphereorient.sphere.compare import (
     CHANGED,
@@ -176,7 +177,7 @@ def connected_places(worn: Tensor) -> Tensor:
 def wear_figure(first: Tensor, series: WearSeries, names: Sequence[str]) -> Figure:
     """Draw the wear of a series of maps against the first (H, 2 H), NaN where unknown; `names` are of all maps."""
     count = len(series.wear)
-    drawn = spread(count, SHOWN).tolist()
+    drawn = spread_frames(range(count), SHOWN)
     rows = math.ceil((len(drawn) + 1) / 2)
     figure = new_figure(WIDTH_IN, 1.75 * rows + 2.7)
     grid = figure.add_gridspec(rows + 1, 2, height_ratios=[1.0] * rows + [1.15])

@@ -138,10 +138,17 @@ def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
+def nearest_rows(known: NDArray[Any], wanted: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the rows of increasing known times nearest to the wanted ones, and where they are within half a step."""
+    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    row = np.where(np.abs(known[before] - wanted) < np.abs(known[after] - wanted), before, after)
+    step = float(np.median(np.diff(known))) if len(known) > 1 else np.inf
+    return row, np.abs(known[row] - wanted) <= step / 2
+
+
 def span_words(mask: NDArray[np.bool_], number: NDArray[np.int64] | None = None) -> str:
-    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319": the longest `SPANS` stretches. `number`: that
-    of each frame, None: its index.
-    """
+    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319": the longest; `number`: of each frame."""
     number = np.arange(len(mask)) if number is None else number
     runs = runs_of(mask)
     longest = sorted(sorted(runs, key=lambda run: run[0] - run[1])[:SPANS])

@@ -1,7 +1,6 @@
-"""A track that is still being measured: a file of rows that only grows, so that it can be read at any time, also after
-a kill. It lies beside the track until that is written whole.
-The first line is JSON with the attributes of the track; then a row of fixed length for each frame (`row_type`). What
-lies behind the last whole row is ignored.
+"""A track that is still being measured, in a file beside it that only grows: readable at any time, also after a kill.
+The first line is JSON with the attributes of the track; then a row of fixed length for each frame (`row_type`). A part
+of a row at the end is ignored.
 """
 
 import json

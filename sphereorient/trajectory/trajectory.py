@@ -244,9 +244,8 @@ class Trajectory:
         return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...).
-        It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
-        Raises OutputError: pandas is not installed.
+        """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...),
+        with quaternions (w >= 0), without covariances and cameras. Raises OutputError: pandas is not installed.
         """
         pandas = package("pandas", "table")
         table: dict[str, NDArray[Any]] = {"time_s": self.time}
@@ -307,8 +306,8 @@ class Trajectory:
         return np.asarray(~self.valid & none.any(0) & (none | unknown).all(0))
 
     def summary(self) -> dict[str, Any]:
-        """Return numbers of frames: all `frames`, those `valid`, those with `no_ball`, and `lost`: the other ones that
-        each camera lost, by reason, most frequent first.
+        """Return the numbers of `frames`, `valid`, `no_ball`, and `lost`: the rest by camera and reason, frequent ones
+        first.
         """
         lost, none = {}, self.without_ball
         for name, camera in self.cameras.items():
@@ -319,9 +318,7 @@ class Trajectory:
 
 
 class Tracks(Mapping[str, Trajectory]):
-    """Trajectories of the spheres of one recording, by name: `tracks["a"]`. The name of a sphere under the key `sphere`
-    of experiment.yaml is empty. All have the same times.
-    """
+    """Trajectories of the spheres of one recording by name, with the same times; an only sphere's name is empty."""
 
     def __init__(self, tracks: Mapping[str, Trajectory]) -> None:
         times = [track.time for track in tracks.values()]
@@ -366,9 +363,8 @@ class Tracks(Mapping[str, Trajectory]):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by `save`. Where `live` did not come to its end, or goes on, read the rows that it has
-        written so far.
-        Raises TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.
+        """Read a file written by `save`, or the rows so far of a `live` that goes on or was killed. Raises TrackError:
+        no HDF5 file, another schema, or a dataset missing or of wrong shape.
         """
         with opened_track(path) as file:
             if not isinstance(file, h5py.File):
@@ -453,11 +449,15 @@ def read_track(group: h5py.Group) -> Trajectory:
     for attribute in (*TEXTS, "frame_rate", "provenance"):
         if attribute not in group.attrs:
             raise TrackError(refusal(f"{name}: attribute {attribute}", expected="a value", got="none", do=AGAIN))
-    cameras = datasets.inside(group, "cameras")
+    cameras = {}
+    for camera in (every := datasets.inside(group, "cameras")) or ():
+        own = datasets.named_group(every, camera)
+        reason = reasons_of(datasets.read_dataset(own, "reason", "S"))
+        cameras[camera] = CameraTrack(reason=reason, **datasets.read_datasets(own, CameraTrack))
     parts: dict[str, Any] = datasets.read_datasets(group, Trajectory)
     parts |= {name: str(group.attrs[name]) for name in TEXTS}
     return Trajectory(
-        cameras={name: read_camera(cameras, name) for name in cameras or ()},
+        cameras=cameras,
         frame_rate=float(group.attrs["frame_rate"]),
         provenance=json.loads(group.attrs["provenance"]),
         length_unit=str(group.attrs.get("length_unit", "mm")),
@@ -487,10 +487,3 @@ def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
     # fixed length: HDF5 stores variable strings outside the dataset
     width = max([16, *map(len, camera.reason)])
     datasets.write_dataset(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), REASON)
-
-
-def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
-    """Read one camera from the group of all."""
-    group = datasets.named_group(cameras, name)
-    reason = reasons_of(datasets.read_dataset(group, "reason", "S"))
-    return CameraTrack(reason=reason, **datasets.read_datasets(group, CameraTrack))

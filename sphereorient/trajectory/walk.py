@@ -94,8 +94,8 @@ def fictrac_rows(
     R_cam_lab: Floats, R_from_first: Floats, ahead: Floats, right: Floats, start: NDArray[np.bool_], **own: ArrayLike
 ) -> Floats:
     """Return FicTrac's columns, (N, 25), of rotations since a stretch began, (N, 3, 3), and steps (N,), radii, in the
-    lab of the table; a frame that is the `start` of a stretch, (N,), has not moved. `own`: the other columns by their
-    names in `FICTRAC`.
+    table's lab; at the `start` (N,) of a stretch nothing has moved. `own`: the other columns by their names in
+    `FICTRAC`.
     """
     # FicTrac's absolute rotations are those since its first frame, in the lab with the camera's pose put before.
     R_cam = R_cam_lab @ R_from_first @ R_cam_lab.T

@@ -310,7 +310,7 @@ def test_fictracs_file_is_read_and_scored(truth, tmp_path):
     rows[:, 0] = np.arange(FRAMES)
     rows[:, 8:11] = (Rotation.from_rotvec([0.0, 0.02, 0.0]) * Rotation.from_matrix(R) * own).as_rotvec()
     np.savetxt(tmp_path / "out.dat", rows, delimiter=", ")
-    frame, measured = read_fictrac(tmp_path / "out.dat")
+    frame, measured, _ = read_fictrac(tmp_path / "out.dat")
     true = orientations_at(path, frame)
     assert np.median(aligned_errors_deg(measured, true)) > 10
     np.testing.assert_allclose(aligned_errors_deg(measured, true, "both"), 0, atol=1e-5)

@@ -14,7 +14,7 @@ from live_examples import rows
 from overlay_examples import true_track
 
 from sphereorient import so3
-from sphereorient.live.lines import FicTracLines, Quantities, Told, fictrac_line
+from sphereorient.live.lines import FicTracLines, Quantities, Told
 from sphereorient.live.live import Measured
 from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Flag, Trajectory
@@ -35,17 +35,8 @@ def test_lines_are_the_rows_of_the_exported_table(track):
     R_cam_own, R_own_lab = so3.exp(torch.tensor([[0.7, -0.1, 0.4], [0.2, 0.1, -0.3]], dtype=torch.float64)).numpy()
     axes = FicTracAxes(R_own_lab=R_own_lab, R_cam_own=R_cam_own)
     table, lines = fictrac_table(track, axes), FicTracLines(axes)
-    found = np.array(
-        [
-            [
-                float(part)
-                for part in fictrac_line(lines.columns(now.number, now.time_s, now.R_lab_body, now.error_rad)).split(
-                    ", "
-                )
-            ]
-            for now in rows(track)
-        ]
-    )
+    texts = [Told(now, lines, Quantities(fixed=True)).fictrac for now in rows(track)]
+    found = np.array([[float(part) for part in text.split(", ")] for text in texts])
     assert found.shape == (len(track), 25)
     rest = [k for k in range(25) if k != 4]  # the stated error is another one here
     np.testing.assert_allclose(found[:, rest], table[:, rest], atol=1e-9)

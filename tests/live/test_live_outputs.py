@@ -147,9 +147,6 @@ def test_a_disk_that_hangs_holds_nobody_up_and_what_is_lost_is_counted():
     assert written == [0, 8, 9, 10]
 
 
-# --- ZeroMQ ---
-
-
 @pytest.fixture
 def published():
     pytest.importorskip("zmq", reason="the extra `live`")
@@ -208,9 +205,6 @@ def test_without_zeromq_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "zmq", None)
     with pytest.raises(OutputError, match=r"pip install 'sphereorient\[live\]'"):
         ZmqOutput("127.0.0.1", 5555)
-
-
-# --- serial ports ---
 
 
 @pytest.fixture

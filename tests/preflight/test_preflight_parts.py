@@ -20,9 +20,9 @@ from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.experiment.recording import pictures_of
 from sphereorient.locate import Background, sightings_of
 from sphereorient.locate.outline import Outline
-from sphereorient.preflight import Finding, Severity
+from sphereorient.preflight import Severity
 from sphereorient.preflight.cameras import expected_outline_px
-from sphereorient.preflight.finding import FAULT, OK, worst
+from sphereorient.preflight.finding import FAULT, OK
 from sphereorient.preflight.in_step import OffsetScan, in_step, scan_offsets, starts_in_step
 from sphereorient.preflight.movies import limb_blur_px, motion_blur
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
@@ -216,14 +216,6 @@ def test_rows_are_read_in_order_with_gaps_where_there_is_no_picture():
     rows = np.array([3, 4, 5, -1, 7, 8, 20, -1, -1, 30])
     read = [None if one is None else int(one[0, 0]) for one in pictures_of(Sevens(), rows)]
     assert read == [3, 4, 5, None, None, 8, 20, None, None, 30]
-
-
-def test_the_worst_severity_counts():
-    def one(severity: Severity) -> Finding:
-        return Finding(title="", severity=severity, measured="")
-
-    assert worst([]) is Severity.OK
-    assert worst([one(Severity.OK), one(Severity.FAULT), one(Severity.WARNING)]) is Severity.FAULT
 
 
 def test_a_telecentric_camera_expects_its_own_scale():

@@ -16,7 +16,7 @@ from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, OutputError, TrackError
 from sphereorient.files.whole_file import writing
 from sphereorient.pose.lights.disk import light_basis
-from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, flag_words, frame_warnings
+from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, frame_warnings
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
 from sphereorient.report.overlay_model import (
     LIMB,
@@ -118,9 +118,8 @@ def test_the_residual_is_small_for_the_true_orientation_only(ready, name):
     at_truth = relative_residual(ready, name)
     assert at_truth < 0.13
     for wrong in ([0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, np.pi]):
-        assert relative_residual(ready, name, Rotation.from_rotvec(wrong).as_matrix() @ track.orientation[K]) > (
-            1.8 * at_truth
-        )
+        R = Rotation.from_rotvec(wrong).as_matrix() @ track.orientation[K]
+        assert relative_residual(ready, name, R) > 1.8 * at_truth
     assert relative_residual(ready, name, track.orientation[K].T) > 3 * at_truth  # the other reading of R_lab_body
 
 
@@ -159,9 +158,6 @@ def test_brightness_follows_the_frame_within_a_factor_of_two():
     np.testing.assert_allclose(lit_picture(light, seen, 0.7 * grey), 0.7 * lit_picture(light, seen, grey), rtol=1e-5)
     bright = lit_picture(light, seen, 9.0 * grey)
     np.testing.assert_allclose(bright, 2.0 * lit_picture(light, seen), rtol=1e-5)
-
-
-def test_without_pixels_there_is_no_light():
     assert fit_light([]) is None
 
 
@@ -216,11 +212,6 @@ def test_doubts_are_told_in_words():
     bad = camera_changed(bad, "cam2", 3, reason=Reason.DARK)
     assert frame_warnings(bad, 3) == ["not valid", "one camera only", "the orientation jumps", "cam2: too dark"]
     assert frame_warnings(camera_changed(track, "cam2", 3, reason="of_tomorrow"), 3) == ["cam2: of_tomorrow"]
-
-
-def test_one_camera_is_no_news_where_there_is_no_other():
-    track = changed(true_track(("cam1",)), slice(None), flags=Flag.ONE_CAMERA)
-    assert flag_words(track, 0) == []
 
 
 def with_track(page, track, **parts):
@@ -278,16 +269,8 @@ def read(path):
 
 @pytest.mark.slow
 def test_the_movie_is_h264_that_players_show(tmp_path):
-    out = tmp_path / "overlay.mp4"
-    steps = []
-    count = overlay_movie(
-        true_track(),
-        excerpt(),
-        out,
-        FrameSelection(first=10, last=16, every=2),
-        fps=12,
-        progress=lambda *at: steps.append(at),
-    )
+    out, steps, chosen = tmp_path / "overlay.mp4", [], FrameSelection(first=10, last=16, every=2)
+    count = overlay_movie(true_track(), excerpt(), out, chosen, 12, lambda *at: steps.append(at))
     facts, pictures = read(out)
     assert facts == ("h264", "yuv420p", 12.0)
     assert count == len(pictures) == 3
@@ -304,10 +287,8 @@ def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
         part, of_part = prepared(true_track(("cam1",), 12, 30), excerpt(), None, opened)
         assert part.numbers.tolist() == list(range(12, 30))
         assert whole.numbers.tolist() == list(range(40))
-        (_, first), (_, same) = (
-            next(pictures_by_row(of_part, np.array([0]))),
-            next(pictures_by_row(streams, np.array([12]))),
-        )
+        _, first = next(pictures_by_row(of_part, np.array([0])))
+        _, same = next(pictures_by_row(streams, np.array([12])))
         np.testing.assert_array_equal(first["cam1"], same["cam1"])
     with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
         overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", FrameSelection(first=30))

@@ -36,9 +36,8 @@ def place(tmp_path_factory) -> Path:
     draw_ensemble(EnsembleSpec(segments=24, mean_frames=80.0), 3).save(folder / "precise.h5")
     longest = np.bincount(whole.segment).argmax()
     whole.at(np.flatnonzero(whole.segment == longest)).save(folder / "one.h5")
-    Trajectory.empty(np.arange(90) / 600, cameras=["cam1"], frame_rate=600.0, method="precise").save(
-        folder / "empty.h5"
-    )
+    empty = Trajectory.empty(np.arange(90) / 600, cameras=["cam1"], frame_rate=600.0, method="precise")
+    empty.save(folder / "empty.h5")
     (folder / "text.h5").write_text("no track")
     whole.save(folder / "newer.h5")
     with h5py.File(folder / "newer.h5", "r+") as file:
@@ -143,9 +142,8 @@ def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, t
         "Durations (Figure 9 of the paper)",
     ]
     assert {"track", "densities", "increments", "durations", "correlations", "angles", "isotropy"} <= drawn
-    assert all(
-        (out / "figures" / f"{name}.{suffix}").stat().st_size > 2000 for name in drawn for suffix in ("png", "pdf")
-    )
+    files = [out / "figures" / f"{name}.{suffix}" for name in drawn for suffix in ("png", "pdf")]
+    assert all(path.stat().st_size > 2000 for path in files)
     links = re.findall(r'href="(tables/[^"]+)"', page)
     assert len(links) >= 2 * 12
     assert all((out / link).is_file() for link in links)
@@ -175,10 +173,8 @@ def test_same_tracks_same_numbers_and_same_pictures(place, report, tmp_path):
 
 @pytest.mark.slow
 def test_settings_of_the_statistics_are_obeyed_and_shown(place, report, tmp_path):
-    code, _, _ = report(
-        place / "a/track.h5", "--out", tmp_path / "page", *QUICK, "--set", "statistics.min_frames=70", "-q"
-    )
-    assert code == 0
+    changed = [*QUICK, "--set", "statistics.min_frames=70", "-q"]
+    assert report(place / "a/track.h5", "--out", tmp_path / "page", *changed)[0] == 0
     page = (tmp_path / "page" / "index.html").read_text()
     assert "min_frames: 70" in page
     rows = (tmp_path / "page" / "tables" / "segments.csv").read_text().splitlines()[1:]

@@ -36,15 +36,8 @@ TURN = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
 def good_track(frames: int, names: tuple[str, ...] = ("cam1", "cam2"), first: int = 0) -> Trajectory:
     """A track without pictures in which nothing is wrong, 600 Hz, errors of 0.1 degree and 0.2 mm."""
     cov = np.tile(np.eye(3), (frames, 1, 1))
-    seen = {
-        name: replace(
-            CameraTrack.empty(frames),
-            reason=("ok",) * frames,
-            score=np.full(frames, 0.95),
-            orientation=cov,
-        )
-        for name in names
-    }
+    right = {"reason": ("ok",) * frames, "score": np.full(frames, 0.95), "orientation": cov}
+    seen = {name: replace(CameraTrack.empty(frames), **right) for name in names}
     track = Trajectory.empty((first + np.arange(frames)) / 600.0, cameras=names, frame_rate=600.0, experiment="planted")
     covs = {"orientation_cov": cov * np.deg2rad(0.1) ** 2, "position_cov": cov * 0.04}
     return replace(track, valid=np.ones(frames, bool), cameras=seen, **covs)
@@ -115,17 +108,14 @@ def test_the_strip_says_of_every_frame_what_was_planted():
     assert set(words["cam2"][70:80]) == {"measured"}
     assert words["cam2"][121] == "no orientation explains the picture"
     told = dict(strip["flag_words"])
-    assert {told[bit] for bit in told if strip["flags"][200] & bit} == {
-        "found again after a loss",
-        "the orientation jumps",
-    }
+    planted = {"found again after a loss", "the orientation jumps"}
+    assert {told[bit] for bit in told if strip["flags"][200] & bit} == planted
     assert [k for k in range(300) if strip["flags"][k]] == [85, 200]
     assert strip["cameras"][0]["score"][5] == 0.6
     assert strip["cameras"][0]["score"][61] is None
     assert strip["orientation_error_deg"][0] == 0.1
     assert strip["position_error"][0] == 0.2
     assert strip["orientation_error_deg"][61] is None
-    assert strip["apart_deg"] is not None
     assert strip["apart_deg"][7] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
     assert strip["apart_deg"][8] == 0.0
 
@@ -149,7 +139,6 @@ def test_one_bad_frame_of_a_million_survives(frames):
     assert strip["cameras"][0]["score"][place] == 0.95
     assert strip["reason_words"][strip["cameras"][1]["reason"][place]] == "too dark"
     assert strip["flags"][place] == Flag.AMBIGUOUS
-    assert strip["apart_deg"] is not None
     assert strip["apart_deg"][place] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
     assert [(one.first, one.frames) for one in bad_stretches(track)] == [(bad, 1)]
 
@@ -176,11 +165,6 @@ def test_one_camera_only_is_no_doubt_where_there_is_no_other():
     assert strip_of(alone)["apart_deg"] is None
     of_two = changed(good_track(30), slice(None), flags=Flag.ONE_CAMERA)
     assert bad_stretches(of_two)[0].reasons == (("one camera only", 30),)
-
-
-def test_a_reason_of_a_newer_file_is_shown_as_it_is():
-    track = camera_changed(good_track(30), "cam1", 4, reason="eaten")
-    assert bad_stretches(track)[0].reasons == (("cam1: eaten", 1),)
 
 
 @pytest.mark.parametrize("frames", [0, 1, 50])

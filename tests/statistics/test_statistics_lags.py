@@ -42,7 +42,7 @@ def test_pairs_are_those_that_a_slow_loop_finds(lag):
 @pytest.mark.slow
 def test_autocorrelation_and_integral_time_of_a_forgetful_process():
     x = forgetful(600, 150, 1)
-    found = correlation(ensemble([150] * 600, velocity=x), "velocity", 100 * STEP_S, FEW)
+    found = correlation(ensemble([150] * 600, velocity=x), "velocity", FEW)
     exact = np.exp(-found.lag_s / STEP_S / TAU)
     assert np.abs((found.value.value - exact[:, None]) / np.maximum(found.value.error, 1e-12))[1:].mean() < 1.5
     assert holds(found.integral_time_s, TAU * STEP_S).sum() >= 3
@@ -55,16 +55,16 @@ def test_gaps_and_lengths_do_not_bias_an_autocorrelation():
     whole = ensemble([150] * 600, velocity=forgetful(600, 150, 2))
     lengths = rng.integers(5, 151, 600)
     kept = (whole.frame < lengths[whole.segment]) & (rng.uniform(size=len(whole)) > 0.4)
-    found = correlation(without(whole, kept), "velocity", 40 * STEP_S, FEW)
-    exact = np.exp(-found.lag_s / STEP_S / TAU)
-    assert np.abs(found.value.value[:, 3] - exact).max() < 0.03
+    found = correlation(without(whole, kept), "velocity", FEW)
+    near_s = found.lag_s[found.lag_s <= 40 * STEP_S]
+    assert np.abs(found.value.value[: len(near_s), 3] - np.exp(-near_s / STEP_S / TAU)).max() < 0.03
 
 
 def test_a_cosine_correlates_as_a_cosine():
     frame = np.tile(np.arange(100), 50)
     phase = np.repeat(np.linspace(0, 2 * np.pi, 50, endpoint=False), 100)
     x = np.cos(0.2 * frame + phase)[:, None] * np.ones(3)
-    found = correlation(ensemble([100] * 50, velocity=x), "velocity", 50 * STEP_S, FEW)
+    found = correlation(ensemble([100] * 50, velocity=x), "velocity", FEW)
     np.testing.assert_allclose(found.value.value[:, 0], np.cos(0.2 * found.lag_s / STEP_S), atol=1e-10)
     assert found.reached_zero.all()
     assert found.integral_time_s.value[0] == pytest.approx(5 * STEP_S, rel=0.01)  # integral of cos to its zero

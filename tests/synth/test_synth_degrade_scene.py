@@ -127,9 +127,6 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
     assert not (tmp_path / "new").exists()
 
 
-# Pictures of a movie.
-
-
 @pytest.mark.slow
 def test_noise_comes_on_top_of_the_cameras_own(tmp_path):
     few = SETTINGS.model_copy(update={"frames": 4, "background": 80.0, "read_noise": 3.0, "shot_noise": 0.0})
@@ -155,12 +152,9 @@ def test_structure_and_dirt_stand_still_and_are_in_the_picture_without_the_ball(
 def test_the_optics_blur_the_light_of_the_ball(name, tmp_path):  # the other order: 1.7 and 49 grey levels off
     quiet = SETTINGS.model_copy(update={"frames": 2, "read_noise": 0.0, "shot_noise": 0.0, "white": 120.0})
     values = {name: severity(name, 3)}
-    sharp, seen = (
-        frames_of(
-            write_synthetic_experiment(tmp_path / str(blur), quiet.model_copy(update={"blur_px": blur}), values=values)
-        )["cam1"]
-        for blur in (0.0, 2.0)
-    )
+    at = {blur: quiet.model_copy(update={"blur_px": blur}) for blur in (0.0, 2.0)}
+    paths = (write_synthetic_experiment(tmp_path / str(blur), one, values=values) for blur, one in at.items())
+    sharp, seen = (frames_of(path)["cam1"] for path in paths)
     for before, after in zip(sharp, seen, strict=True):
         expected = cv2.GaussianBlur(before.astype(np.float32), (0, 0), 2.0)
         assert np.abs(after - expected).max() <= 1.0  # both are rounded to whole levels
@@ -221,9 +215,6 @@ def test_the_ball_in_a_picture_is_where_and_as_large_as_it_is_seen(plain):
     assert disk.radius_px.tolist() == pytest.approx([20 * 520 / 460, 20.0], rel=1e-3)
 
 
-# The scene.
-
-
 @pytest.mark.slow
 def test_the_ball_has_its_size_and_the_scene_stays_the_same(tmp_path):
     for diameter in (20.0, 32.0):
@@ -232,8 +223,7 @@ def test_the_ball_has_its_size_and_the_scene_stays_the_same(tmp_path):
         ball = np.sqrt((frames_of(path)["cam1"] > 60).sum((1, 2)) * 4 / np.pi)
         assert ball == pytest.approx(diameter, rel=0.06)
         scale = diameter / 40
-        for camera, size in ((settings.image_size, (96 * scale, 90 * scale)),):
-            assert camera == pytest.approx(size, abs=0.5)
+        assert settings.image_size == pytest.approx((96 * scale, 90 * scale), abs=0.5)
         truth, base = motion_of(settings), motion_of(SETTINGS)
         now = torch.tensor([0.01], dtype=torch.float64)
         assert torch.equal(truth.at(now).position_lab_mm, base.at(now).position_lab_mm)
@@ -270,13 +260,8 @@ def test_motion_blur_smears_the_picture_of_the_ball(tmp_path):
         open_long = with_motion_blur(quiet, degrees)
         # The same poses in a flash.
         flash = open_long.model_copy(update={"exposure": 0.0, "exposure_samples": 1})
-        steps = [
-            sum(np.square(np.diff(movie[:, 5:85, 5:91])).sum() for movie in frames_of(path).values())
-            for path in (
-                write_synthetic_experiment(tmp_path / "a", open_long),
-                write_synthetic_experiment(tmp_path / "b", flash),
-            )
-        ]
+        movies = [frames_of(write_synthetic_experiment(tmp_path / "a", one)).values() for one in (open_long, flash)]
+        steps = [sum(np.square(np.diff(one[:, 5:85, 5:91])).sum() for one in each) for each in movies]
         left.append(steps[0] / steps[1])
     assert 1.0 > left[0] > 1.02 * left[1]
     assert left[2] < 0.8 * left[1]
@@ -286,9 +271,6 @@ def test_blur_at_high_spin_needs_no_more_spin():
     settings = degraded_settings(SETTINGS, {"motion_blur": 16.0, "spin": 60.0})
     assert settings.omega_rms == with_spin(SETTINGS, 60.0).omega_rms
     assert settings.exposure * settings.frame_rate == pytest.approx(16 / 60)
-
-
-# The paint.
 
 
 @pytest.mark.parametrize(("share", "height"), [(0.05, 128), (0.35, 96), (0.2, 64)])
@@ -337,9 +319,6 @@ def test_worn_paint_is_on_the_filmed_ball_only():
     assert float((area * bare).sum() / area.sum()) == pytest.approx(0.25, abs=5e-3)
 
 
-# What the method is told.
-
-
 @pytest.mark.slow
 def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     path = write_synthetic_experiment(tmp_path, SETTINGS, values={"radius_error": 2.0})
@@ -370,9 +349,8 @@ def test_an_odd_seed_turns_the_first_camera():
     true = default_cameras(SETTINGS)
     for seed, turned, kept in ((1, "cam1", "cam2"), (2, "cam2", "cam1")):
         told = wrong_cameras(true, {"camera_rotation": 5.0}, seed)
-        assert math.degrees(float(so3.log(told[turned].R_cam_lab @ true[turned].R_cam_lab.mT).norm())) == pytest.approx(
-            5
-        )
+        turn = so3.log(told[turned].R_cam_lab @ true[turned].R_cam_lab.mT)
+        assert math.degrees(float(turn.norm())) == pytest.approx(5)
         assert torch.equal(told[kept].R_cam_lab, true[kept].R_cam_lab)
 
 

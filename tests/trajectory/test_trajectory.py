@@ -79,9 +79,6 @@ def datasets(path: Path) -> dict[str, h5py.Dataset]:
     return found
 
 
-# convention: the file is the one of docs/data-format.md
-
-
 def test_an_empty_trajectory_has_every_dataset_of_the_design_in_its_shape(tmp_path: Path) -> None:
     Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=("cam1",)).save(tmp_path / "track.h5")
     found = datasets(tmp_path / "track.h5")
@@ -131,9 +128,6 @@ def test_the_root_and_the_flags_are_named_as_in_the_design(tmp_path: Path) -> No
         assert file["cameras/cam1/reason"].asstr()[1] == "dark"
 
 
-# property: what is written is what is read
-
-
 def test_saving_and_loading_gives_back_every_number_and_every_nan(tmp_path: Path) -> None:
     track = full_trajectory()
     track.save(tmp_path / "track.h5")
@@ -169,9 +163,6 @@ def test_a_reason_of_a_later_version_is_kept(tmp_path: Path) -> None:
     camera = replace(CameraTrack.empty(2), reason=("ok", "swallowed_by_a_very_large_bubble"))
     replace(Trajectory.empty(np.zeros(2)), cameras={"cam1": camera}).save(tmp_path / "track.h5")
     assert Trajectory.load(tmp_path / "track.h5").cameras["cam1"].reason == camera.reason
-
-
-# files: whole or not at all
 
 
 def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
@@ -242,9 +233,6 @@ def test_arrays_of_unequal_length_make_no_trajectory() -> None:
         replace(track.cameras["cam1"], candidate_score=np.zeros(4))
 
 
-# table and summary
-
-
 def test_the_table_has_units_in_its_names_and_quaternions_w_first() -> None:
     quarter_about_z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     track = full_trajectory()
@@ -290,9 +278,6 @@ def test_a_track_of_before_the_systematic_errors_is_read_without_them(tmp_path: 
     for name in names:
         np.testing.assert_array_equal(getattr(old, name), np.full((len(track), 3, 3), np.nan))
     np.testing.assert_array_equal(old.position_cov, track.position_cov)
-
-
-# in a notebook
 
 
 def test_a_slice_is_a_part_with_its_candidates() -> None:

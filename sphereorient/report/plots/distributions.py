@@ -107,9 +107,8 @@ def _reach(densities: Sequence[Density]) -> tuple[float, float]:
 
 @look.in_style
 def increments_figure(distributions: Distributions, table: Mapping[str, Moments] | None = None) -> Figure:
-    """Draw the PDFs of increments of omega, each a decade above that of the next shorter lag, and flatness against lag.
-
-    `table` gives lines at the flatness of omega and alpha. Source: the paper, section IV, with docs/errata.md E7.
+    """Draw the PDFs of increments of omega, each a decade above that of the next shorter lag, and flatness against lag,
+    with lines at the flatness in `table`. Source: the paper, section IV, with docs/errata.md E7.
     """
     figure = look.new_figure(look.WIDTH_IN, 4.6)
     left, right = figure.subplots(1, 2)

@@ -166,7 +166,6 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
 @look.in_style
 def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
     """Draw the PDF of the distance of the cameras' orientations and its median, a panel for each pair of cameras.
-    Both axes are logarithmic if even bins would show the smaller distances as one bar; the PDF is per degree.
     Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
     """
     figure = look.new_figure(look.WIDTH_IN * 0.7, 2.9 * len(distances))

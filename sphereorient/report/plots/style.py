@@ -192,11 +192,6 @@ def interval_text(of: Interval, unit: str = "", factor: float = 1.0) -> str:
     return f"{value:.{places}f}{behind} ({low:.{places}f} to {high:.{places}f})"
 
 
-def spread(count: int, most: int) -> NDArray[np.int64]:
-    """Return indices of at most `most` of `count` things, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.int64))
-
-
 def superscript(units: str) -> str:
     """Return units with a square as people write it."""
     return units.replace("^2", "\u00b2")

@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from sphereorient.experiment.recording import spread_frames
 from sphereorient.report.plots import style as look
 from sphereorient.trajectory import Trajectory, runs_of
 from sphereorient.trajectory.datasets import in_length
@@ -59,10 +60,9 @@ class TrackPart:
 
 @look.in_style
 def track_figure(track: Trajectory) -> Figure:
-    """Draw position, Tait-Bryan angles, velocities and accelerations against time: smooth with 2 sigma, and measured.
-    Of a ball in its place, the rotation alone. Frames that are not valid are shaded. Of a long track, the part of
-    `shown_part` is drawn, with a note.
-    Source: the paper, figure of a sample track; the angles by docs/errata.md E1.
+    """Draw position, Tait-Bryan angles, velocities and accelerations against time: measured, and smooth with 2 sigma;
+    of a fixed ball the rotation alone; of a long track `shown_part`. Frames that are not valid are shaded. Source: the
+    paper, figure of a sample track; the angles by docs/errata.md E1.
     """
     part = shown_part(track)
     track = part.track
@@ -108,9 +108,7 @@ def track_figure(track: Trajectory) -> Figure:
 
 @look.in_style
 def path_figure(*tracks: Trajectory) -> Figure:
-    """Draw the path in the lab, to scale, with body axes; of a long track `shown_part`. Several are of one
-    recording, a colour each sphere. Source: the paper, figure.
-    """
+    """Draw the paths of tracks of one recording, lab, to scale, with body axes; of a long track `shown_part`."""
     parts = [shown_part(track) for track in tracks]
     figure = look.new_figure(look.WIDTH_IN, 5.6)
     axes: Any = figure.add_subplot(projection="3d")
@@ -182,7 +180,6 @@ def _angles(axes: Axes, time: Floats, part: TrackPart) -> None:
 
 
 def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_]) -> None:
-    """Draw three components (N, 3) and limit the axis to them."""
     for i in range(3):
         _curve(axes, time, values[:, i], sigma[:, i], broken, i)
     _limit(axes, values, sigma)
@@ -211,7 +208,7 @@ def _dots(axes: Axes, time: Floats, values: Floats) -> None:
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
-    chosen = known[look.spread(len(known), 14)]
+    chosen = known[spread_frames(range(len(known)), 14)]
     start = track.position_smooth[chosen]
     for i, style in enumerate(look.COMPONENTS):
         tip = start + size * track.orientation_smooth[chosen, :, i]
