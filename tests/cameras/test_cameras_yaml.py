@@ -157,7 +157,7 @@ FAULTS = {
     "wide": (PINHOLE.replace("45.0", "181"), "cam1, vfov_deg: expected an angle between 0 and 180, got 181"),
     "a list": ("- 1\n- 2\n", r"expected keys and values, got \[1, 2\]"),
     "empty": ("", "got an empty file"),
-    "no yaml": ("a: [1, 2\nb: }", "expected YAML, got '.*' in line"),
+    "no yaml": ("a: [1, 2\nb: }", "expected YAML"),
 }
 
 
