@@ -291,9 +291,7 @@ def test_parameters_that_cannot_be_fitted_are_refused():
         calibrate_tsai(plane, camera.project(plane), SIZE, PITCH, ("pixel_pitch_u",))
     square, points = planted(kappa1=0.0), in_space()  # without distortion one scale of f and both pitches is open
     names = ("f", "pixel_pitch_u", "pixel_pitch_v", *ROTATION, *TRANSLATION)
-    with pytest.raises(
-        CameraError, match="expected a determined camera, got no information on f, pixel_pitch_u, pixel_pit"
-    ):
+    with pytest.raises(CameraError, match="expected a determined camera, got no information on f, pixel_pitch_u"):
         fit_to_points(square, names, points, square.project(points))
     with pytest.raises(CameraError, match="expected 5 or more for 9 parameters, got 4"):
         fit_to_points(square, names, points[:4], square.project(points[:4]))

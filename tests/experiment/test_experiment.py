@@ -144,24 +144,15 @@ FAULTS = {
     "a response of no camera": (SHORT + "response: {cam7: srgb}\n", "got 'cam7'"),
     "settings of no camera": (SHORT + "camera: {cam7: {}}\n", "got 'cam7'"),
     "a setting of a camera that there is not": (SHORT + "camera: {cam1: {triger: Line1}}\n", "'trigger'"),
-    "a pixel format of colour": (
-        SHORT + "camera: {cam1: {pixel_format: BayerRG8}}\n",
-        "pixel_format: expected 'Mono8'",
-    ),
+    "a pixel format of colour": (SHORT + "camera: {cam1: {pixel_format: BayerRG8}}\n", "pixel_format: expected"),
     "a line that YAML reads as no": (SHORT + "camera: {cam1: {trigger: off}}\n", "cam1.trigger: expected"),
     "an exposure longer than the interval": (
         SHORT + "camera: {cam1: {exposure_ms: 4, rate_hz: 500}}\n",
         "exposure_ms: expected at most 2 ms",
     ),
     "a flip of no camera": (SHORT + "flip: {cam7: both}\n", "got 'cam7'"),
-    "schema": (
-        SHORT.replace("experiment/1", "experiment/7"),
-        "schema: expected sphereorient-experiment/1, got 'sphere",
-    ),
-    "cameras file": (
-        "schema: sphereorient-cameras/1\ncameras: {}\n",
-        "expected sphereorient-experiment/1, got 'sphere",
-    ),
+    "schema": (SHORT.replace("experiment/1", "experiment/7"), "schema: expected sphereorient-experiment/1, got"),
+    "cameras file": ("schema: sphereorient-cameras/1\ncameras: {}\n", "expected sphereorient-experiment/1, got"),
     "a text": ("just words", "expected keys and values, got 'just words'"),
     "empty": ("", "got an empty file"),
     "no yaml": ("a: [", "expected YAML"),
