@@ -149,7 +149,7 @@ def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor
 
 def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
     """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid.
-    The keys of the model tell which focal length it has; distortion begins with their defaults.
+    Distortion begins with the defaults of the model.
     """
     port, (pitch_u, pitch_v), kind = document.ports.get(name), document.keys.pixel_pitch, MODELS[document.keys.model]
     start = start if port is None else _in_air(start, port)

@@ -35,7 +35,6 @@ def dots_at(scene: Scene, *, without: tuple[tuple[int, int], ...] = (), jitter_p
         shape=np.linalg.inv(spread @ spread.transpose(0, 2, 1))[order],
         sigma_px=np.full(n, 0.02),
         contrast=np.ones(n),
-        blur_px=np.full(n, 0.6),
         misfit=np.full(n, 0.02),
     )
 
