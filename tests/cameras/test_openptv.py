@@ -228,8 +228,3 @@ def test_files_that_are_not_there_and_addpars_that_are_short_are_refused(tmp_pat
         load_openptv(ori, load_ptv_par(par), tmp_path / "none")
     with pytest.raises(CameraError, match="got a folder"):
         load_openptv(tmp_path, load_ptv_par(par))
-
-
-def test_media_that_are_all_alike_make_no_wall():
-    assert not PtvPar(image_size=(9, 9), pixel_pitch_mm=(1.0, 1.0), n_air=1.3, n_glass=1.3, n_fluid=1.3).refracts
-    assert PtvPar(image_size=(9, 9), pixel_pitch_mm=(1.0, 1.0), n_glass=1.0, n_fluid=1.3).refracts
