@@ -1,6 +1,6 @@
 """Calibration of one camera of Tsai's model, and the first guess of all cameras, from which `bundle` goes on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
 from sphereorient.calibration.targets import PlateView
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
 from sphereorient.cameras.brown import TsaiCamera
-from sphereorient.cameras.checks import camera_error, check_image_size, check_known, check_positive
+from sphereorient.cameras.checks import camera_error, check_image_size, check_positive
 from sphereorient.cameras.io.cameras_yaml import MODELS
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
@@ -29,7 +29,6 @@ POINTS_OF_PLANE, POINTS_OF_SPACE = 5, 7  # Tsai's least numbers
 FOCAL, TRIED = (1.0, 60.0), 15  # focal lengths tried, over the largest distance of a pixel from the picture's middle
 UNCERTAIN_F = 0.1  # sigma of f over f beyond which f and T_z cannot be separated
 MISFIT = 0.01  # rms over the picture's diagonal: no lens with one fitted kappa misses by so much
-ALSO = ("sx", "centre_u", "centre_v")
 ADD = "add points"
 Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
 FREE = ("f", "kappa1", *ROTATION, *TRANSLATION)
@@ -39,35 +38,26 @@ SAME = ("image_size", "R_cam_lab", "T_cam_lab_mm", "centre_px")  # fields of all
 
 
 def calibrate_tsai(
-    x_lab_mm: Tensor,
-    uv_px: Tensor,
-    image_size: tuple[int, int],
-    pixel_pitch_mm: tuple[float, float],
-    also: Sequence[str] = (),
+    x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
     """Calibrate a camera from points (n, 3), lab, mm, and their pixels (n, 2), by least squares of f, kappa1, R and T.
-    The picture has `image_size` (W, H), px, the sensor a pixel pitch along u and v, mm. `also` names what is fitted too
-    of sx (needs points outside one plane; else 1), centre_u, centre_v (strong perspective; else the picture's middle).
-    Points in one plane also fit mirrored: give the seen side.
-    Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels;
-    other names in `also`), ShapeError (arrays of another shape).
+    The picture has `image_size` (W, H), px, the sensor a pixel pitch along u and v, mm; s_x is 1, the centre the
+    picture's middle: `fit_to_points` fits these too. Points in one plane also fit mirrored: give the seen side.
+    Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels),
+    ShapeError (arrays of another shape).
     Source: Tsai 1987 (model); Terzakis and Lourakis 2020 (SQPnP, the start for each of some focal lengths).
     """
-    check_known(also, ALSO, "also")
     points, pixels = checked_points(x_lab_mm, uv_px)
     check_image_size("image_size", image_size)
     pitch = torch.tensor(pixel_pitch_mm, dtype=torch.float64)
     check_positive("pixel_pitch_mm", pitch)
     flat = _is_flat(points)
-    if "sx" in also and flat:
-        do = "leave out sx, or add points off the plane"
-        raise camera_error("also, sx", "points that fill space", "points in one plane", do)
     centre, fitted = middle_of_picture(image_size), []
     for f_mm, R, T in _starts(points, (pixels - centre) * pitch):
         pose: dict[str, Any] = {"f_mm": f_mm, "R_cam_lab": R, "T_cam_lab_mm": T, "sx": 1.0, "kappa1": 0.0}
         start = TsaiCamera(image_size=image_size, centre_px=centre, pixel_pitch_mm=pitch, **pose)
         with suppress(CameraError):
-            fitted.append(fit_to_points(start, (*FREE, *also), points, pixels))
+            fitted.append(fit_to_points(start, FREE, points, pixels))
     if not fitted and flat:
         raise _parallel("none")
     if not fitted:
