@@ -181,14 +181,7 @@ def adjust(problem: Problem) -> Fitted:
     good = torch.ones(sum(lengths), dtype=torch.bool)
     for k in range(ROUNDS):
         shifts, rows = problem.shifts(problem.applied(change)), good.repeat_interleave(2)  # rows: u and v of points
-        change = least_squares(
-            lambda at, shifts=shifts, rows=rows: problem.residuals(at, shifts)[rows],
-            lambda at, rows=rows: problem.slopes(at)[rows],
-            change,
-            soft=SOFT,
-            gain=GAIN[k == ROUNDS - 1],
-            steps=STEPS,
-        )
+        change = _solved(problem, change, shifts, rows, GAIN[k == ROUNDS - 1])
         size = problem.residuals(change, shifts).view(-1, 2).norm(dim=1)
         usual = float(size.nanmedian()) / 1.1774  # the median length of a two-dimensional Gaussian is 1.1774 sigma
         good = size <= OUTLIER * max(usual, 1e-12)
@@ -210,6 +203,17 @@ def adjust(problem: Problem) -> Fitted:
         scale=scale,
         problem=problem,
         covariance=covariance,
+    )
+
+
+def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows: Tensor, gain: float) -> Tensor:
+    return least_squares(
+        lambda change: problem.residuals(change, shifts)[rows],
+        lambda change: problem.slopes(change)[rows],
+        start,
+        soft=SOFT,
+        gain=gain,
+        steps=STEPS,
     )
 
 

@@ -243,7 +243,11 @@ def test_pixels_of_other_points_are_refused():
 
 def test_too_few_points_are_refused_and_just_enough_are_not():
     camera, space, plane = planted(), in_space(), in_plane()[[0, 12, 84, 156, 30]]
-    for points, line in ((space[:6], "expected 7 or more in space, got 6"), (plane[:4], "expected 5 or more")):
+    for points, line in (
+        (space[:6], "expected 7 or more in space, got 6"),
+        (plane[:4], "5 or more"),
+        (plane[:0], "5 or more"),
+    ):
         with pytest.raises(CameraError, match=line):
             calibrate_tsai(points, camera.project(points), SIZE, PITCH)
     for points in (space[:7], plane):
