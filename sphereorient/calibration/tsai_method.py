@@ -72,7 +72,7 @@ def _is_flat(points: Tensor) -> bool:
     """Return whether points (n, 3) lie in a plane; CameraError for too few, or points on a line."""
     some = points if len(points) else points.new_zeros(1, 3)
     height, width, length = torch.linalg.eigvalsh(some.mT.cov(correction=0)).clamp_min(0).sqrt().tolist()
-    flat: bool = height < FLAT * length
+    flat: bool = height <= FLAT * length
     least, where = (POINTS_OF_PLANE, "in one plane") if flat else (POINTS_OF_SPACE, "in space")
     if len(points) < least:
         raise camera_error("points", f"{least} or more {where}", f"{len(points)}", ADD)
