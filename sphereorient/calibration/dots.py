@@ -30,7 +30,6 @@ class Dots:
     shape: Floats  # (n, 2, 2), 1/px^2: x^T shape x = 1 on the rim, x from the centre
     sigma_px: Floats  # (n,), standard deviation of each of u and v, from the fit
     contrast: Floats  # (n,), share of the light that is missing in the dark part, 0 .. 1
-    blur_px: Floats  # (n,), sigma of the rim
     misfit: Floats  # (n,), rms of the picture around the fitted dot, relative to its contrast
 
     def __len__(self) -> int:
@@ -171,7 +170,6 @@ def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *,
         shape=values[:, [[2, 3], [3, 4]]],
         sigma_px=sigma,
         contrast=values[:, 9],
-        blur_px=values[:, 5],
         misfit=misfit,
     )
 

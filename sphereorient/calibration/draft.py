@@ -138,7 +138,7 @@ def _key(name: str, comment: str, value: Any = ..., asked: Any = None) -> DraftK
 
 
 def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: int) -> list[DraftKey]:
-    """Return the keys of a plate of dots, where any picture shows one; the pitch is what pictures cannot tell."""
+    """Return the keys of a plate of dots, where any picture shows one; no picture shows the pitch."""
     if not seen:
         comment = f"no dots in any of {count} pictures: type, columns, rows, pitch (docs/calibration.md)"
         return [_key("plate", comment, asked={"type": "chessboard", "columns": 9, "rows": 6, "pitch": 10.0})]
@@ -147,15 +147,15 @@ def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: i
     marks = Counter(one.marks for one in seen if one.marks).most_common(1)
     on_x, on_y = marks[0][0] if marks else (3, 2)
     fiducials = [[0, 0], [on_x, 0], [0, on_y]]
-    told = f"of the largest grid seen, in {whole} of {len(seen)} pictures"
+    seen_in = f"of the largest grid seen, in {whole} of {len(seen)} pictures"
     of_pitch = {name: f"{width:.3f} of the pitch, measured; mm" for name, width in widths.items()}
     mm = {name: round(8.0 * widths.get(name, 0.6), 2) for name in DIAMETERS}
     larger = "larger dots at the middle of the grid, on +x, on +y: columns and rows from the first"
     dark = 2 * sum(one.dark for one in seen) >= len(seen)
     return [
         _key("plate.type", "or chessboard, charuco, circles", "dots"),
-        _key("plate.columns", told, columns),
-        _key("plate.rows", told, rows),
+        _key("plate.columns", seen_in, columns),
+        _key("plate.rows", seen_in, rows),
         _key("plate.pitch", "mm, between the middles of dots", asked=8.0),
         *(DraftKey(name=name, comment=of_pitch.get(name, "mm; none was seen"), example=mm[name]) for name in DIAMETERS),
         _key("plate.fiducials", larger, fiducials if marks else ..., fiducials),

@@ -29,7 +29,7 @@ PRIOR = torch.tensor([0.1] * 3 + [2.0] * 3, dtype=torch.float64)  # sigma of a c
 BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alone: a dark rim shifts its centre
 SHARED = 12  # consecutive frames that share one error of the centre: they have the same light
 HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
-FRAMES_MIN = 20  # fewer do not tell displacements from the scatter of frames
+FRAMES_MIN = 20  # fewer do not separate displacements from the scatter of frames
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
 CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
 

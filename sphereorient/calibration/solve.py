@@ -14,7 +14,7 @@ DAMPING = 1e-4  # at the start, relative to the information's diagonal
 LEAST, MOST = 1e-12, 1e10  # of the damping; beyond the upper one no step helps
 FAR = 1e6  # residual of a point that a trial camera does not see
 SIGMA_PX = 0.05  # of good centroids, and of corners of drawn boards (0.03 to 0.07): none is certain
-UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: float64 cannot tell less from zero
+UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: less is zero in float64
 
 
 def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: Sequence[Tensor] | Tensor) -> Tensor:

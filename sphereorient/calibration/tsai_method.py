@@ -1,10 +1,6 @@
-"""Tsai's calibration of one camera, and the first guess of all cameras, from which `bundle` goes on.
+"""Calibration of one camera of Tsai's model, and the first guess of all cameras, from which `bundle` goes on."""
 
-Tsai: distortion is radial; a pixel and its point have the same direction from the optical axis, taken at the picture's
-middle. Linear equations give R, T_x, T_y, then f, T_z; a search refines f, T_z, kappa1.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -21,175 +17,85 @@ from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
 from sphereorient.calibration.targets import PlateView
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
 from sphereorient.cameras.brown import TsaiCamera
-from sphereorient.cameras.checks import camera_error, check_image_size, check_known, check_positive
+from sphereorient.cameras.checks import camera_error, check_image_size, check_positive
 from sphereorient.cameras.io.cameras_yaml import MODELS
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
 from sphereorient.errors import CameraError
 
-FLAT = 3e-3  # relief over width below which the linear stage takes points as a plane
+FLAT = 3e-3  # relief over length below which points count as a plane
 LINE = 1e-6  # width over length below which points are on a line
-POINTS_OF_PLANE = 5  # that the radial alignment of a plane needs; Tsai's numbers
-POINTS_OF_SPACE = 7
+POINTS_OF_PLANE, POINTS_OF_SPACE = 5, 7  # Tsai's least numbers
+FOCAL, TRIED = (1.0, 60.0), 15  # focal lengths tried, over the largest distance of a pixel from the picture's middle
 UNCERTAIN_F = 0.1  # sigma of f over f beyond which f and T_z cannot be separated
 MISFIT = 0.01  # rms over the picture's diagonal: no lens with one fitted kappa misses by so much
-ALSO = ("sx", "centre_u", "centre_v")
 ADD = "add points"
-Pose = tuple[Tensor, Tensor]  # R (3, 3) or its first two rows, and T (3,), mm, or T_x, T_y
+Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
 FREE = ("f", "kappa1", *ROTATION, *TRANSLATION)
 POINTS_MIN = 6  # of a picture that is used
 VIEWS_MIN = 3  # of a camera: two planes do not determine the focal length
 SAME = ("image_size", "R_cam_lab", "T_cam_lab_mm", "centre_px")  # fields of all models
 
 
-def tsai_stages(
+def calibrate_tsai(
     x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
-    """Calibrate a camera by Tsai's two stages: R, T_x, T_y from radial alignment, then f, T_z and kappa1.
-    From points (n, 3), lab, mm, right-handed, and their pixels (n, 2), for a picture of `image_size` (W, H), px, and a
-    pixel pitch along u and v; s_x is 1. Points in one plane also fit mirrored: give the seen side. The covariance takes
-    R, T_x, T_y as exact; with noise, `calibrate_tsai` is more accurate.
+    """Calibrate a camera from points (n, 3), lab, mm, and their pixels (n, 2), by least squares of f, kappa1, R and T.
+    The picture has `image_size` (W, H), px, the sensor a pixel pitch along u and v, mm; s_x is 1, the centre the
+    picture's middle: `fit_to_points` fits these too. Points in one plane also fit mirrored: give the seen side.
     Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels),
     ShapeError (arrays of another shape).
-    Source: Tsai 1987, stages 1 and 2, which the paper uses without error.
+    Source: Tsai 1987 (model); Terzakis and Lourakis 2020 (SQPnP, the start for each of some focal lengths).
     """
     points, pixels = checked_points(x_lab_mm, uv_px)
-    _check_count(points, POINTS_OF_PLANE, "in one plane")
     check_image_size("image_size", image_size)
     pitch = torch.tensor(pixel_pitch_mm, dtype=torch.float64)
     check_positive("pixel_pitch_mm", pitch)
-    centre = middle_of_picture(image_size)
-    sensor_mm = (pixels - centre) * pitch
-    starts = []
-    for R, T_aside in _aligned(points, sensor_mm):
-        f_mm, T = _with_depth(R, T_aside, points, sensor_mm)
-        if f_mm > 0 and bool((points @ R[2] + T[2] > 0).all()):
-            start: dict[str, Any] = {"f_mm": f_mm, "R_cam_lab": R, "T_cam_lab_mm": T, "sx": 1.0, "kappa1": 0.0}
-            starts.append(TsaiCamera(image_size=image_size, centre_px=centre, pixel_pitch_mm=pitch, **start))
-    if not starts and _Frame(points).relief < FLAT:
+    flat = _is_flat(points)
+    centre, fitted = middle_of_picture(image_size), []
+    for f_mm, R, T in _starts(points, (pixels - centre) * pitch):
+        pose: dict[str, Any] = {"f_mm": f_mm, "R_cam_lab": R, "T_cam_lab_mm": T, "sx": 1.0, "kappa1": 0.0}
+        start = TsaiCamera(image_size=image_size, centre_px=centre, pixel_pitch_mm=pitch, **pose)
+        with suppress(CameraError):
+            fitted.append(fit_to_points(start, FREE, points, pixels))
+    if not fitted and flat:
         raise _parallel("none")
-    if not starts:
+    if not fitted:
         do = "check the points' order and the axes' signs (lab right-handed, u to the right, v downwards)"
         raise camera_error("points", "points as a camera sees them", "their mirror image, or others", do)
-    camera = _best(starts, points, pixels)
+    camera = min(fitted, key=lambda one: torch.tensor(rms_px(one, points, pixels)).nan_to_num(torch.inf))
     _check_fit(camera, points, pixels)
     return camera
 
 
-def calibrate_tsai(
-    x_lab_mm: Tensor,
-    uv_px: Tensor,
-    image_size: tuple[int, int],
-    pixel_pitch_mm: tuple[float, float],
-    also: Sequence[str] = (),
-) -> TsaiCamera:
-    """Calibrate a camera as `tsai_stages`, then fit all parameters together by least squares in the picture.
-    `also` names which of sx (needs points outside one plane), centre_u, centre_v (strong perspective) are fitted
-    besides f, kappa1, R and T. Errors as in `tsai_stages`; CameraError for other names in `also`.
-    """
-    check_known(also, ALSO, "also")
-    camera = tsai_stages(x_lab_mm, uv_px, image_size, pixel_pitch_mm)
-    points, pixels = checked_points(x_lab_mm, uv_px)
-    if "sx" in also and _Frame(points).relief < FLAT:
-        do = "leave out sx, or add points off the plane"
-        raise camera_error("also, sx", "points that fill space", "points in one plane", do)
-    camera = fit_to_points(camera, (*FREE, *also), points, pixels)
-    _check_fit(camera, points, pixels)
-    return camera
-
-
-class _Frame:
-    """Middle (3,) and axes (3, 3) of points (n, 3), and their width and height over their length."""
-
-    def __init__(self, points: Tensor) -> None:
-        self.middle_lab_mm = points.mean(0)
-        _, size, axes = torch.linalg.svd(points - self.middle_lab_mm, full_matrices=False)
-        self.R_own_lab = axes * torch.linalg.det(axes).sign()  # right-handed
-        _, self.narrow, self.relief = (size / size[0].clamp_min(torch.finfo(size.dtype).tiny)).tolist()
-
-
-def _aligned(points: Tensor, sensor_mm: Tensor) -> list[Pose]:
-    """Return the poses, with T_z 0, that put each point in the direction of its pixel."""
-    frame = _Frame(points)
-    if frame.narrow < LINE:
-        raise camera_error("x_lab_mm", "points in a plane or in space", "points on a line", ADD)
-    flat = frame.relief < FLAT
-    _check_count(points, POINTS_OF_PLANE if flat else POINTS_OF_SPACE, "in one plane" if flat else "in space")
-    own = (points - frame.middle_lab_mm) @ frame.R_own_lab.mT  # own axes: well scaled equations
-    width = float(own.abs().max())
-    found = []
-    for rows, T_xy in (_aligned_plane if flat else _aligned_space)(own / width, sensor_mm):
-        R_cam_own = torch.stack([rows[0], rows[1], torch.linalg.cross(rows[0], rows[1])])
-        R_cam_lab, T_own = R_cam_own @ frame.R_own_lab, torch.cat([T_xy, T_xy.new_zeros(1)])
-        found.append((R_cam_lab, T_own * width - R_cam_lab @ frame.middle_lab_mm))
-    return found
-
-
-def _aligned_space(own: Tensor, sensor_mm: Tensor) -> list[Pose]:
-    """Solve x_d (r_4..6 . X + T_y) = y_d (r_1..3 . X + T_x) for the first two rows of R and T_x, T_y."""
-    x, y = sensor_mm[:, :1], sensor_mm[:, 1:]
-    a = _null_vector(torch.cat([y * own, y, -x * own, -x], dim=-1)).reshape(2, 4)
-    left, size, right = torch.linalg.svd(a[:, :3], full_matrices=False)
-    rows = left @ right  # Horn: the nearest two orthonormal rows
-    return [_facing(rows, a[:, 3] / size.mean(), own, sensor_mm)]
-
-
-def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[Pose]:
-    """Solve the same for z = 0: two mirrored rotations, whose 2 x 2 corner has the larger singular value 1."""
-    x, y, flat = sensor_mm[:, :1], sensor_mm[:, 1:], own[:, :2]
-    a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
-    a = a / torch.linalg.matrix_norm(a[:, :2], ord=2)
-    corner, T_xy = _facing(a[:, :2], a[:, 2], flat, sensor_mm)
-    # The missing column makes the rows orthonormal: I - C C^T has rank one.
-    values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
-    missing = vectors[:, 1] * values[1].clamp_min(0).sqrt()
-    return [(torch.cat([corner, sign * missing[:, None]], dim=-1), T_xy) for sign in (1.0, -1.0)]
-
-
-def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> Pose:
-    """Return rows and T with the sign that puts points on the same side of the axis as their pixels (Tsai's T_y)."""
-    sign = ((own @ rows.mT + T_xy) * sensor_mm).sum().sign()
-    return rows * sign, T_xy * sign
-
-
-def _null_vector(equations: Tensor) -> Tensor:
-    """Return the null vector of equations (n, k); Tsai's division by T_y fails with the origin on the middle row."""
-    # Columns of length 1 make sensor and point coordinates comparable despite different units.
-    scale = equations.norm(dim=0).clamp_min(torch.finfo(equations.dtype).tiny)
-    n, k = equations.shape
-    # With fewer equations than unknowns only the full V holds the vector.
-    _, size, right = torch.linalg.svd(equations / scale, full_matrices=n < k)
-    if float(size[k - 2]) < 1e-9 * float(size[0]):
-        got = "points whose directions in the picture do not determine the pose"
-        raise camera_error("points", "points all over the picture", got, ADD)
-    solution: Tensor = right[k - 1] / scale
-    return solution
-
-
-def _with_depth(R: Tensor, T: Tensor, points: Tensor, sensor_mm: Tensor) -> tuple[float, Tensor]:
-    """Solve f X_cam - x_d T_z = x_d (r_7..9 . X), and the same of y, for f and T, whose T_z is 0; no distortion."""
-    turned = points @ R.mT + T
-    equations = torch.stack([turned[:, :2].reshape(-1), -sensor_mm.reshape(-1)], dim=-1)
-    scale = equations.norm(dim=0).clamp_min(torch.finfo(equations.dtype).tiny)
-    right = (sensor_mm * turned[:, 2:]).reshape(-1, 1)
-    f_mm, T_z = (torch.linalg.lstsq(equations / scale, right, driver="gelsd").solution[:, 0] / scale).tolist()
-    return f_mm, T + T.new_tensor([0.0, 0.0, T_z])
-
-
-def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiCamera:
-    """Fit f, T_z and kappa1 from each start; return the best, skipping undetermined ones."""
-    names, fitted = ("f", "T_z", "kappa1"), []
-    for start in starts:
-        with suppress(CameraError):
-            fitted.append(fit_to_points(start, names, points, pixels))
-    if not fitted:
-        return fit_to_points(starts[-1], names, points, pixels)  # which is refused
-    return min(fitted, key=lambda camera: rms_px(camera, points, pixels))
-
-
-def _check_count(points: Tensor, least: int, where: str) -> None:
+def _is_flat(points: Tensor) -> bool:
+    """Return whether points (n, 3) lie in a plane; CameraError for too few, or points on a line."""
+    some = points if len(points) else points.new_zeros(1, 3)
+    height, width, length = torch.linalg.eigvalsh(some.mT.cov(correction=0)).clamp_min(0).sqrt().tolist()
+    flat: bool = height <= FLAT * length
+    least, where = (POINTS_OF_PLANE, "in one plane") if flat else (POINTS_OF_SPACE, "in space")
     if len(points) < least:
         raise camera_error("points", f"{least} or more {where}", f"{len(points)}", ADD)
+    if not width > LINE * length:
+        raise camera_error("x_lab_mm", "points in a plane or in space", "points on a line", ADD)
+    return flat
+
+
+def _starts(points: Tensor, sensor_mm: Tensor) -> list[tuple[float, Tensor, Tensor]]:
+    """Return f, R and T of the poses that fit best: the best one, and the best of those turned far from it."""
+    middle, found = points.mean(0), []
+    for f_mm in np.geomspace(*FOCAL, TRIED) * float(sensor_mm.abs().max()):
+        K = np.diag([f_mm, f_mm, 1.0])
+        arrays = (points - middle).numpy(), sensor_mm.numpy(), K, None
+        with suppress(cv2.error):  # pixels that are too near to each other
+            _, turns, moves, misses = cv2.solvePnPGeneric(*arrays, flags=cv2.SOLVEPNP_SQPNP)
+            for turn, move, miss in zip(turns, moves, misses[:, 0], strict=True):
+                R = so3.exp(torch.from_numpy(turn[:, 0]))
+                found.append((float(miss), f_mm, R, torch.from_numpy(move[:, 0]) - R @ middle))
+    found.sort(key=lambda one: one[0])
+    best = found[:1]
+    best += [one for one in found if float(so3.geodesic_distance(one[2], best[0][2])) > 0.2][:1]
+    return [one[1:] for one in best]
 
 
 def _check_fit(camera: TsaiCamera, points: Tensor, pixels: Tensor) -> None:
@@ -234,7 +140,7 @@ def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor
 
 def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
     """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid.
-    The keys of the model tell which focal length it has; distortion begins with their defaults.
+    Distortion begins with the defaults of the model.
     """
     port, (pitch_u, pitch_v), kind = document.ports.get(name), document.keys.pixel_pitch, MODELS[document.keys.model]
     start = start if port is None else _in_air(start, port)

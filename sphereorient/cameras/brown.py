@@ -1,7 +1,6 @@
 """Cameras with polynomial distortion: Brown's, in OpenCV's model and OpenPTV's, and Tsai's radial one."""
 
 import math
-from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -112,17 +111,17 @@ class PolynomialCamera(CentralCamera):
             raise camera_error("k, p", "a distortion that can be undone in the picture", got, do)
 
     @property
-    @abstractmethod
     def _p_opencv(self) -> Tensor:
-        """(2,), tangential, in OpenCV's order."""
+        """(2,), tangential, in OpenCV's order; this default has none."""
+        return torch.zeros(2, dtype=torch.float64)
 
-    @abstractmethod
     def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
         """Return pixels as points on the plane of the polynomial."""
+        return (uv_px - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
 
-    @abstractmethod
     def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
         """Invert `_plane`."""
+        return xy * self.focal_px.to(xy) + self.centre_px.to(xy)
 
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Undistort pixels (..., 2) to the last digits; NaN beyond the fold, which lies outside the picture."""
@@ -160,12 +159,6 @@ class BrownCamera(PolynomialCamera):
     @property
     def _p_opencv(self) -> Tensor:
         return self.p
-
-    def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
-        return (uv_px - self.centre_px.to(uv_px)) / self.f_px.to(uv_px)
-
-    def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
-        return xy * self.f_px.to(xy) + self.centre_px.to(xy)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,7 +1,7 @@
 """What every camera gives: rays, projection and the covariance of its parameters; and the geometry of rays."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Protocol
 
@@ -113,27 +113,16 @@ class CoarserCamera:
 
     camera: Camera
     factor: int
+    image_size: tuple[int, int] = field(init=False)  # what is left at the right and below is no pixel
+    R_cam_lab: Tensor = field(init=False)
+    T_cam_lab_mm: Tensor = field(init=False)
+    covariance: ParameterCovariance | None = field(init=False)  # its parameters are in the pixels of `camera`
 
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the picture, px; what is left at the right and below is no pixel."""
+    def __post_init__(self) -> None:
+        for name in ("R_cam_lab", "T_cam_lab_mm", "covariance"):
+            object.__setattr__(self, name, getattr(self.camera, name))
         width, height = self.camera.image_size
-        return width // self.factor, height // self.factor
-
-    @property
-    def R_cam_lab(self) -> Tensor:
-        """As of the camera."""
-        return self.camera.R_cam_lab
-
-    @property
-    def T_cam_lab_mm(self) -> Tensor:
-        """As of the camera."""
-        return self.camera.T_cam_lab_mm
-
-    @property
-    def covariance(self) -> ParameterCovariance | None:
-        """As of the camera: its parameters are in its pixels."""
-        return self.camera.covariance
+        object.__setattr__(self, "image_size", (width // self.factor, height // self.factor))
 
     def _fine(self, uv_px: Tensor) -> Tensor:
         return (uv_px + 0.5) * self.factor - 0.5

@@ -64,16 +64,6 @@ class FisheyeCamera(PolynomialCamera):
         angle = torch.atan2(x, -y)  # 0 on the axis: the camera's x
         return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(x)], -1) @ R_cam_lab
 
-    @property
-    def _p_opencv(self) -> Tensor:
-        return torch.zeros(2, dtype=torch.float64)
-
-    def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
-        return (uv_px - self.centre_px.to(uv_px)) / self.f_px.to(uv_px)
-
-    def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
-        return xy * self.f_px.to(xy) + self.centre_px.to(xy)
-
     def _flattened(self, x_cam_mm: Tensor) -> tuple[Tensor, Tensor]:
         """Return points at their angle from the axis, rad, in their direction about it; not seen is the axis behind."""
         aside2, depth = x_cam_mm[..., :2].square().sum(-1, keepdim=True), x_cam_mm[..., 2:]

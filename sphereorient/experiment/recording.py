@@ -50,7 +50,7 @@ class CameraStream:
 
     @property
     def photograph(self) -> bool:
-        """Whether it is one picture: of one camera alone it tells the size of the ball."""
+        """Whether it is one picture."""
         return len(self) == 1
 
     def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:

@@ -52,25 +52,25 @@ def cached(kind: str, inputs: Iterable[Tensor | str | float | None], make: Calla
 
 
 def _key(inputs: Iterable[Tensor | str | float | None]) -> str:
-    told = hashlib.sha256(_code())
+    total = hashlib.sha256(_code())
     for one in inputs:
         if isinstance(one, Tensor):
-            told.update(f"{tuple(one.shape)} {one.dtype}".encode() + one.contiguous().numpy().tobytes())
+            total.update(f"{tuple(one.shape)} {one.dtype}".encode() + one.contiguous().numpy().tobytes())
         else:
-            told.update(repr(one).encode())
-        told.update(b"|")
-    return told.hexdigest()[:32]
+            total.update(repr(one).encode())
+        total.update(b"|")
+    return total.hexdigest()[:32]
 
 
 @lru_cache(maxsize=1)
 def _code() -> bytes:
     """Return a word for all that decides on the last bits beside the inputs."""
-    told = hashlib.sha256(f"{torch.__version__} {np.__version__} {torch.backends.cpu.get_cpu_capability()}".encode())
+    total = hashlib.sha256(f"{torch.__version__} {np.__version__} {torch.backends.cpu.get_cpu_capability()}".encode())
     for name in MAKERS:
         files = sorted((PACKAGE / name).rglob("*.py")) if (PACKAGE / name).is_dir() else [PACKAGE / name]
         for file in files:
-            told.update(file.read_bytes())
-    return told.digest()
+            total.update(file.read_bytes())
+    return total.digest()
 
 
 def _read(path: Path) -> Arrays | None:

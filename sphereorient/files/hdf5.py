@@ -33,9 +33,9 @@ def digest(file: h5py.File) -> str:
     total = hashlib.sha256()
 
     def add(name: str, thing: h5py.Group | h5py.Dataset) -> None:
-        told = {key: np.asarray(value).tolist() for key, value in thing.attrs.items() if key != "sha256"}
+        named = {key: np.asarray(value).tolist() for key, value in thing.attrs.items() if key != "sha256"}
         values = np.asarray(thing[()]) if isinstance(thing, h5py.Dataset) else np.zeros(0)
-        total.update(f"{name} {values.dtype} {values.shape} {sorted(told.items())}".encode() + values.tobytes())
+        total.update(f"{name} {values.dtype} {values.shape} {sorted(named.items())}".encode() + values.tobytes())
 
     add("", file)
     file.visititems(add)

@@ -120,4 +120,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, form: str, *values: object) -> None:
-        """Print nothing: the page tells what happens."""
+        """Print nothing: the page shows what happens."""

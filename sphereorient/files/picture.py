@@ -84,7 +84,7 @@ def decoded_grey(content: bytes) -> NDArray[Any] | None:
 
 
 def vertical_field_deg(path: Path) -> float | None:
-    """Return the field of view, top to bottom, of a photograph by its EXIF tags; None where they do not tell it: no
+    """Return the field of view, top to bottom, of a photograph by its EXIF tags; None without it: no
     focal length for 35 mm film, or a picture that was cut or scaled since. CIPA DC-008: that length is for equal
     diagonals, 43.27 mm.
     """

@@ -72,7 +72,7 @@ def writing(inputs: Iterable[Path] = (), *, force: bool = False) -> Iterator[Non
     """Within this context `inputs` are not replaced; with `force` all other plain files may be."""
     found = set()
     for path in inputs:
-        with suppress(OSError, ValueError):  # whoever reads it tells what is wrong
+        with suppress(OSError, ValueError):  # reading it reports what is wrong
             status = path.stat()
             found.add((status.st_dev, status.st_ino))
     known, forced = _inputs.set(_inputs.get() | found), _forced.set(_forced.get() or force)
@@ -149,8 +149,8 @@ def _hdf5_has_mark(path: Path) -> bool:
     import h5py
 
     with h5py.File(path, "r") as file:
-        told = [file.attrs.get(name) for name in ("made_by", "schema")]  # the second of older versions
-    return any(isinstance(one, str) and one.startswith("sphereorient") for one in told)
+        found = [file.attrs.get(name) for name in ("made_by", "schema")]  # the second of older versions
+    return any(isinstance(one, str) and one.startswith("sphereorient") for one in found)
 
 
 def _add_mark(path: Path) -> None:

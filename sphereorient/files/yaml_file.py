@@ -68,7 +68,7 @@ def validated(
     model: type[Model], data: Any, where: str, error: type[SphereOrientError], also: Sequence[str] = ()
 ) -> Model:
     """Validate YAML data against a model that forbids extra keys; raise `error` with the first fault and `where`.
-    All missing keys are told at once; `also`: those that the caller misses.
+    All missing keys are named at once; `also`: those that the caller misses.
     """
     try:
         return model.model_validate(data)

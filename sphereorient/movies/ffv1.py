@@ -69,7 +69,7 @@ class SliceDecoder:
 
     def matches(self, packet: bytes, picture: Grey) -> bool:
         """Learn from one packet and its picture (H, W) where slices lie: on the one grid, row by row, on which each
-        alone gives its part and nothing else. Return False where none is, or where the picture is too dark to tell:
+        alone gives its part and nothing else. Return False where none is, or where the picture is too dark for that:
         then whole frames must be decoded.
         """
         slices = split_slices(packet)

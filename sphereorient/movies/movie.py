@@ -98,10 +98,10 @@ class Movie:
         do = "export the movie again, or leave the frame out with frames: in the experiment"
         return refused(f"{self.path}, frame {number}", "a decodable picture", got, do)
 
-    def _truncated(self, told: int) -> tuple[str, ...]:
+    def _truncated(self, stated: int) -> tuple[str, ...]:
         """Return the remark on a movie whose header states more frames than the file holds."""
         there = len(self)
-        return (f"truncated: its header tells of {told} frames, {there} are there",) if there < told else ()
+        return (f"truncated: its header tells of {stated} frames, {there} are there",) if there < stated else ()
 
     def __enter__(self) -> Self:
         return self

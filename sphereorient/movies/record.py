@@ -48,21 +48,21 @@ class Recorder:
         self._sent = self._lost = 0
         self._ended = False
         stamps, self._stamps = spawn.Pipe(duplex=False)
-        self._told, tells = spawn.Pipe(duplex=False)
+        self._lines, lines = spawn.Pipe(duplex=False)
         ring = memory, self._written, like.frame_shape, dtype
-        arguments = path, ring, stamps, tells, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN: of a single frame
+        arguments = path, ring, stamps, lines, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN: of a single frame
         self._process = spawn.Process(target=_record, args=arguments, name="recorder")
         self._process.start()
         stamps.close()
-        tells.close()
-        self._told.poll(BEGIN_S)
+        lines.close()
+        self._lines.poll(BEGIN_S)
         self._thread = Thread(target=self._listen, name="recorder", daemon=True)
         self._thread.start()
 
     def _listen(self) -> None:
         with suppress(EOFError, OSError):
             while True:
-                if line := self._told.recv_bytes().decode():
+                if line := self._lines.recv_bytes().decode():
                     self._tell(line)
         self._ended = True
         self._process.join()
@@ -103,8 +103,8 @@ class Recorder:
         self._thread.join()
 
 
-def _record(path: Path, ring: _Ring, stamps: Connection, tells: Connection, frame_s: float, left_bytes: int) -> None:
-    """Write a movie of the frames whose times come, until their sender ends; tell in lines what goes wrong."""
+def _record(path: Path, ring: _Ring, stamps: Connection, lines: Connection, frame_s: float, left_bytes: int) -> None:
+    """Write a movie of the frames whose times come, until their sender ends; send a line for what goes wrong."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
     memory, written, shape, dtype = ring
     times_s, frames = list[float](), np.frombuffer(memory, dtype).reshape(-1, *shape)
@@ -118,15 +118,15 @@ def _record(path: Path, ring: _Ring, stamps: Connection, tells: Connection, fram
                     shift_s = times_s[-1] + frame_s - time_s
                 if len(times_s) % EVERY == 0 and (free := shutil.disk_usage(path.parent).free) < left_bytes:
                     got, do = f"{free / 1e6:.0f} MB left", "make room; the recording ends here, tracking goes on"
-                    tells.send_bytes(refusal(str(path), expected="a disk with room", got=got, do=do).encode())
+                    lines.send_bytes(refusal(str(path), expected="a disk with room", got=got, do=do).encode())
                     stamps.close()
                     return
                 times_s.append(time_s + shift_s)
                 yield frames[written.value % len(frames)]
                 written.value += 1
 
-    tells.send_bytes(b"")  # it has begun
+    lines.send_bytes(b"")  # it has begun
     try:
         write_movie(path, taken(), times_s, 1 / frame_s)
     except SphereOrientError as error:
-        tells.send_bytes(str(error).encode() if times_s else b"")  # without frames no movie is expected
+        lines.send_bytes(str(error).encode() if times_s else b"")  # without frames no movie is expected

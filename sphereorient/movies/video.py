@@ -295,7 +295,7 @@ def _stated_frames(path: Path, container: av.container.InputContainer, count: in
     if not (matroska and container.duration and stream.average_rate):
         return 0
     rate = float(stream.average_rate)
-    # Of unevenly spaced frames only the end tells, of many in a step of their stamps only the number.
+    # The end counts for unevenly spaced frames, the number for several frames in a step of their stamps.
     missing = min(container.duration * rate / av.time_base - count, (container.duration / av.time_base - end_s) * rate)
     return count + round(missing) if missing > SLACK else 0
 

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-import yaml
 from calibrate_examples import document, write
 from conftest import assert_close
 
@@ -37,10 +36,6 @@ def test_a_rotation_with_few_digits_is_made_one(tmp_path):
     R, _ = load_calibration(write(tmp_path, content, drawn=False)).surveyed[0]
     assert_close(R @ R.mT, torch.eye(3).double(), atol=1e-12)
     assert_close(R[0, 0], torch.tensor(c).double(), atol=1e-5)
-
-
-def without_surveyed():
-    return {"surveyed": None}
 
 
 def surveyed(**changes):
@@ -141,8 +136,3 @@ def test_tables_that_are_none_are_refused(tmp_path, text, words):
         read_points(path)
     with pytest.raises(CameraError, match="no such file"):
         read_points(tmp_path / "q.csv")
-
-
-def test_the_document_of_the_tests_is_what_the_docs_show(tmp_path):
-    content = yaml.safe_load(write(tmp_path, drawn=False).read_text())
-    assert content["schema"] == "sphereorient-calibration/1"

@@ -33,74 +33,42 @@ def turned(rotvec: tuple[float, float, float] = ROTVEC) -> Tensor:
     return torch.from_numpy(Rotation.from_rotvec(rotvec).as_matrix())
 
 
-def tsai(kappa1: float | Tensor = 2.2e-4, **changes: object) -> TsaiCamera:
-    parameters: dict[str, object] = {
-        "image_size": SIZE,
-        "R_cam_lab": turned(),
-        "T_cam_lab_mm": f64(T_MM),
-        "centre_px": f64((331.0, 228.5)),
-        "f_mm": f64(45.0),
-        "pixel_pitch_mm": f64((0.02, 0.021)),
-        "sx": f64(1.03),
-        "kappa1": kappa1,
-    }
-    return TsaiCamera(**(parameters | changes))
-
-
-def pinhole(**changes: object) -> PinholeCamera:
-    parameters: dict[str, object] = {
-        "image_size": SIZE,
-        "R_cam_lab": turned(),
-        "T_cam_lab_mm": f64(T_MM),
-        "centre_px": f64((331.0, 228.5)),
-        "f_px": f64(700.0),
-    }
-    return PinholeCamera(**(parameters | changes))
-
-
-def lens() -> dict[str, object]:
+def lens(**own: object) -> dict[str, object]:
+    """Return the parameters that all cameras here share, and others."""
     return {
         "image_size": SIZE,
         "R_cam_lab": turned(),
         "T_cam_lab_mm": f64(T_MM),
         "centre_px": f64((331.0, 228.5)),
-        "f_px": f64((700.0, 715.0)),
-    }
+    } | own
+
+
+def tsai(kappa1: float | Tensor = 2.2e-4, **changes: object) -> TsaiCamera:
+    own = lens(f_mm=f64(45.0), pixel_pitch_mm=f64((0.02, 0.021)), sx=f64(1.03), kappa1=kappa1)
+    return TsaiCamera(**(own | changes))
+
+
+def pinhole(**changes: object) -> PinholeCamera:
+    return PinholeCamera(**(lens(f_px=f64(700.0)) | changes))
 
 
 def brown(**changes: object) -> BrownCamera:
-    return BrownCamera(**(lens() | {"k": f64((-0.21, 0.12, -0.03)), "p": f64((2e-3, -1.5e-3))} | changes))
+    own = lens(f_px=f64((700.0, 715.0)), k=f64((-0.21, 0.12, -0.03)), p=f64((2e-3, -1.5e-3)))
+    return BrownCamera(**(own | changes))
 
 
 def fisheye(**changes: object) -> FisheyeCamera:
-    return FisheyeCamera(**(lens() | {"k": f64((-0.02, 0.005, -0.004, 0.001))} | changes))
+    return FisheyeCamera(**(lens(f_px=f64((700.0, 715.0)), k=f64((-0.02, 0.005, -0.004, 0.001))) | changes))
 
 
 def telecentric(**changes: object) -> TelecentricCamera:
-    parameters: dict[str, object] = {
-        "image_size": SIZE,
-        "R_cam_lab": turned(),
-        "T_cam_lab_mm": f64(T_MM),
-        "centre_px": f64((331.0, 228.5)),
-        "scale_mm_px": f64(0.23),
-    }
-    return TelecentricCamera(**(parameters | changes))
+    return TelecentricCamera(**(lens(scale_mm_px=f64(0.23)) | changes))
 
 
 def openptv(**changes: object) -> OpenPTVCamera:
-    parameters: dict[str, object] = {
-        "image_size": SIZE,
-        "R_cam_lab": turned(),
-        "T_cam_lab_mm": f64(T_MM),
-        "centre_px": f64((331.0, 228.5)),
-        "f_mm": f64(18.0),
-        "pixel_pitch_mm": f64((0.02, 0.021)),
-        "k": f64((-4e-4, 6e-7, 1e-9)),
-        "p": f64((1e-4, -2e-4)),
-        "scx": f64(1.003),
-        "she": f64(0.002),
-    }
-    return OpenPTVCamera(**(parameters | changes))
+    own = lens(f_mm=f64(18.0), pixel_pitch_mm=f64((0.02, 0.021)), scx=f64(1.003), she=f64(0.002))
+    own |= {"k": f64((-4e-4, 6e-7, 1e-9)), "p": f64((1e-4, -2e-4))}
+    return OpenPTVCamera(**(own | changes))
 
 
 MODELS = {"tsai": tsai, "pinhole": pinhole, "brown": brown, "telecentric": telecentric, "openptv": openptv}

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from camera_examples import MODELS, behind_port, f64, pinhole, tsai, whole_picture
+from camera_examples import MODELS, behind_port, f64, tsai, whole_picture
 from conftest import SHARED, assert_close
 
-from sphereorient.cameras import PinholeCamera, TsaiCamera, load_cameras, save_cameras
+from sphereorient.cameras import load_cameras, save_cameras
 from sphereorient.cameras.camera import ParameterCovariance
 from sphereorient.errors import CameraError
 
@@ -42,25 +42,6 @@ def written(folder: Path, text: str) -> Path:
     path = folder / "cameras.yaml"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def test_cameras_come_back_to_the_last_bit(tmp_path):
-    cameras = {"left": tsai(1e-5 / 3), "right": pinhole(f_px=f64(700.0 / 3))}
-    path = tmp_path / "cameras.yaml"
-    save_cameras(path, cameras, comment="two lines\nof comment")
-    back = load_cameras(path)
-    assert list(back) == ["left", "right"]
-    assert isinstance(back["left"], TsaiCamera)
-    assert isinstance(back["right"], PinholeCamera)
-    uv_px = whole_picture()
-    for name, camera in cameras.items():
-        assert back[name].image_size == camera.image_size
-        assert torch.equal(back[name].R_cam_lab, camera.R_cam_lab)
-        assert torch.equal(back[name].rays(uv_px).direction_lab, camera.rays(uv_px).direction_lab)
-    assert path.read_text().startswith(
-        "# made by sphereorient\n# two lines\n# of comment\nschema: sphereorient-cameras/1\n"
-    )
-    assert [file.name for file in tmp_path.iterdir()] == ["cameras.yaml"]
 
 
 def test_small_numbers_are_written_so_that_yaml_reads_numbers(tmp_path):
@@ -105,17 +86,11 @@ def test_keys_that_a_calibration_adds_are_accepted(tmp_path, extra):
 FAULTS = {
     "unknown key": (TSAI.replace("kappa1", "kapa1"), r"cam1: expected one of .*got 'kapa1'; write 'kappa1' instead\."),
     "unknown top key": (TSAI + "camera: 3\n", "got 'camera'; write 'cameras' instead"),
-    "unknown model": (
-        TSAI.replace("tsai", "tsay"),
-        "model: expected one of tsai, pinhole, brown.*, got 'tsay'; write 'tsai'",
-    ),
+    "unknown model": (TSAI.replace("tsai", "tsay"), "model: expected one of tsai, pinhole, brown.*, got 'tsay'; write"),
     "model of another": (TSAI.replace("tsai", "cahvor"), "expected one of tsai, pinhole, .*, got 'cahvor'"),
     "model as a list": (TSAI.replace("tsai", "[tsai]"), "model: expected one of tsai, pinhole"),
     "no model": (TSAI.replace("    model: tsai\n", ""), "cam1, model: expected one of tsai, pinhole, .* got none"),
-    "half a port": (
-        TSAI + "    port: {normal: [0, 0, -1], offset: 120.0}\n",
-        "cam1: expected all needed keys, got no port.thickness, port.n_glass, port.n_fluid",
-    ),
+    "half a port": (TSAI + "    port: {normal: [0, 0, -1], offset: 120.0}\n", "cam1: expected all needed keys, got no"),
     "unknown key of a port": (TSAI + PORT.replace("n_fluid", "n_liquid"), "cam1, port: .* write 'n_fluid' instead"),
     "wall the wrong way round": (TSAI + PORT.replace("-1]", "1]"), "cam1, port: expected a camera before the wall, .*"),
     "long normal": (TSAI + PORT.replace("-1]", "-2]"), "cam1, port, normal: expected a vector of length 1, got 2"),
@@ -126,10 +101,7 @@ FAULTS = {
     "covariance of a port without one": (TSAI + COVARIANCE.replace("kappa1", "port_offset"), "got 'port_offset'"),
     "short covariance": (TSAI + COVARIANCE.replace("[0.1, 0.0]", "[0.1]"), r"rows of 2 numbers, got lengths \[1, 2\]"),
     "lopsided covariance": (TSAI + COVARIANCE.replace("[0.1, 0.0]", "[0.1, 1.0e-5]"), "expected a symmetric matrix"),
-    "impossible covariance": (
-        TSAI + COVARIANCE.replace("0.0", "1.0"),
-        "covariance, matrix: expected no negative eigenvalue",
-    ),
+    "impossible covariance": (TSAI + COVARIANCE.replace("0.0", "1.0"), "covariance, matrix: expected no negative"),
     "negative variance": (TSAI + COVARIANCE.replace("[0.1", "[-0.1"), "none below zero on the diagonal"),
     "one name twice": (TSAI + COVARIANCE.replace("kappa1", "f"), "covariance, parameters: expected different names"),
     "missing key": (TSAI.replace("    f: 45.0\n", ""), "cam1, f: expected a value, got none; add the key"),
@@ -148,16 +120,13 @@ FAULTS = {
     "schema": (TSAI.replace("cameras/1", "cameras/2"), "schema: expected sphereorient-cameras/1, got 'sphereorient-ca"),
     "no schema": (TSAI.replace("schema: sphereorient-cameras/1", ""), "expected sphereorient-cameras/1, got none"),
     "no cameras": ("schema: sphereorient-cameras/1\ncameras: {}\n", "expected named cameras"),
-    "camera of text": (
-        "schema: sphereorient-cameras/1\ncameras: {cam1: tsai}\n",
-        "expected the keys of a camera",
-    ),
+    "camera of text": ("schema: sphereorient-cameras/1\ncameras: {cam1: tsai}\n", "expected the keys of a camera"),
     "both foci": (PINHOLE.replace("vfov_deg: 45.0", "vfov_deg: 45.0, f_px: 3.0"), "exactly one, got both"),
     "no focus": (PINHOLE.replace("vfov_deg: 45.0, ", ""), "cam1, vfov_deg, f_px: expected exactly one, got none"),
     "wide": (PINHOLE.replace("45.0", "181"), "cam1, vfov_deg: expected an angle between 0 and 180, got 181"),
     "a list": ("- 1\n- 2\n", r"expected keys and values, got \[1, 2\]"),
     "empty": ("", "got an empty file"),
-    "no yaml": ("a: [1, 2\nb: }", "expected YAML, got .* line"),
+    "no yaml": ("a: [1, 2\nb: }", "expected YAML"),
 }
 
 
@@ -224,7 +193,10 @@ def test_every_model_comes_back_to_the_last_bit(tmp_path, model, wall):
     camera = model()
     camera = behind_port(camera, normal=f64((1.0, 2.0, 2.001)) / -3) if wall else camera
     camera = replace(camera, covariance=ParameterCovariance(names=names, matrix=root @ root.mT / 3))
-    save_cameras(tmp_path / "cameras.yaml", {"cam1": camera})
+    save_cameras(tmp_path / "cameras.yaml", {"cam1": camera}, comment="two lines\nof comment")
+    text = (tmp_path / "cameras.yaml").read_text()
+    assert text.startswith("# made by sphereorient\n# two lines\n# of comment\nschema: sphereorient-cameras/1\n")
+    assert [file.name for file in tmp_path.iterdir()] == ["cameras.yaml"]
     back = load_cameras(tmp_path / "cameras.yaml")["cam1"]
     assert type(back) is type(camera)
     assert back.image_size == camera.image_size
@@ -232,7 +204,7 @@ def test_every_model_comes_back_to_the_last_bit(tmp_path, model, wall):
     assert torch.equal(back.rays(whole_picture()).origin_lab_mm, camera.rays(whole_picture()).origin_lab_mm)
     assert back.covariance.names == names
     assert torch.equal(back.covariance.matrix, camera.covariance.matrix)
-    save_cameras(tmp_path / "again.yaml", {"cam1": back})
+    save_cameras(tmp_path / "again.yaml", {"cam1": back}, comment="two lines\nof comment")
     assert (tmp_path / "again.yaml").read_bytes() == (tmp_path / "cameras.yaml").read_bytes()
 
 

@@ -117,5 +117,5 @@ def test_files_that_are_not_opencvs_are_refused(tmp_path):
     with pytest.raises(CameraError, match="got a folder"):
         load_opencv(tmp_path)
     (tmp_path / "cam.yml").write_text("a: [1, 2\n}")
-    with pytest.raises(CameraError, match=r"can be parsed, got .* line 1"):
+    with pytest.raises(CameraError, match=r"can be parsed"):
         load_opencv(tmp_path / "cam.yml")

@@ -176,24 +176,8 @@ def test_a_scale_of_unknown_origin_is_read_with_a_warning(tmp_path):
     assert_close(camera.distort(f64((739.5, 611.5))), f64((740.5, 611.5)), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["f_mm", "pixel_pitch_mm", "centre_px", "k", "p", "scx", "she"])
-def test_gradients_with_respect_to_parameters_are_right(name, rng):
-    x_lab_mm = (torch.rand(3, 3, generator=rng, dtype=torch.float64) - 0.5) * 150
-    start = getattr(openptv(), name).clone()
-    size = 1e-4 if name in ("pixel_pitch_mm", "k", "p") else 1.0
-
-    def seen(change: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        camera = openptv(**{name: start + size * change})
-        return camera.project(x_lab_mm), camera.rays(whole_picture(steps=2)).direction_lab
-
-    assert torch.autograd.gradcheck(seen, torch.zeros_like(start).requires_grad_(), eps=1e-7, atol=1e-4)
-
-
 ORI_FAULTS = {
-    "truncated": (
-        ORI[: ORI.index("-2.4742")],
-        r"cam1.tif.ori: expected 21 numbers \(centre, .*\), got 15; .* cut off\.",
-    ),
+    "truncated": (ORI[: ORI.index("-2.4742")], r"cam1.tif.ori: expected 21 numbers \(centre, .*\), got 15; .* cut"),
     "without glass": (ORI[: ORI.rindex("0.0001")], "expected 21 numbers .*, got 18; copy the file again"),
     "empty": ("", "expected 21 numbers .*, got 0"),
     "too long": (ORI + "1.0\n", "expected 21 numbers .*, got 22; name a file of this kind"),
@@ -244,8 +228,3 @@ def test_files_that_are_not_there_and_addpars_that_are_short_are_refused(tmp_pat
         load_openptv(ori, load_ptv_par(par), tmp_path / "none")
     with pytest.raises(CameraError, match="got a folder"):
         load_openptv(tmp_path, load_ptv_par(par))
-
-
-def test_media_that_are_all_alike_make_no_wall():
-    assert not PtvPar(image_size=(9, 9), pixel_pitch_mm=(1.0, 1.0), n_air=1.3, n_glass=1.3, n_fluid=1.3).refracts
-    assert PtvPar(image_size=(9, 9), pixel_pitch_mm=(1.0, 1.0), n_glass=1.0, n_fluid=1.3).refracts

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from camera_examples import f64, pinhole, whole_picture
+from camera_examples import f64, pinhole
 from conftest import assert_close
 
 from sphereorient.cameras.model import focal_of_field, middle_of_picture
@@ -27,12 +27,6 @@ def test_the_field_of_view_is_that_of_the_full_height():
 
 def test_the_middle_of_a_picture_lies_between_its_outer_pixel_centres():
     assert_close(middle_of_picture((384, 288)), f64((191.5, 143.5)))
-
-
-def test_nothing_is_distorted():
-    uv_px = whole_picture()
-    assert_close(pinhole().undistort(uv_px), uv_px)
-    assert_close(pinhole().distort(uv_px), uv_px)
 
 
 @pytest.mark.parametrize("vfov_deg", [0.0, -3.0, 180.0, math.nan])

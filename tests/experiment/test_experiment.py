@@ -89,12 +89,16 @@ def test_a_folder_that_cannot_be_made_cannot_be_written_to(folder):
         write_experiment(dataclasses.replace(experiment, path=experiment.path / "experiment.yaml"))
 
 
+def balls(keys: str) -> str:
+    return SHORT.replace("sphere: {diameter: null, fixed: true}", keys)
+
+
 FAULTS = {
     "unknown key": (FULL.replace("exposure", "exposre"), "expected one of .* got 'exposre'; write 'exposure' instead"),
     "unknown key inside": (FULL.replace("diameter", "diametre"), "sphere: .*got 'diametre'; write 'diameter' instead"),
     "far from any key": (FULL + "zzz: 1\n", "got 'zzz'; remove it"),
     "flow key": (FULL.replace("viscosity", "viscosty"), "flow: .*write 'viscosity' instead"),
-    "no sphere": (SHORT.replace("sphere: {diameter: null, fixed: true}", ""), "sphere: expected a value"),
+    "no sphere": (balls(""), "sphere: expected a value"),
     "no diameter": (SHORT.replace("diameter: null, ", ""), r"sphere\.diameter: expected a value, got none"),
     "frame rate of zero": (SHORT.replace("30", "0"), "frame_rate: expected greater than 0, got 0"),
     "frame rate in words": (SHORT.replace("30", "fast"), "frame_rate: expected a valid number.* got 'fast'"),
@@ -108,25 +112,13 @@ FAULTS = {
     "mask of no movie": (FULL.replace("masks: {cam1", "masks: {side"), "masks: expected one of cam1, cam2, got 'side'"),
     "movie without camera": (SHORT.replace("{cam1:", "{cam9:"), "camera of movie cam9: expected one of cam1, cam2"),
     "both keys": (SHORT + "spheres: {a: {diameter: 14}}\n", "sphere: expected either sphere or spheres, got both"),
-    "no ball": (SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {}"), "spheres: .*at least 1"),
-    "one name twice": (
-        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diameter: 14}, a: {diameter: 14}}"),
-        "expected YAML, got 'the key 'a' twice' in line 4",
-    ),
-    "unknown key of a ball": (
-        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diametre: 14}}"),
-        "spheres, a: .*got 'diametre'; write 'diameter' instead",
-    ),
-    "a name that is a path": (
-        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a/b: {diameter: 14}}"),
-        "spheres: expected names without '/', got 'a/b'",
-    ),
-    "a name that is empty": (
-        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {'': {diameter: 14}}"),
-        "spheres: expected names",
-    ),
+    "no ball": (balls("spheres: {}"), "spheres: .*at least 1"),
+    "one name twice": (balls("spheres: {a: {diameter: 14}, a: {diameter: 14}}"), "expected YAML, got 'the key 'a'"),
+    "unknown key of a ball": (balls("spheres: {a: {diametre: 14}}"), "spheres, a: .*got 'diametre'; write 'diameter'"),
+    "a name that is a path": (balls("spheres: {a/b: {diameter: 14}}"), "spheres: expected names without '/', got"),
+    "a name that is empty": (balls("spheres: {'': {diameter: 14}}"), "spheres: expected names"),
     "several balls, one of unknown diameter": (
-        SHORT.replace("sphere: {diameter: null, fixed: true}", "spheres: {a: {diameter: 14}, b: {diameter: null}}"),
+        balls("spheres: {a: {diameter: 14}, b: {diameter: null}}"),
         r"spheres\.b\.diameter: expected a number \(mm\), got none",
     ),
     "nine cameras": (
@@ -144,24 +136,15 @@ FAULTS = {
     "a response of no camera": (SHORT + "response: {cam7: srgb}\n", "got 'cam7'"),
     "settings of no camera": (SHORT + "camera: {cam7: {}}\n", "got 'cam7'"),
     "a setting of a camera that there is not": (SHORT + "camera: {cam1: {triger: Line1}}\n", "'trigger'"),
-    "a pixel format of colour": (
-        SHORT + "camera: {cam1: {pixel_format: BayerRG8}}\n",
-        "pixel_format: expected 'Mono8'",
-    ),
+    "a pixel format of colour": (SHORT + "camera: {cam1: {pixel_format: BayerRG8}}\n", "pixel_format: expected"),
     "a line that YAML reads as no": (SHORT + "camera: {cam1: {trigger: off}}\n", "cam1.trigger: expected"),
     "an exposure longer than the interval": (
         SHORT + "camera: {cam1: {exposure_ms: 4, rate_hz: 500}}\n",
         "exposure_ms: expected at most 2 ms",
     ),
     "a flip of no camera": (SHORT + "flip: {cam7: both}\n", "got 'cam7'"),
-    "schema": (
-        SHORT.replace("experiment/1", "experiment/7"),
-        "schema: expected sphereorient-experiment/1, got 'sphere",
-    ),
-    "cameras file": (
-        "schema: sphereorient-cameras/1\ncameras: {}\n",
-        "expected sphereorient-experiment/1, got 'sphere",
-    ),
+    "schema": (SHORT.replace("experiment/1", "experiment/7"), "schema: expected sphereorient-experiment/1, got"),
+    "cameras file": ("schema: sphereorient-cameras/1\ncameras: {}\n", "expected sphereorient-experiment/1, got"),
     "a text": ("just words", "expected keys and values, got 'just words'"),
     "empty": ("", "got an empty file"),
     "no yaml": ("a: [", "expected YAML"),

@@ -15,7 +15,7 @@ from movie_examples import pictures, smooth
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError
-from sphereorient.movies import flipped, flipped_picture, open_movie
+from sphereorient.movies import flipped, open_movie
 
 JITTER_S = np.cumsum([0.0, 0.034, 0.04, 0.02, 0.047, 0.023, 0.43, 0.03, 0.036, 0.041, 0.033, 0.029])  # with a pause
 
@@ -152,12 +152,6 @@ def test_a_transposed_movie_says_so_where_nothing_marks_it_and_flip_turns_it_bac
     assert back.frame_shape == (37, 51)
     assert np.array_equal(np.stack(list(back.frames())), frames)
     assert np.array_equal(back.sample([3]), frames[[3]])
-
-
-@pytest.mark.parametrize("how", ["none", "vertical", "horizontal", "both", "transpose"])
-def test_every_flip_undoes_itself(how):
-    frames = pictures()
-    assert np.array_equal(flipped_picture(flipped_picture(frames, how), how), frames)
 
 
 FOURTH = [(30, 37, 51, 1), (30, 1, 37, 51), (30, 37, 1, 51)]

@@ -101,13 +101,6 @@ def test_a_part_may_be_asked_for_after_the_pool_has_closed(tmp_path: Path) -> No
         np.testing.assert_array_equal(picture.part(0, 0, SHAPE[1] - 1, SHAPE[0] - 1), whole)
 
 
-def test_a_range_of_frames_begins_where_it_is_asked_to(tmp_path: Path) -> None:
-    expected = pictures()
-    path = written(tmp_path / "m.mkv", expected, slices="4")
-    for picture, whole in zip(demanded(path, 2, 5), expected[2:5], strict=True):
-        np.testing.assert_array_equal(picture.part(0, 0, 1, 1), whole)
-
-
 @pytest.mark.parametrize("options", [{"g": "4", "slices": "4"}, {"slicecrc": "0", "slices": "4"}])
 def test_frames_that_do_not_stand_alone_or_are_not_checked_are_decoded_whole(tmp_path: Path, options: dict) -> None:
     expected = pictures()

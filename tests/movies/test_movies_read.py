@@ -36,12 +36,6 @@ def test_more_than_eight_bits_are_neither_lost_nor_rescaled(tmp_path, bits):
         assert np.array_equal(movie.sample(range(FRAMES)), frames)
 
 
-def test_the_top_left_corner_stays_at_the_top_left(tmp_path):
-    for name, codec in (("movie.mkv", "ffv1"), ("movie.avi", "rawvideo")):
-        frame = all_of(encode(tmp_path / name, pictures(), codec, "gray"))[0]
-        assert np.argwhere(frame[:4, :5]).tolist() == [[1, 2]]
-
-
 def test_rows_stored_bottom_up_come_out_top_down(tmp_path):
     # The option flags rows as stored bottom-up without turning them, so the decoder hands them out upside down,
     # with a negative line size.

@@ -7,6 +7,7 @@ import torch
 from conftest import assert_close
 
 from sphereorient import so3
+from sphereorient.errors import ShapeError
 
 
 def vectors(batch, dtype, rng):
@@ -73,6 +74,13 @@ def test_a_batch_of_no_elements_passes_gradients(function, dtype, rng):
     inputs = [x.requires_grad_() for x in CASES[function][0]((0,), dtype, rng)]
     function(*inputs).sum().backward()
     assert all(x.grad.shape == x.shape for x in inputs)
+
+
+@pytest.mark.parametrize("function", [f for f in CASES if f not in (steps, so3.trace)], ids=lambda f: f.__name__)
+def test_another_last_axis_is_refused(function, rng):
+    first, *others = CASES[function][0]((2,), torch.float64, rng)
+    with pytest.raises(ShapeError, match="expected shape"):
+        function(first[..., :2], *others)
 
 
 def test_every_public_function_is_a_case():

@@ -43,11 +43,6 @@ class PtvPar:
     n_fluid: float = 1.0
     thickness_mm: float = 0.0
 
-    @property
-    def refracts(self) -> bool:
-        """Whether there is a wall; equal indices switch it off."""
-        return not self.n_air == self.n_glass == self.n_fluid
-
 
 def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None) -> Camera:
     """Read a camera from .ori and .addpar (None: no distortion), behind a port where the media refract.
@@ -75,7 +70,9 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
             scx=_tensor(scx),
             she=_tensor(she),
         )
-        return PortCamera(camera=camera, port=_port(glass, par)) if par.refracts else camera
+        if par.n_air == par.n_glass == par.n_fluid:  # equal indices: no wall
+            return camera
+        return PortCamera(camera=camera, port=_port(glass, par))
 
 
 def load_ptv_par(path: Path | str) -> PtvPar:
