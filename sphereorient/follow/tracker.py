@@ -113,7 +113,7 @@ class Tracker:
                 for name, of_ball in ahead.items()
             }
             frames = [[movie[number] for movie in shots] for number in numbers]
-            followed = self._followed(wanted, places, frames, [True] * len(now))
+            followed = self._followed(wanted, places, frames)
             for name, tracker in self.balls.items():
                 for n, number, row in zip(now, numbers, followed, strict=True):
                     poses, was, chunk = row[name], found[number][name], chunks[name][n]
@@ -143,15 +143,18 @@ class Tracker:
         ]
         rough = [any(one is not None and one.rough for one in row) for row in zip(*ahead.values(), strict=True)]
         # Where a motion is not known yet, the others are looked past once all are found.
-        first = [{} if unsure else row for unsure, row in zip(rough, known, strict=True)]
-        found = self._followed(ahead, first, frames, [True] * len(frames))
+        first = [{} if no else row for no, row in zip(rough, known, strict=True)]
+        found = self._followed(ahead, first, frames)
         if any(rough) and any(self._others.values()):
             at = [
                 {name: _found_place(poses, row[name]) for name, poses in there.items() if poses is not None}
                 for row, there in zip(known, found, strict=True)
             ]
-            again = self._followed(ahead, at, frames, rough)
-            found = [again[n] if unsure else row for n, (unsure, row) in enumerate(zip(rough, found, strict=True))]
+            unsure = {
+                name: [one if no else None for one, no in zip(row, rough, strict=True)] for name, row in ahead.items()
+            }
+            again = self._followed(unsure, at, frames)
+            found = [new if no else row for new, no, row in zip(again, rough, found, strict=True)]
         done = [{name: poses for name, poses in row.items() if poses is not None} for row in found]
         if all(len(row) == len(self.balls) for row in done):
             return done
@@ -170,12 +173,11 @@ class Tracker:
         ahead: Mapping[str, Sequence[Expected | None]],
         places: Sequence[Mapping[str, _Place]],
         frames: Sequence[Sequence[Frame]],
-        wanted: Sequence[bool],
     ) -> list[dict[str, Poses | None]]:
-        """Fit the predicted balls of each frame that is wanted, past the others at their places."""
+        """Fit the predicted balls of each frame past the others at their places."""
         found: list[dict[str, Poses | None]] = [dict.fromkeys(self.balls) for _ in frames]
         for name, tracker in self.balls.items():
-            rows = {n: one for n, one in enumerate(ahead[name]) if one is not None and wanted[n]}
+            rows = {n: one for n, one in enumerate(ahead[name]) if one is not None}
             expected = [replace(one, among=self._among(name, places[n])) for n, one in rows.items()]
             for n, poses in zip(rows, tracker.follow(expected, [frames[n] for n in rows]), strict=True):
                 found[n][name] = poses

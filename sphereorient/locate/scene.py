@@ -213,8 +213,7 @@ def fixed_ball(
     full_scale = float(np.iinfo(pictures.dtype).max)
     if circle is not None:
         given = given_outline(circle)
-        scene = _around(middle, scatter, given, full_scale)
-        return given, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
+        return given, _around(given, Background(mean=middle, noise=scatter, full_scale=full_scale, shown=shown), empty)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255
     moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter against single pixels, px
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
@@ -230,8 +229,8 @@ def fixed_ball(
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
         raise _none_fixed(_what_changes(stats[1:]))
-    scene = _around(middle, scatter, outline, full_scale)
-    return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
+    scene = Background(mean=middle, noise=scatter, full_scale=full_scale, shown=shown)
+    return outline, _around(outline, scene, empty)
 
 
 def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettings) -> float:
@@ -335,8 +334,7 @@ def still_ball(
     if outline is None:
         do = "leave a tenth of its radius around the ball, or set locate.diameter_px"
         raise ExperimentError(refusal("movies", expected="a photograph of a ball", got="nothing round", do=do))
-    around = _around(middle, noise, outline, scene.full_scale)
-    return outline, replace(around, mean=around.mean if empty is None else empty, shown=shown)
+    return outline, _around(outline, replace(scene, mean=middle), empty)
 
 
 def measured_size_px(
@@ -357,16 +355,15 @@ def measured_size_px(
     return size
 
 
-def _around(
-    middle: NDArray[np.float32], scatter: NDArray[np.float32], outline: Outline, full_scale: float
-) -> Background:
-    row, column = np.ogrid[: middle.shape[0], : middle.shape[1]]
+def _around(outline: Outline, scene: Background, empty: NDArray[np.float32] | None) -> Background:
+    """Return a scene with the grey about a ball in place of it, or with that without it, where this is given."""
+    row, column = np.ogrid[: scene.mean.shape[0], : scene.mean.shape[1]]
     away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
     ball, ring = away < RIM_FIXED, (away >= RIM_FIXED) & (away < RING)
     around = ring if ring.any() else ~ball
-    mean, noise = middle.astype(np.float32), np.maximum(scatter, 0.3).astype(np.float32)
-    mean[ball], noise[ball] = np.median(middle[around]), np.median(noise[around])
-    return Background(mean=mean, noise=noise, full_scale=full_scale)
+    mean, noise = scene.mean.astype(np.float32), np.maximum(scene.noise, 0.3).astype(np.float32)
+    mean[ball], noise[ball] = np.median(scene.mean[around]), np.median(noise[around])
+    return replace(scene, mean=mean if empty is None else empty, noise=noise)
 
 
 def _what_changes(stats: NDArray[Any]) -> str:

@@ -180,16 +180,14 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
         if crop is None or not bool(crops.seen[k, camera]):
             none = torch.zeros(at.cells.side**2)
             return none, none, none.int()
-        grey = torch.from_numpy(_blurred(crop.grey.astype(np.float32), blur_px))
-        place = 0 if crops.fixed else k
-        return at.cells.see(balls[place], grey, counts[place], (crop.left, crop.top), at.R_lab_body[k])
+        grey, place = crop.grey.astype(np.float32), 0 if crops.fixed else k
+        if blur_px > 1.5 * BLUR:
+            grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32)
+        corner = crop.left, crop.top
+        return at.cells.see(balls[place], torch.from_numpy(grey), counts[place], corner, at.R_lab_body[k])
 
     grey, cosine, pixel = zip(*side_by_side(one, range(len(at.R_lab_body))), strict=True)
     return _Seen(grey=torch.stack(grey), cosine=torch.stack(cosine), pixel=torch.stack(pixel))
-
-
-def _blurred(grey: Picture, blur_px: float) -> Picture:
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32) if blur_px > 1.5 * BLUR else grey
 
 
 def _radius_px(crops: Crops, camera: int) -> float:

@@ -134,14 +134,6 @@ class EvenLight:
         return whole
 
 
-class _Place:
-    """Where a frame shows the ball: its position, and the parts of all cameras' pictures, made even."""
-
-    def __init__(self, ball: Crops, position_lab_mm: Tensor) -> None:
-        self.X = position_lab_mm  # (3,)
-        self.even = [EvenLight(view, self.X, ball.radius_mm) for view in ball.views]
-
-
 class FirstPass:
     """Follows a ball in its place by the map of the frames before: the body frame is the lab at the first one."""
 
@@ -151,7 +143,8 @@ class FirstPass:
         """
         radius_mm = place.radius_mm
         self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
-        self._ball, self._here = place, _Place(place, place.usual)
+        self._ball = place
+        self._go_to(place.usual)
         self._views = self._views_at(place.usual)  # of a fixed ball
         known = place.position_lab_mm[torch.isfinite(place.position_lab_mm).all(1)]
         sizes = [view.radius_px(known, radius_mm).max() for view in place.views]
@@ -174,6 +167,11 @@ class FirstPass:
         self._lost = 0  # frames that are not explained, in a row
         self._usual, self._count = 0.0, 1  # score of frames that are, and their number
 
+    def _go_to(self, position_lab_mm: Tensor) -> None:
+        """Take what the pictures show at a position (3,) from now on."""
+        self._X = position_lab_mm
+        self._even = [EvenLight(view, self._X, self._ball.radius_mm) for view in self._ball.views]
+
     def next(
         self, time_s: float, shots: Sequence[Frame], there: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Poses, bool]:
@@ -188,19 +186,18 @@ class FirstPass:
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
         if there is not None:
-            self._here = _Place(self._ball, there[0])
-        even = [light(shot.picture) for light, shot in zip(self._here.even, shots, strict=True)]
+            self._go_to(there[0])
+        even = [light(shot.picture) for light, shot in zip(self._even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
-            self._grow(even, use, R, self._here.X)  # the map is this frame
+            self._grow(even, use, R, self._X)  # the map is this frame
             self._before = time_s, R
             return self._told(self._settled([even], R[None], use), use, reason), True
         step_s, before = time_s - self._before[0], self._before[1]
         fit, searched = self._fitted(max(step_s, 0.0), before, even, use)
         if fit is None:
             self._lost, self._rate, self._change = self._lost + 1, *torch.zeros(2, 3, dtype=torch.float64)
-            why = [Reason.LOW_SCORE if one is Reason.OK else one for one in reason]
-            return no_pose(len(shots), why, use), True
+            return no_pose(len(shots), reason, use), True
         R = fit.R_lab_body[0]
         rate = so3.log(R @ before.mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
         rate = rate * (not searched)
@@ -223,8 +220,8 @@ class FirstPass:
         for k, use in enumerate(crops.seen):
             pictures, X = crops.pictures(torch.tensor([k]))[0], crops.place(k)
             if not crops.fixed:
-                self._here = _Place(self._ball, X)
-            even = [light(one) for light, one in zip(self._here.even, pictures, strict=True)]
+                self._go_to(X)
+            even = [light(one) for light, one in zip(self._even, pictures, strict=True)]
             self._grow(even, use, R_lab_body[k], X)
         return self
 
@@ -241,7 +238,7 @@ class FirstPass:
 
     def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor, X: Tensor) -> None:
         views = self._views if self._ball.fixed else self._views_at(X)
-        for view, light, one, seen in zip(views, self._here.even, even, use.tolist(), strict=True):
+        for view, light, one, seen in zip(views, self._even, even, use.tolist(), strict=True):
             if seen:
                 self.cells.add(view, torch.from_numpy(one), light.counts, (light.left, light.top), R_lab_body)
 
@@ -269,7 +266,7 @@ class FirstPass:
         """Return the best fit near any of many orientations (M, 3, 3)."""
         frames, begin = self._start([even], R, use)
         level = self._fitter.optics.fine
-        one = self._fitter.pixels(frames, self._here.X[None], level).thinned(TRIED_EVERY)
+        one = self._fitter.pixels(frames, self._X[None], level).thinned(TRIED_EVERY)
         tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(len(R))), begin, level, TRIED_STEPS)
         best = _mean_score(tried, use).topk(TRIED_BEST).indices
         fit = self._settled([even] * TRIED_BEST, tried.R_lab_body[best], use)
@@ -280,9 +277,9 @@ class FirstPass:
     ) -> tuple[list[list[NDArray[np.float32]]], PoseStart]:
         """Return whole pictures, and the start of fits at orientations (B, 3, 3)."""
         shapes = [view.camera.image_size[::-1] for view in self._fitter.views]
-        lights = list(zip(self._here.even, shapes, strict=True))
+        lights = list(zip(self._even, shapes, strict=True))
         frames = [[light.framed(one, shape) for (light, shape), one in zip(lights, row, strict=True)] for row in even]
-        many = self._here.X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
+        many = self._X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
         return frames, PoseStart(*many, held=True)
 
     def _settled(self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor) -> FittedPoses:

@@ -16,6 +16,7 @@ from sphereorient.pose.camera_view import (
     Optics,
     PyramidLevel,
     Shown,
+    Steps,
     size_steps,
     widest_px,
 )
@@ -33,8 +34,6 @@ from sphereorient.sphere.texture_table import TextureTable
 CPU = torch.device("cpu")
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
-
-Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
 
 
 class DisksPx(NamedTuple):
