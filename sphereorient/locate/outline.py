@@ -34,7 +34,7 @@ class Blob:
     merit: float  # variance inside times similarity to a disk
 
 
-def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+def coarser(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     """Average by an integer factor, cropping right and lower borders (other ratios are 40 times slower)."""
     height, width = (side // factor for side in picture.shape)
     whole = picture[: height * factor, : width * factor]
@@ -50,7 +50,7 @@ def find_blobs(
     Source: paper section III A.
     """
     factor = settings.reduction
-    small = np.maximum(_reduce(difference - settings.noise_factor * noise, factor), 0)
+    small = np.maximum(coarser(difference - settings.noise_factor * noise, factor), 0)
     # Clip near the sphere's brightness: a bright reflection must not dominate.
     lit = small[small > 0]
     if lit.size == 0:

@@ -173,7 +173,7 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
     places = crops.position_lab_mm[:1] if crops.fixed else crops.position_lab_mm
     balls = [BallView.of(view.camera, X, crops.radius_mm) for X in places]
     counts = [torch.from_numpy(_within(crops, camera, k)) for k in range(len(places))]
-    blur_px = BLUR * _radius_px(crops, camera) * math.sqrt(4 * math.pi) / at.cells.side
+    blur_px = BLUR * float(view.radius_px(crops.usual, crops.radius_mm)) * math.sqrt(4 * math.pi) / at.cells.side
 
     def one(k: int) -> tuple[Tensor, Tensor, Tensor]:
         crop = crops.crops[camera][k]
@@ -188,10 +188,6 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
 
     grey, cosine, pixel = zip(*side_by_side(one, range(len(at.R_lab_body))), strict=True)
     return _Seen(grey=torch.stack(grey), cosine=torch.stack(cosine), pixel=torch.stack(pixel))
-
-
-def _radius_px(crops: Crops, camera: int) -> float:
-    return float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
 
 
 def _within(crops: Crops, camera: int, frame: int = 0) -> NDArray[np.bool_]:
@@ -217,7 +213,8 @@ def within_limb(
 
 def _smooth(crops: Crops, camera: int, total: Picture, share: Picture) -> Picture:
     """Return the local mean of what counts: sums over pixels, by the share that each has."""
-    side = (2 * int(LIGHT_RADII * _radius_px(crops, camera)) + 1,) * 2
+    radius_px = float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
+    side = (2 * int(LIGHT_RADII * radius_px) + 1,) * 2
     for _ in range(2):
         total, share = (
             np.asarray(cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT), np.float32)

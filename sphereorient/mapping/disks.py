@@ -32,6 +32,7 @@ from sphereorient.locate import (
     sightings_of,
     smoothed,
 )
+from sphereorient.locate.outline import window_about
 from sphereorient.locate.scene import fixed_ball, wander_px
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import CameraView
@@ -223,9 +224,8 @@ def evenly_spread(rows: Tensor, count: int) -> Tensor:
 def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
     """Cut a disk and its surroundings out of a picture."""
     reach = int(np.ceil(REACH * radius_px)) + 3
-    top, left = max(0, round(v_px) - reach), max(0, round(u_px) - reach)
-    grey = picture[top : round(v_px) + reach + 1, left : round(u_px) + reach + 1].copy()
-    return Crop(grey=grey, top=top, left=left)
+    rows, columns = window_about(round(u_px), round(v_px), reach)
+    return Crop(grey=picture[rows, columns].copy(), top=rows.start, left=columns.start)
 
 
 def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor | None = None) -> list[Crop]:
@@ -245,8 +245,7 @@ def _whole_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) ->
     reach = int(np.ceil(REACH * radius_px)) + 3
     top, left = round(v_px) - reach, round(u_px) - reach
     grey = np.zeros((2 * reach + 1, 2 * reach + 1), picture.dtype)
-    there = np.s_[max(0, top) : max(0, top + 2 * reach + 1), max(0, left) : max(0, left + 2 * reach + 1)]
-    part = picture[there]
+    part = picture[window_about(round(u_px), round(v_px), reach)]
     grey[max(0, -top) :, max(0, -left) :][: part.shape[0], : part.shape[1]] = part
     return Crop(grey=grey, top=top, left=left)
 

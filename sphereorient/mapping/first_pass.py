@@ -20,6 +20,7 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
+from sphereorient.locate.outline import coarser
 from sphereorient.mapping.adjustment import Adjustment, adjusted, cells_of, place_metric, within_limb
 from sphereorient.mapping.disks import FOLLOWED, Crop, Crops, cut_out, evenly_spread
 from sphereorient.mapping.paint_cells import BallView
@@ -75,21 +76,15 @@ class CoarserPictures:
         if self.factor == 1:
             return shots
         # Pictures that show nothing are not looked at.
-        return [Frame(shown=_coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in shots]
-
-
-def _coarser(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    height, width = (side // factor for side in picture.shape)
-    whole = picture[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        return [Frame(shown=coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in shots]
 
 
 def _coarser_view(view: CameraView, factor: int) -> CameraView:
     if factor == 1:
         return view
     scene, shown = view.background, view.background.shown
-    mean, noise = (_coarser(part, factor) for part in (scene.mean, scene.noise))
-    shown = None if shown is None else _coarser(shown.astype(np.float32), factor) == 1.0
+    mean, noise = (coarser(part, factor) for part in (scene.mean, scene.noise))
+    shown = None if shown is None else coarser(shown.astype(np.float32), factor) == 1.0
     background = Background(mean=mean, noise=noise / np.float32(factor), full_scale=scene.full_scale, shown=shown)
     diameter_px = view.diameter_px / factor
     coarse = replace(view.scene, background=background, diameter_px=diameter_px)

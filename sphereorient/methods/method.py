@@ -283,16 +283,13 @@ def write_poses(poses: Measured, path: Path) -> None:
     with whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA_OF_POSES
         for ball, of_ball in poses.items():
-            _write_poses(of_ball, ball_group(file, ball))
+            group = ball_group(file, ball)
+            group["count"] = np.array([len(one) for one in of_ball])
+            group["use"] = np.stack([one.use.numpy() for one in of_ball])
+            group["reason"] = np.array([[str(why) for why in one.reason] for one in of_ball], "S16")
+            for name in POSE_PARTS:
+                group[name] = torch.cat([getattr(one, name) for one in of_ball]).numpy()
         file.attrs["sha256"] = digest(file)
-
-
-def _write_poses(poses: list[Poses], group: h5py.Group) -> None:
-    group["count"] = np.array([len(one) for one in poses])
-    group["use"] = np.stack([one.use.numpy() for one in poses])
-    group["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
-    for name in POSE_PARTS:
-        group[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
 
 
 def read_poses(path: Path) -> Measured | None:

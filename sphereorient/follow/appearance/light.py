@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.record import Studied, enough_of, soft
-from sphereorient.locate.outline import Outline
+from sphereorient.locate.outline import Outline, window_about
 from sphereorient.pose.camera_view import FINEST_PX, Optics, level_of, widest_px
 from sphereorient.pose.fit import USUALLY_HIDDEN
 from sphereorient.pose.fitter import Fitter
@@ -40,14 +40,11 @@ def estimate_blur_px(disks: Iterable[tuple[NDArray[np.generic], Outline]]) -> fl
     A first guess, biased by noise and paint without edges. 0 without disks.
     Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
     """
-    found = [steepest_blur_px(_about(*disk)) for disk in disks]
+    found = []
+    for picture, disk in disks:
+        about = window_about(round(disk.u_px), round(disk.v_px), round(AROUND * disk.radius_px))
+        found.append(steepest_blur_px(picture[about].astype(np.float32)))
     return float(np.median(found)) if found else 0.0
-
-
-def _about(picture: NDArray[np.generic], disk: Outline) -> NDArray[np.float32]:
-    reach = round(AROUND * disk.radius_px)
-    u, v = round(disk.u_px), round(disk.v_px)
-    return picture[max(0, v - reach) : v + reach + 1, max(0, u - reach) : u + reach + 1].astype(np.float32)
 
 
 def steepest_blur_px(picture: NDArray[np.float32]) -> float:
