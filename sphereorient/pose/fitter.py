@@ -75,6 +75,10 @@ class Fitter:
             )
         return self._models[level]
 
+    def with_blur(self, paint: TextureTable, blur_px: float, limb_blur_px: float | None = None) -> "Fitter":
+        """Return a fitter of paint whose pictures have a blur, px, and their limb another one; see `Optics`."""
+        return replace(self, optics=Optics(paint, blur_px, widest_px(self.views), limb_blur_px))
+
     def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, glints: bool = True) -> "Fitter":
         """Return a fitter with the light, of the same kind, and the noise of fitted pictures; see `Light.learnt`."""
         return replace(self, light=self.light.learnt(pixels, fit, use, self.model(), glints=glints))

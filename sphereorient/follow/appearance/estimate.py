@@ -30,7 +30,6 @@ from sphereorient.follow.appearance.worn import without_worn
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.camera_view import Optics, widest_px
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.lights.kinds import lit_in_the_lab
 from sphereorient.pose.poses import Poses
@@ -131,8 +130,7 @@ def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
     fitter, blur_px = search.fitter, studied.fitter.optics.blur_px
     if abs(blur_px / fitter.optics.blur_px - 1) <= BLUR_FAR_OFF or darkest_white(studied.fitter) is not None:
         return None
-    optics = Optics(studied.paint, blur_px, widest_px(fitter.views))
-    return replace(search, fitter=replace(fitter, optics=optics))
+    return replace(search, fitter=fitter.with_blur(studied.paint, blur_px))
 
 
 def _score_min(studied: Studied, still: float, best: float, wrong: float) -> float:

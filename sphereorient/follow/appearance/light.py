@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.record import Studied, enough_of, soft
 from sphereorient.locate.outline import Outline, window_about
-from sphereorient.pose.camera_view import FINEST_PX, Optics, level_of, widest_px
+from sphereorient.pose.camera_view import FINEST_PX, level_of, widest_px
 from sphereorient.pose.fit import USUALLY_HIDDEN
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import limb_wider_px
@@ -87,7 +87,6 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
     """Estimate light, then blur unless it is `given`, then light again, until the blur stays.
     Where the first guess of the blur is far off, one round is not enough.
     """
-    diameter_px = widest_px(studied.fitter.views)
     studied = studied.lit()
     slow = soft(studied.fitter)  # there each round moves the blur by little
     for done in range(1 if given else BLUR_ROUNDS):
@@ -95,7 +94,7 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
         if not given:
             fitter, fits = studied.fitter, (studied.pixels, studied.fit, studied.use)
             blur_px = best_blur_px(fitter, studied.paint, *fits, FINEST if done else FINER)
-            studied = replace(studied, fitter=replace(fitter, optics=Optics(studied.paint, blur_px, diameter_px)))
+            studied = replace(studied, fitter=fitter.with_blur(studied.paint, blur_px))
         studied = studied.lit()
         if not slow and abs(studied.fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
             break
