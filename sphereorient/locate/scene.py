@@ -17,7 +17,7 @@ from sphereorient.experiment.recording import CameraStream, Recording, given_sce
 from sphereorient.files.threads import side_by_side
 from sphereorient.locate.background import FREE, LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
-from sphereorient.locate.outline import Blob, Outline, fit_outline
+from sphereorient.locate.outline import Blob, Levels, Mask, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
 
@@ -125,8 +125,8 @@ def learn_background(
     pictures: NDArray[Any],
     diameter_px: float | Sequence[float],
     settings: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    empty: Levels | None = None,
+    shown: Mask | None = None,
 ) -> Background:
     """Estimate the background of frames (n, H, W): average, find the spheres, measure their pixels from other frames.
     `diameter_px` is that of the sphere, or those of all. With `empty` (H, W), a given background, only the noise is
@@ -175,7 +175,7 @@ def _only_disk(
     return [] if outline is None else [outline]
 
 
-def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -> tuple[NDArray[np.bool_], int]:
+def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -> tuple[Mask, int]:
     """Return the pixels of all disks found in frames (n, H, W), and their number."""
     covered, found = np.zeros(pictures.shape, bool), 0
     for picture, mask in zip(pictures, covered, strict=True):
@@ -193,8 +193,8 @@ def given_outline(circle: tuple[float, float, float]) -> Outline:
 def fixed_ball(
     pictures: NDArray[Any],
     locating: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    empty: Levels | None = None,
+    shown: Mask | None = None,
     circle: tuple[float, float, float] | None = None,
 ) -> tuple[Outline, Background]:
     """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
@@ -249,10 +249,7 @@ def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettin
 
 
 def swaying_ball(
-    pictures: NDArray[Any],
-    locating: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None = None, shown: Mask | None = None
 ) -> tuple[Outline, Background]:
     """Find a rotating sphere that sways, or moves slowly, in frames (n, H, W) in order of time: in a few of them its
     centre is nearly fixed. Return the median of its outlines, and the background with a guess where it always is.
@@ -288,10 +285,7 @@ def swaying_ball(
 
 
 def _turning(
-    pictures: NDArray[Any],
-    locating: LocateSettings,
-    empty: NDArray[np.float32] | None,
-    shown: NDArray[np.bool_] | None,
+    pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None, shown: Mask | None
 ) -> Outline | None:
     """Return the outline of `fixed_ball`; None of a ball that rests, or moves too far in these frames."""
     try:
@@ -300,7 +294,7 @@ def _turning(
         return None
 
 
-def _where_always(background: Background, covered: NDArray[np.bool_]) -> Background:
+def _where_always(background: Background, covered: Mask) -> Background:
     """Return a background that goes on smoothly where a ball covers pixels in nearly all frames."""
     always = (len(covered) - covered.sum(0) < FREE).astype(np.uint8)
     noise = np.where(always > 0, np.float32(background.typical_noise), background.noise)
@@ -309,10 +303,7 @@ def _where_always(background: Background, covered: NDArray[np.bool_]) -> Backgro
 
 
 def still_ball(
-    pictures: NDArray[Any],
-    locating: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None = None, shown: Mask | None = None
 ) -> tuple[Outline, Background]:
     """Find the sphere in a photograph, (1, H, W), of which it may fill the most, by the grey level of its border.
     Return its outline, and the background as in `fixed_ball`, which has the other arguments, too.
@@ -355,7 +346,7 @@ def measured_size_px(
     return size
 
 
-def _around(outline: Outline, scene: Background, empty: NDArray[np.float32] | None) -> Background:
+def _around(outline: Outline, scene: Background, empty: Levels | None) -> Background:
     """Return a scene with the grey about a ball in place of it, or with that without it, where this is given."""
     row, column = np.ogrid[: scene.mean.shape[0], : scene.mean.shape[1]]
     away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
