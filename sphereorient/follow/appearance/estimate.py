@@ -51,9 +51,7 @@ def estimate_appearance(
     `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
     the motion while the shutter is open counts as blur. `among`: of several balls, with poses that are known; then
     cameras that see another ball do not disagree.
-
-    Raises:
-        ExperimentError: no frame has a pose, or none is better than wrong poses.
+    Raises ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
     search, found, sample, odds = _chosen(for_blur(first), frames, among)
     given = settings.blur_px is not None
@@ -82,8 +80,8 @@ def estimate_appearance(
     alone = among is None and sample.camera is None  # a ball, and all cameras together
     views = with_least_merit(search, sure, sample.poses[2]) if alone else studied.fitter.views
     fitter, fit, use = studied.fitter, studied.fit, studied.use
-    widest_px_ = WIDER * float(fitter.disks_px(fit.position_lab_mm).largest_px.max())
-    fitter = replace(fitter, views=views, widest_px=widest_px_, limb_px=limb_px(fitter, fit, use))
+    most_px = WIDER * float(fitter.disks_px(fit.position_lab_mm).largest_px.max())
+    fitter = replace(fitter, views=views, widest_px=most_px, limb_px=limb_px(fitter, fit, use))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(studied.pixels, fit, use, fitter.model(), with_more_blur(studied) if coded else None)
     return Appearance(
