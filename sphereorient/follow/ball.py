@@ -198,10 +198,7 @@ class BallTracker:
             moved=np.zeros(6),
             open_share=0.0,
         )
-        poses = self.followed(begin, shots)
-        if poses is not None:
-            return poses
-        return no_pose(len(shots), [Reason.LOW_SCORE if why is Reason.OK else why for why in there.reason])
+        return self.followed(begin, shots) or no_pose(len(shots), there.reason)
 
     def _begun(
         self,

@@ -63,7 +63,7 @@ def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> 
     reason = [why[k] for k in range(len(why))]
     seeing = [k for k, poses in enumerate(apart) if len(poses) and bool(poses.use.any())]
     if not seeing:
-        return no_pose(len(reason), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+        return no_pose(len(reason), reason)
     main, own = apart[seeing[0]], parts[seeing[0]]
     told, use = main.parts(), torch.zeros(len(reason), dtype=torch.bool)
     use[list(own)] = main.use

@@ -300,10 +300,8 @@ class Initialiser:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
-        if not use.any():
+        if not use.any() or not len(R):
             return no_pose(len(views), reason)
-        if not len(R):
-            return no_pose(len(views), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
         placed = self._placed(found)
         slack = torch.nan_to_num(placed.covariance_mm2[0])
         slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
@@ -313,13 +311,8 @@ class Initialiser:
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
             slack = slack + DEPTH_SHARE**2 * along[:, None] * along
-        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
-        return self._narrow(pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, frame)
-
-    def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
-        """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""
-        fitter, optics, use = self.fitter, self.fitter.optics, frame.use
-        X = place.expand(len(R), 3)
+        place, precision, pictures = placed.position_lab_mm, torch.linalg.inv(slack), [shot.picture for shot in shots]
+        optics, X = fitter.optics, place.expand(len(R), 3)
         # (level, every n-th pixel, iterations, poses kept): coarse levels need few pixels, the last fit all.
         steps = (
             (optics.coarse, 1, 4, self.finalists + 1),
@@ -338,15 +331,14 @@ class Initialiser:
             fit = replace(fit, nll=explaining_first(fit, use))
             chosen = distinct_indices(fit.R_lab_body, fit.nll, keep)
             if not len(chosen):
-                lost = [Reason.LOW_SCORE if used else why for used, why in zip(use, frame.reason, strict=True)]
-                return no_pose(len(use), lost)
+                return no_pose(len(use), reason)
             X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
             place = X[:1]
         hidden = [bool(used) and bool(fitter.shows_unknown(k, X[:1], R[:1]).any()) for k, used in enumerate(use)]
         shown = use & ~torch.tensor(hidden)
         if not bool(shown.any()):  # no camera is better than another
-            return poses_of(fit, chosen, use, frame.reason)
-        reason = [Reason.UNSEEN if unknown else why for unknown, why in zip(hidden, frame.reason, strict=True)]
+            return poses_of(fit, chosen, use, reason)
+        reason = [Reason.UNSEEN if unknown else why for unknown, why in zip(hidden, reason, strict=True)]
         return poses_of(fit, chosen, shown, reason)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, sphere_disk_px
+from sphereorient.cameras import sphere_disk_px
 from sphereorient.errors import Reason
 from sphereorient.follow.chunk import Ahead
 from sphereorient.follow.initialise import Initialiser
@@ -82,7 +82,9 @@ class SceneStart:
                         for disk, shot in zip(matches[n].disks, shots, strict=True)
                     ]
                     fits[kind, n] = self.balls[name].fitted(shots, found, looks[kind][n].R_lab_body)
-            wrong = {(kind, n) for kind, n, _ in pairs if not _explains(fits[kind, n])}
+            # A paint is wrong that explains the pictures in use no better than an unknown one.
+            gains = {(kind, n): _gain(fits[kind, n].score[:1, fits[kind, n].use]).sum() for kind, n, _ in pairs}
+            wrong = {each for each, gain in gains.items() if not float(gain) > 0}
             if not wrong:
                 break
             for row, name in enumerate(names):
@@ -134,8 +136,9 @@ class SceneStart:
         cost = np.array([0.5 * match.chi2 - one.gain for match, one in zip(matches, look, strict=True)]) - NOT_SEEN
         for k, (view, shot) in enumerate(zip(ball.fitter.views, shots, strict=True)):
             if shot.usable:
-                missed = [match.chosen[k] < 0 for match in matches] & in_picture(view.camera, X).numpy()
-                cost += MISSED * missed
+                place = view.camera.project(X)
+                inside = ((place >= 0) & (place <= place.new_tensor(view.camera.image_size) - 1)).all(-1)
+                cost += MISSED * ([match.chosen[k] < 0 for match in matches] & inside.numpy())
             radius = torch.tensor(
                 [math.nan if (disk := match.disks[k]) is None else disk.radius_px for match in matches]
             )
@@ -147,12 +150,6 @@ class SceneStart:
             R = torch.stack([one.R_lab_body[0] if len(one.R_lab_body) else ahead.R_lab_body for one in look])
             cost += _surprise(ahead, X, places.covariance_mm2, R, ball.fitter.radius_mm)
         return cost
-
-
-def in_picture(camera: Camera, position_lab_mm: Tensor) -> Tensor:
-    """Return whether the picture of a camera holds positions (..., 3), mm, (...) bool."""
-    place = camera.project(position_lab_mm)
-    return ((place >= 0) & (place <= place.new_tensor(camera.image_size) - 1)).all(-1)
 
 
 def _gain(score: Tensor) -> Tensor:
@@ -175,11 +172,6 @@ def look_of(proposed: Sequence[tuple[Tensor, Tensor]]) -> _Look:
         total += torch.where(torch.isfinite(best), best, -ANOTHER)
     order = total.argsort(descending=True, stable=True)
     return _Look(float(total[order[0]]), R[order])
-
-
-def _explains(poses: Poses) -> bool:
-    """Return whether the paint of a ball explains the pictures in use better than an unknown one."""
-    return len(poses) > 0 and float(_gain(poses.score[0, poses.use]).sum()) > 0
 
 
 def _surprise(ahead: Ahead, X: Tensor, covariance_mm2: Tensor, R: Tensor, radius_mm: float) -> Floats:

@@ -1,9 +1,10 @@
 """Poses of all balls in all frames: a search at the first frame of a chunk, then each frame from those before it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate, pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,14 +19,6 @@ from sphereorient.pose.neighbours import Neighbours, joined
 from sphereorient.pose.poses import Poses, supported
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Where a ball is in a frame."""
-
-    position_lab_mm: Tensor  # (3,)
-    move_mm: Tensor  # (3,), while the shutter is open
 
 
 class Tracker:
@@ -97,14 +90,11 @@ class Tracker:
                 name: [tracker.ahead(chunks[name][n], -number) for n, number in zip(now, numbers, strict=True)]
                 for name, tracker in self.balls.items()
             }
-            places = [
-                {
-                    name: place
-                    for name, poses in found[number].items()
-                    if (place := _place(poses, ahead[name][row])) is not None
-                }
-                for row, number in enumerate(numbers)
-            ]
+            places = []
+            for number, due in zip(numbers, zip(*ahead.values(), strict=True), strict=True):
+                known = {name: _expected_place(one) for name, one in zip(ahead, due, strict=True) if one is not None}
+                seen = {name: poses for name, poses in found[number].items() if supported(poses)}
+                places.append(known | {name: _found_place(poses, known.get(name)) for name, poses in seen.items()})
             wanted = {
                 name: [
                     one if not supported(found[number][name]) or (name, number + 1) in lost else None
@@ -113,7 +103,7 @@ class Tracker:
                 for name, of_ball in ahead.items()
             }
             frames = [[movie[number] for movie in shots] for number in numbers]
-            followed = self._followed(wanted, places, frames, [True] * len(now))
+            followed = self._followed(wanted, places, frames)
             for name, tracker in self.balls.items():
                 for n, number, row in zip(now, numbers, followed, strict=True):
                     poses, was, chunk = row[name], found[number][name], chunks[name][n]
@@ -143,15 +133,18 @@ class Tracker:
         ]
         rough = [any(one is not None and one.rough for one in row) for row in zip(*ahead.values(), strict=True)]
         # Where a motion is not known yet, the others are looked past once all are found.
-        first = [{} if unsure else row for unsure, row in zip(rough, known, strict=True)]
-        found = self._followed(ahead, first, frames, [True] * len(frames))
+        first = [{} if no else row for no, row in zip(rough, known, strict=True)]
+        found = self._followed(ahead, first, frames)
         if any(rough) and any(self._others.values()):
             at = [
                 {name: _found_place(poses, row[name]) for name, poses in there.items() if poses is not None}
                 for row, there in zip(known, found, strict=True)
             ]
-            again = self._followed(ahead, at, frames, rough)
-            found = [again[n] if unsure else row for n, (unsure, row) in enumerate(zip(rough, found, strict=True))]
+            unsure = {
+                name: [one if no else None for one, no in zip(row, rough, strict=True)] for name, row in ahead.items()
+            }
+            again = self._followed(unsure, at, frames)
+            found = [new if no else row for new, no, row in zip(again, rough, found, strict=True)]
         done = [{name: poses for name, poses in row.items() if poses is not None} for row in found]
         if all(len(row) == len(self.balls) for row in done):
             return done
@@ -168,14 +161,13 @@ class Tracker:
     def _followed(
         self,
         ahead: Mapping[str, Sequence[Expected | None]],
-        places: Sequence[Mapping[str, _Place]],
+        places: Sequence[Mapping[str, Tensor]],
         frames: Sequence[Sequence[Frame]],
-        wanted: Sequence[bool],
     ) -> list[dict[str, Poses | None]]:
-        """Fit the predicted balls of each frame that is wanted, past the others at their places."""
+        """Fit the predicted balls of each frame past the others at their places."""
         found: list[dict[str, Poses | None]] = [dict.fromkeys(self.balls) for _ in frames]
         for name, tracker in self.balls.items():
-            rows = {n: one for n, one in enumerate(ahead[name]) if one is not None and wanted[n]}
+            rows = {n: one for n, one in enumerate(ahead[name]) if one is not None}
             expected = [replace(one, among=self._among(name, places[n])) for n, one in rows.items()]
             for n, poses in zip(rows, tracker.follow(expected, [frames[n] for n in rows]), strict=True):
                 found[n][name] = poses
@@ -183,7 +175,7 @@ class Tracker:
 
     def _completed(
         self,
-        frame: tuple[dict[str, Poses], Mapping[str, _Place], Sequence[Frame], Mapping[str, Ahead]],
+        frame: tuple[dict[str, Poses], Mapping[str, Tensor], Sequence[Frame], Mapping[str, Ahead]],
     ) -> dict[str, Poses]:
         """Return the poses of all balls of a frame: those followed, and those that a search finds."""
         done, known, shots, past = frame
@@ -191,14 +183,14 @@ class Tracker:
         if not lost:
             return done
         places = {name: _found_place(poses, known.get(name)) for name, poses in done.items()}
-        there = self.start(shots, lost, {name: place.position_lab_mm for name, place in places.items()}, past)
+        there = self.start(shots, lost, {name: place[0] for name, place in places.items()}, past)
         places |= {name: _found_place(poses, None) for name, poses in there.items() if len(poses)}
         for name in lost:
             among = self._among(name, places) if len(there[name]) else None
             done[name] = there[name] if among is None else self.balls[name].looked_past(there[name], shots, among)
         return {name: done[name] for name in self.balls}
 
-    def _among(self, name: str, places: Mapping[str, _Place]) -> Neighbours | None:
+    def _among(self, name: str, places: Mapping[str, Tensor]) -> Neighbours | None:
         """Return the neighbours of one ball in one frame; None where there are none."""
         others = self._others[name]
         return _neighbours(others, places) if others else None
@@ -216,15 +208,12 @@ def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[
     return found
 
 
-def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, _Place]) -> Neighbours:
-    """Return the neighbours, by name, of one pose."""
-    nowhere = _Place(torch.full((3,), torch.nan, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    there = [places.get(name, nowhere) for name in radius_mm]
-    return Neighbours(
-        position_lab_mm=torch.stack([one.position_lab_mm for one in there])[None],
-        radius_mm=torch.tensor([list(radius_mm.values())], dtype=torch.float64),
-        move_mm=torch.stack([one.move_mm for one in there])[None],
-    )
+def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, Tensor]) -> Neighbours:
+    """Return the neighbours, by name, of one pose; a place (2, 3): position, and move while the shutter is open, mm."""
+    nowhere = torch.tensor([[torch.nan] * 3, [0.0] * 3], dtype=torch.float64)
+    position, move = torch.stack([places.get(name, nowhere) for name in radius_mm], 1)[:, None]
+    radii = torch.tensor([list(radius_mm.values())], dtype=torch.float64)
+    return Neighbours(position_lab_mm=position, radius_mm=radii, move_mm=move)
 
 
 def _same(one: Poses, other: Poses, tracker: BallTracker) -> bool:
@@ -234,17 +223,11 @@ def _same(one: Poses, other: Poses, tracker: BallTracker) -> bool:
     return bool(turn < DISTINCT_RAD) and bool(move < MOVE_SHARE * tracker.fitter.radius_mm)
 
 
-def _place(poses: Poses, expected: Expected | None) -> _Place | None:
-    """Return where a ball is in a frame, or is expected."""
-    before = None if expected is None else _expected_place(expected)
-    return _found_place(poses, before) if supported(poses) else before
+def _expected_place(one: Expected) -> Tensor:
+    return torch.from_numpy(np.stack([one.position_lab_mm, one.moved[3:]]))
 
 
-def _expected_place(one: Expected) -> _Place:
-    return _Place(torch.from_numpy(one.position_lab_mm), torch.from_numpy(one.moved[3:]))
-
-
-def _found_place(poses: Poses, before: _Place | None) -> _Place:
+def _found_place(poses: Poses, before: Tensor | None) -> Tensor:
     """Return the place of a frame's best pose, with the motion that was expected of it."""
-    still = torch.zeros(3, dtype=torch.float64)
-    return _Place(poses.position_lab_mm[0], still if before is None else before.move_mm)
+    X = poses.position_lab_mm[0]
+    return torch.stack([X, torch.zeros_like(X) if before is None else before[1]])

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from sphereorient import so3
 from sphereorient.errors import Reason
 from sphereorient.learn.settings import NetworkSettings
-from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
+from sphereorient.search.candidates import BATCH, Candidates, Proposer, check_disks, distinct
 from sphereorient.search.normalisation import rim_share
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -218,7 +218,7 @@ def probability_of(score: Tensor) -> Tensor:
     return 2.0 * score - 1.0
 
 
-class LearnedProposer(DiskSearch):
+class LearnedProposer(Proposer):
     """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
     At most `CANDIDATES` for each disk; `temperature` divides the logits, for calibrated probabilities.
     """

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import Reason
 from sphereorient.experiment.recording import EVERY, CameraStream, Shown, equal, uniform, whole
+from sphereorient.locate.outline import Levels, Mask
 
 Picture = NDArray[Any]
 # A pixel's noise is a quantile of its deviations over that of a unit normal. Measured mean: glitter is in more frames
@@ -34,25 +35,25 @@ WHITE_SHARE = 0.5  # share of all pixels
 class Background:
     """Mean picture and noise of one movie; made by `learn_background`."""
 
-    mean: NDArray[np.float32]  # (H, W), grey levels
-    noise: NDArray[np.float32]  # (H, W), robust sigma about the mean, grey levels
+    mean: Levels  # (H, W), grey levels
+    noise: Levels  # (H, W), robust sigma about the mean, grey levels
     full_scale: float  # saturated grey level: 255 for 8 bit, 1023 for 10 bit
-    shown: NDArray[np.bool_] | None = None  # (H, W), False where something static hides the sphere
+    shown: Mask | None = None  # (H, W), False where something static hides the sphere
 
     @cached_property
     def typical_noise(self) -> float:
         """Median noise of the pixels, grey levels."""
         return float(np.median(self.noise))
 
-    def difference(self, frame: NDArray[np.generic]) -> NDArray[np.float32]:
+    def difference(self, frame: NDArray[np.generic]) -> Levels:
         """Return |frame - background|, (H, W) float32, grey levels; 0 where the sphere is hidden."""
-        out: NDArray[np.float32] = np.abs(frame.astype(np.float32) - self.mean)
+        out: Levels = np.abs(frame.astype(np.float32) - self.mean)
         if self.shown is not None:
             out[~self.shown] = 0
         return out
 
 
-def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:
+def measure_background(pictures: NDArray[Any], empty: Levels | None = None) -> Background:
     """Return the clipped mean and noise per pixel of evenly spread frames (n, H, W), uint8 or uint16.
     Values beyond four robust sigmas are left out: the plain mean (paper, section III A) keeps 1/n of the sphere. With
     `empty` (H, W), the scene without the sphere, only the noise is measured.
@@ -99,7 +100,7 @@ def even_scene(background: Background, diameter_px: float) -> Background:
     return replace(background, mean=even * np.float32((high - low) / 255) + np.float32(low), noise=noise)
 
 
-def filled(background: Background, even: Background, covered: NDArray[np.bool_], diameter_px: float) -> Background:
+def filled(background: Background, even: Background, covered: Mask, diameter_px: float) -> Background:
     """Return a background with the even scene where spheres that turn cover pixels in nearly all frames (n, H, W)."""
     loud = (background.noise > LOUD * background.typical_noise).astype(np.float32)
     changes = cv2.blur(loud, (int(diameter_px / 2) | 1,) * 2) > CHANGING  # what stands still belongs to the scene
@@ -110,7 +111,7 @@ def filled(background: Background, even: Background, covered: NDArray[np.bool_],
     return replace(background, mean=mean, noise=noise)
 
 
-def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:
+def without_ball(background: Background, pictures: NDArray[Any], covered: Mask) -> Background:
     """Measure the pixels `covered` (n, H, W) again from the other frames; with under `FREE` they keep their values."""
     free = len(pictures) - covered.sum(axis=0)
     again = (free < len(pictures)) & (free >= FREE)
@@ -125,9 +126,7 @@ def _rounding(full_scale: float) -> float:
     return float(full_scale / 255 / 12**0.5)
 
 
-def _statistics(
-    values: NDArray[np.float32], given: NDArray[np.float32] | None, full_scale: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _statistics(values: Levels, given: Levels | None, full_scale: float) -> tuple[Levels, Levels]:
     """Return the clipped mean, or the given one, and the robust sigma over axis 0, ignoring NaN."""
     rounding = _rounding(full_scale)
     share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if given is None else (GIVEN_SHARE, GIVEN_SIGMAS)
@@ -140,7 +139,7 @@ def _statistics(
     return np.where(usual, values, 0).sum(0) / usual.sum(0), sigma
 
 
-def _nan_quantile(values: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+def _nan_quantile(values: Levels, share: float) -> Levels:
     """Return the quantile over axis 0 without NaN, nearest rank; np.nanquantile loops over pixels."""
     ordered = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0)
@@ -200,11 +199,7 @@ def screened(picture: Shown, before: Shown | None, background: Background) -> Fr
 
 
 def screened_frames(
-    stream: CameraStream,
-    background: Background,
-    first: int = 0,
-    last: int | None = None,
-    pool: Executor | None = None,
+    stream: CameraStream, background: Background, first: int = 0, last: int | None = None, pool: Executor | None = None
 ) -> Iterator[Frame]:
     """Yield frames first .. last - 1 from the first in use; reasons depend on this and the previous frame only.
     With a `pool` movies that allow it are decoded there, part by part, as fits ask for it.

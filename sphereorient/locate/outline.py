@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 from sphereorient.locate.settings import LocateSettings
 
+Floats = NDArray[np.float64]
+Levels = NDArray[np.float32]  # a picture (H, W), grey levels
+Mask = NDArray[np.bool_]
+
 DIRECTIONS = 72  # bins of 5 degrees for a circle's support
 BEYOND = 1.0  # weight of a rim point outside a circle relative to one on it
 NOISE_FLOOR = 2.0  # the root is linear below this many sigmas: noise is not amplified
@@ -34,23 +38,21 @@ class Blob:
     merit: float  # variance inside times similarity to a disk
 
 
-def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+def coarser(picture: Levels, factor: int) -> Levels:
     """Average by an integer factor, cropping right and lower borders (other ratios are 40 times slower)."""
     height, width = (side // factor for side in picture.shape)
     whole = picture[: height * factor, : width * factor]
     return picture if factor == 1 else np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def find_blobs(
-    difference: NDArray[np.float32], noise: NDArray[np.float32], diameter_px: float, settings: LocateSettings
-) -> list[Blob]:
+def find_blobs(difference: Levels, noise: Levels, diameter_px: float, settings: LocateSettings) -> list[Blob]:
     """Return at most `settings.blob_candidates` round blobs of about `diameter_px`, best first.
     `difference` is |frame - background|, `noise` the background's sigma, (H, W), grey levels. The blob filter is a
     difference of two box filters.
     Source: paper section III A.
     """
     factor = settings.reduction
-    small = np.maximum(_reduce(difference - settings.noise_factor * noise, factor), 0)
+    small = np.maximum(coarser(difference - settings.noise_factor * noise, factor), 0)
     # Clip near the sphere's brightness: a bright reflection must not dominate.
     lit = small[small > 0]
     if lit.size == 0:
@@ -75,7 +77,7 @@ def find_blobs(
     return sorted(blobs, key=lambda blob: -blob.merit)
 
 
-def _judge(small: NDArray[np.float32], u: float, v: float, radius: float) -> tuple[float, float, float]:
+def _judge(small: Levels, u: float, v: float, radius: float) -> tuple[float, float, float]:
     """Centre a blob on its foreground; return (u, v, merit)."""
     merit = 0.0
     for _ in range(2):
@@ -117,15 +119,15 @@ class Outline:
 class Edges:
     """Edge pixels (E, 2), px, and unit vectors from dark to bright (E, 2)."""
 
-    point: NDArray[np.float64]
-    inward: NDArray[np.float64]
+    point: Floats
+    inward: Floats
 
-    def where(self, kept: NDArray[np.bool_]) -> "Edges":
+    def where(self, kept: Mask) -> "Edges":
         """Return some of the edges, by a mask (E,)."""
         return Edges(point=self.point[kept], inward=self.inward[kept])
 
 
-def edge_points(window: NDArray[np.float32], steepness: float) -> Edges:
+def edge_points(window: Levels, steepness: float) -> Edges:
     """Return the edges of a picture (H, W) that rise by at least `steepness` per px."""
     du = cv2.Scharr(window, cv2.CV_32F, 1, 0) / 32
     dv = cv2.Scharr(window, cv2.CV_32F, 0, 1) / 32
@@ -146,12 +148,12 @@ def window_about(u: float, v: float, reach: int) -> tuple[slice, slice]:
     return rows, columns
 
 
-def direction_bins(across: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.int64]:
+def direction_bins(across: Floats, down: Floats) -> NDArray[np.int64]:
     """Return in which of `DIRECTIONS` bins vectors point, (n,)."""
     return ((np.arctan2(down, across) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
 
 
-def stabilised(difference: NDArray[np.float32], noise: float, settings: LocateSettings) -> NDArray[np.float32]:
+def stabilised(difference: Levels, noise: float, settings: LocateSettings) -> Levels:
     """Return the root of a blurred difference: the variance of shot noise is even, dim and bright rims count alike."""
     lift = NOISE_FLOOR * noise
     blurred = cv2.GaussianBlur(difference, (0, 0), settings.edge_blur_px)
@@ -165,7 +167,7 @@ def least_steepness(contrast: float, noise: float, settings: LocateSettings) -> 
     return max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor), floor
 
 
-def away_from_hidden(shown: NDArray[np.bool_] | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def away_from_hidden(shown: Mask | None, shape: tuple[int, ...]) -> Mask:
     """Return where in a picture, or a window, edges are not those of a mask, (H, W)."""
     if shown is None:
         return np.ones(shape, bool)
@@ -173,21 +175,21 @@ def away_from_hidden(shown: NDArray[np.bool_] | None, shape: tuple[int, ...]) ->
     return np.asarray(cv2.erode(shown.astype(np.uint8), square) > 0)
 
 
-def in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def in_the_clear(place: Floats, clear: Mask) -> Mask:
     """Return which points (n, 2), window px, are away from the mask, (n,)."""
     limit = np.array(clear.shape[::-1]) - 1
     u, v = np.rint(place).astype(np.int64).clip(0, limit).T
     return np.asarray(clear[v, u])
 
 
-def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_]) -> float:
+def _rim_in_the_clear(circle: Floats, clear: Mask) -> float:
     """Return the number of directions in which the rim is away from the mask."""
     angle = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
     rim = circle[:2] + circle[2] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return max(float(in_the_clear(rim, clear).sum()), LEAST_RIM * DIRECTIONS)
 
 
-def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def _circles_through(p: Floats) -> Floats:
     """Return circles (n, 3: u, v, r) through point triples (n, 3, 2); NaN if collinear."""
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     cross = 2 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
@@ -197,7 +199,7 @@ def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([p[:, 0] + offset, np.linalg.norm(offset, axis=1)])
 
 
-def support(circles: NDArray[np.float64], edges: Edges, tolerance: float) -> NDArray[np.float64]:
+def support(circles: Floats, edges: Edges, tolerance: float) -> Floats:
     """Count directions with an edge on the circle, less half of those with one just outside: the rim is outermost."""
     across, down = (edges.point[:, k] - circles[:, k : k + 1] for k in (0, 1))
     distance = np.sqrt(across**2 + down**2)
@@ -216,7 +218,7 @@ def support(circles: NDArray[np.float64], edges: Edges, tolerance: float) -> NDA
     return np.asarray(counted[0].sum(1) - 0.5 * counted[1].sum(1), np.float64)
 
 
-def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
+def _painted(window: Levels, circle: Floats) -> bool:
     """Return whether the variance inside a circle is near the window's largest: objects of one colour have less."""
     side = max(3, round(2**0.5 * circle[2]) | 1)
     mean, square = (
@@ -228,7 +230,7 @@ def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
     return bool(variance[v, u] >= PAINTED * variance.max())
 
 
-def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
+def _alone(window: Levels, circle: Floats) -> bool:
     """Return whether there is no foreground outside a circle, which then may be a sphere of one colour."""
     row, column = np.ogrid[: window.shape[0], : window.shape[1]]
     away = np.hypot(row - circle[1], column - circle[0]) / circle[2]
@@ -237,9 +239,7 @@ def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
     return bool(float(beside.sum()) < BESIDE * np.pi * circle[2] ** 2)
 
 
-def _best_circle(
-    edges: Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
-) -> NDArray[np.float64] | None:
+def _best_circle(edges: Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400) -> Floats | None:
     """Return the best supported circle of an allowed size (RANSAC, fixed seed)."""
     if len(edges.point) < 8:
         return None
@@ -255,13 +255,13 @@ def _best_circle(
     circles = circles[outwards.all(1)][:tries]
     if not len(circles):
         return None
-    best: NDArray[np.float64] = circles[int(support(circles, edges, tolerance).argmax())]
+    best: Floats = circles[int(support(circles, edges, tolerance).argmax())]
     return best
 
 
 def _ball_circle(
-    edges: Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
-) -> tuple[NDArray[np.float64] | None, bool]:
+    edges: Edges, window: Levels, radius_range: tuple[float, float], tolerance: float
+) -> tuple[Floats | None, bool]:
     """Return the best circle that may be the sphere, and whether it is painted; remove rims of other objects."""
     for _ in range(SET_ASIDE + 1):
         circle = _best_circle(edges, radius_range, tolerance)
@@ -274,12 +274,8 @@ def _ball_circle(
 
 
 def _radial_edges(
-    window: NDArray[np.float32],
-    circle: NDArray[np.float64],
-    reach: tuple[float, float],
-    steepness: float,
-    clear: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    window: Levels, circle: Floats, reach: tuple[float, float], steepness: float, clear: Mask
+) -> tuple[Floats, Floats, Floats]:
     """Return direction (n, 2), offset (n,), px, and steepness (n,) of outermost falls; inner edges may be steeper."""
     step = 0.5
     # A fall needs two samples on each side.
@@ -305,9 +301,7 @@ def _radial_edges(
     return outward[keep], offset[last[keep] + 1] + shift * step, middle[keep]
 
 
-def _consensus(
-    outward: NDArray[np.float64], offset: NDArray[np.float64], trust: NDArray[np.float64], tolerance: float
-) -> NDArray[np.float64]:
+def _consensus(outward: Floats, offset: Floats, trust: Floats, tolerance: float) -> Floats:
     """Return the shift (du, dv, dr) with most support: outliers lie inside, so that means and medians are biased."""
     design = np.column_stack([outward, np.ones(len(outward))])
     choice = np.random.default_rng(0).integers(0, len(offset), (300, 3))
@@ -319,17 +313,11 @@ def _consensus(
     residual = offset - moves @ design.T
     # The sphere ends at its rim: points outside weigh more than points on it.
     merit = (np.abs(residual) < tolerance) @ trust - BEYOND * ((residual > 2 * tolerance) @ trust)
-    best: NDArray[np.float64] = moves[int(merit.argmax())]
+    best: Floats = moves[int(merit.argmax())]
     return best
 
 
-def _fit_circle(
-    window: NDArray[np.float32],
-    circle: NDArray[np.float64],
-    tolerance: float,
-    steepness: float,
-    clear: NDArray[np.bool_],
-) -> Outline | None:
+def _fit_circle(window: Levels, circle: Floats, tolerance: float, steepness: float, clear: Mask) -> Outline | None:
     for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
         outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
         if len(offset) < 12:
@@ -368,12 +356,12 @@ def _fit_circle(
 
 
 def fit_outline(
-    difference: NDArray[np.float32],
+    difference: Levels,
     noise: float,
     blob: Blob,
     diameter_px: float,
     settings: LocateSettings,
-    shown: NDArray[np.bool_] | None = None,
+    shown: Mask | None = None,
 ) -> Outline | None:
     """Return the outline near a blob, picture px; None if no circle of an allowed size is supported. The fewer edges
     support a circle, the better they must fit: those of paint and of glints at the border scatter.

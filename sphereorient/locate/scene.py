@@ -17,7 +17,7 @@ from sphereorient.experiment.recording import CameraStream, Recording, given_sce
 from sphereorient.files.threads import side_by_side
 from sphereorient.locate.background import FREE, LOUD, Background, even_scene, filled, measure_background, without_ball
 from sphereorient.locate.disks import cover, find_disks
-from sphereorient.locate.outline import Blob, Outline, fit_outline
+from sphereorient.locate.outline import Blob, Levels, Mask, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
 
@@ -125,8 +125,8 @@ def learn_background(
     pictures: NDArray[Any],
     diameter_px: float | Sequence[float],
     settings: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    empty: Levels | None = None,
+    shown: Mask | None = None,
 ) -> Background:
     """Estimate the background of frames (n, H, W): average, find the spheres, measure their pixels from other frames.
     `diameter_px` is that of the sphere, or those of all. With `empty` (H, W), a given background, only the noise is
@@ -175,7 +175,7 @@ def _only_disk(
     return [] if outline is None else [outline]
 
 
-def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -> tuple[NDArray[np.bool_], int]:
+def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -> tuple[Mask, int]:
     """Return the pixels of all disks found in frames (n, H, W), and their number."""
     covered, found = np.zeros(pictures.shape, bool), 0
     for picture, mask in zip(pictures, covered, strict=True):
@@ -193,8 +193,8 @@ def given_outline(circle: tuple[float, float, float]) -> Outline:
 def fixed_ball(
     pictures: NDArray[Any],
     locating: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    empty: Levels | None = None,
+    shown: Mask | None = None,
     circle: tuple[float, float, float] | None = None,
 ) -> tuple[Outline, Background]:
     """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
@@ -213,8 +213,7 @@ def fixed_ball(
     full_scale = float(np.iinfo(pictures.dtype).max)
     if circle is not None:
         given = given_outline(circle)
-        scene = _around(middle, scatter, given, full_scale)
-        return given, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
+        return given, _around(given, Background(mean=middle, noise=scatter, full_scale=full_scale, shown=shown), empty)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255
     moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter against single pixels, px
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
@@ -230,8 +229,8 @@ def fixed_ball(
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
         raise _none_fixed(_what_changes(stats[1:]))
-    scene = _around(middle, scatter, outline, full_scale)
-    return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
+    scene = Background(mean=middle, noise=scatter, full_scale=full_scale, shown=shown)
+    return outline, _around(outline, scene, empty)
 
 
 def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettings) -> float:
@@ -250,10 +249,7 @@ def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettin
 
 
 def swaying_ball(
-    pictures: NDArray[Any],
-    locating: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None = None, shown: Mask | None = None
 ) -> tuple[Outline, Background]:
     """Find a rotating sphere that sways, or moves slowly, in frames (n, H, W) in order of time: in a few of them its
     centre is nearly fixed. Return the median of its outlines, and the background with a guess where it always is.
@@ -289,10 +285,7 @@ def swaying_ball(
 
 
 def _turning(
-    pictures: NDArray[Any],
-    locating: LocateSettings,
-    empty: NDArray[np.float32] | None,
-    shown: NDArray[np.bool_] | None,
+    pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None, shown: Mask | None
 ) -> Outline | None:
     """Return the outline of `fixed_ball`; None of a ball that rests, or moves too far in these frames."""
     try:
@@ -301,7 +294,7 @@ def _turning(
         return None
 
 
-def _where_always(background: Background, covered: NDArray[np.bool_]) -> Background:
+def _where_always(background: Background, covered: Mask) -> Background:
     """Return a background that goes on smoothly where a ball covers pixels in nearly all frames."""
     always = (len(covered) - covered.sum(0) < FREE).astype(np.uint8)
     noise = np.where(always > 0, np.float32(background.typical_noise), background.noise)
@@ -310,10 +303,7 @@ def _where_always(background: Background, covered: NDArray[np.bool_]) -> Backgro
 
 
 def still_ball(
-    pictures: NDArray[Any],
-    locating: LocateSettings,
-    empty: NDArray[np.float32] | None = None,
-    shown: NDArray[np.bool_] | None = None,
+    pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None = None, shown: Mask | None = None
 ) -> tuple[Outline, Background]:
     """Find the sphere in a photograph, (1, H, W), of which it may fill the most, by the grey level of its border.
     Return its outline, and the background as in `fixed_ball`, which has the other arguments, too.
@@ -335,8 +325,7 @@ def still_ball(
     if outline is None:
         do = "leave a tenth of its radius around the ball, or set locate.diameter_px"
         raise ExperimentError(refusal("movies", expected="a photograph of a ball", got="nothing round", do=do))
-    around = _around(middle, noise, outline, scene.full_scale)
-    return outline, replace(around, mean=around.mean if empty is None else empty, shown=shown)
+    return outline, _around(outline, replace(scene, mean=middle), empty)
 
 
 def measured_size_px(
@@ -357,16 +346,15 @@ def measured_size_px(
     return size
 
 
-def _around(
-    middle: NDArray[np.float32], scatter: NDArray[np.float32], outline: Outline, full_scale: float
-) -> Background:
-    row, column = np.ogrid[: middle.shape[0], : middle.shape[1]]
+def _around(outline: Outline, scene: Background, empty: Levels | None) -> Background:
+    """Return a scene with the grey about a ball in place of it, or with that without it, where this is given."""
+    row, column = np.ogrid[: scene.mean.shape[0], : scene.mean.shape[1]]
     away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
     ball, ring = away < RIM_FIXED, (away >= RIM_FIXED) & (away < RING)
     around = ring if ring.any() else ~ball
-    mean, noise = middle.astype(np.float32), np.maximum(scatter, 0.3).astype(np.float32)
-    mean[ball], noise[ball] = np.median(middle[around]), np.median(noise[around])
-    return Background(mean=mean, noise=noise, full_scale=full_scale)
+    mean, noise = scene.mean.astype(np.float32), np.maximum(scene.noise, 0.3).astype(np.float32)
+    mean[ball], noise[ball] = np.median(scene.mean[around]), np.median(noise[around])
+    return replace(scene, mean=mean if empty is None else empty, noise=noise)
 
 
 def _what_changes(stats: NDArray[Any]) -> str:

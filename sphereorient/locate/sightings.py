@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, Flag, Reason, ShapeError, refusal
 from sphereorient.locate.background import Background
-from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline, window_about
+from sphereorient.locate.outline import Blob, Floats, Levels, Mask, Outline, find_blobs, fit_outline, window_about
 from sphereorient.locate.settings import LocateSettings
 
 DEGREE = 3  # of the spline
@@ -79,7 +79,7 @@ def find_ball(
 
 def ball_at(
     blobs: Sequence[Blob],
-    difference: NDArray[np.float32],
+    difference: Levels,
     frame: NDArray[np.generic],
     background: Background,
     diameter_px: float,
@@ -174,11 +174,11 @@ def smoothed(sightings: Sightings, settings: LocateSettings) -> Sightings:
     return replace(sightings, centre_px=centre_px, radius_px=radius_px)
 
 
-def _likely_path(frame: NDArray[np.int64], value: NDArray[np.float64]) -> Callable[..., NDArray[np.float64]]:
+def _likely_path(frame: NDArray[np.int64], value: Floats) -> Callable[..., Floats]:
     """Return the smoothing spline of values (n, D) at frames (n,) that predicts what is held out best."""
     x = frame.astype(float)
 
-    def through(some: NDArray[np.bool_], stiffness: float) -> Callable[..., NDArray[np.float64]]:
+    def through(some: Mask, stiffness: float) -> Callable[..., Floats]:
         each = [make_smoothing_spline(x[some], one[some], lam=stiffness) for one in value.T]
         return lambda at: np.column_stack([one(at) for one in each])
 
@@ -187,7 +187,7 @@ def _likely_path(frame: NDArray[np.int64], value: NDArray[np.float64]) -> Callab
     return through(np.ones(len(frame), bool), STIFFNESSES[int(np.argmin(off))])
 
 
-def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:
+def known_stretches(known: Mask, gap_frames_max: int) -> list[NDArray[np.int64]]:
     """Return runs of frame numbers with gaps of at most `gap_frames_max`; the ends are known frames."""
     at = np.flatnonzero(known)
     if not len(at):
@@ -196,9 +196,7 @@ def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArr
     return [np.arange(part[0], part[-1] + 1) for part in parts]
 
 
-def robust_spline(
-    frame: NDArray[np.int64], value: NDArray[np.float64], settings: LocateSettings
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def robust_spline(frame: NDArray[np.int64], value: Floats, settings: LocateSettings) -> tuple[Floats, Mask]:
     """Return a robust cubic spline (n, D) of values (n, D), px, at frames (n,), and the outliers (n,) bool."""
     outlier = np.zeros(len(frame), bool)
     fitted = value.copy()
@@ -216,7 +214,7 @@ def robust_spline(
     return fitted, outlier
 
 
-def _spline(x: NDArray[np.int64], y: NDArray[np.float64], spacing: int):  # type: ignore[no-untyped-def]
+def _spline(x: NDArray[np.int64], y: Floats, spacing: int):  # type: ignore[no-untyped-def]
     inner = np.arange(x[0] + spacing, x[-1] - spacing / 2, spacing, dtype=float)
     counts = np.histogram(x, np.concatenate([[x[0]], inner, [x[-1] + 1]]))[0]
     # Schoenberg and Whitney: each knot needs data nearby.

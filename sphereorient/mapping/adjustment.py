@@ -173,27 +173,21 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
     places = crops.position_lab_mm[:1] if crops.fixed else crops.position_lab_mm
     balls = [BallView.of(view.camera, X, crops.radius_mm) for X in places]
     counts = [torch.from_numpy(_within(crops, camera, k)) for k in range(len(places))]
-    blur_px = BLUR * _radius_px(crops, camera) * math.sqrt(4 * math.pi) / at.cells.side
+    blur_px = BLUR * float(view.radius_px(crops.usual, crops.radius_mm)) * math.sqrt(4 * math.pi) / at.cells.side
 
     def one(k: int) -> tuple[Tensor, Tensor, Tensor]:
         crop = crops.crops[camera][k]
         if crop is None or not bool(crops.seen[k, camera]):
             none = torch.zeros(at.cells.side**2)
             return none, none, none.int()
-        grey = torch.from_numpy(_blurred(crop.grey.astype(np.float32), blur_px))
-        place = 0 if crops.fixed else k
-        return at.cells.see(balls[place], grey, counts[place], (crop.left, crop.top), at.R_lab_body[k])
+        grey, place = crop.grey.astype(np.float32), 0 if crops.fixed else k
+        if blur_px > 1.5 * BLUR:
+            grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32)
+        corner = crop.left, crop.top
+        return at.cells.see(balls[place], torch.from_numpy(grey), counts[place], corner, at.R_lab_body[k])
 
     grey, cosine, pixel = zip(*side_by_side(one, range(len(at.R_lab_body))), strict=True)
     return _Seen(grey=torch.stack(grey), cosine=torch.stack(cosine), pixel=torch.stack(pixel))
-
-
-def _blurred(grey: Picture, blur_px: float) -> Picture:
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32) if blur_px > 1.5 * BLUR else grey
-
-
-def _radius_px(crops: Crops, camera: int) -> float:
-    return float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
 
 
 def _within(crops: Crops, camera: int, frame: int = 0) -> NDArray[np.bool_]:
@@ -219,7 +213,8 @@ def within_limb(
 
 def _smooth(crops: Crops, camera: int, total: Picture, share: Picture) -> Picture:
     """Return the local mean of what counts: sums over pixels, by the share that each has."""
-    side = (2 * int(LIGHT_RADII * _radius_px(crops, camera)) + 1,) * 2
+    radius_px = float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
+    side = (2 * int(LIGHT_RADII * radius_px) + 1,) * 2
     for _ in range(2):
         total, share = (
             np.asarray(cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT), np.float32)

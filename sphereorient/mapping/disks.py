@@ -3,7 +3,7 @@
 The disks compare pictures before there is a map.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -25,12 +25,14 @@ from sphereorient.locate import (
     Found,
     Frame,
     LocateSettings,
+    Positions,
+    Sightings,
     find_ball,
     find_positions,
     sightings_of,
     smoothed,
 )
-from sphereorient.locate.outline import Outline
+from sphereorient.locate.outline import window_about
 from sphereorient.locate.scene import fixed_ball, wander_px
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import CameraView
@@ -126,28 +128,20 @@ def too_few(count: int) -> PaintError:
 
 def take_crops(recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress) -> Crops:
     """Crop the sphere in every frame; raise ExperimentError if it is not found, PaintError if cameras disagree."""
-    experiment = recording.experiment
-    views, rows, sightings = [], [], {}
+    experiment, views, sightings = recording.experiment, list[CameraView](), dict[str, Sightings]()
+    rows: list[list[Crop | None]] = []
     for stream in recording.streams:
-        outline = None
-        if experiment.fixed:  # what changes in the pictures is the ball
-            outline, scene = _fixed_scene(recording, stream, settings, locating)
-        else:
-            (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
-        found: list[Found] = []
-        row: list[Crop | None] = []
+        scene, found = _scene(recording, stream, settings, locating), list[Found]()
+        rows.append([])
         for k, shot in enumerate(locate.screened_frames(stream, scene.background)):
-            one = (outline if shot.usable else None, shot.reason) if outline else _outline(scene, locating, shot)
-            found.append(one)
-            ball = one[0]
-            row.append(None if ball is None else cut_crop(shot.picture, *ball.circle))
+            found.append(_outline(scene, locating, shot))
+            ball, _ = found[-1]
+            rows[-1].append(None if ball is None else cut_crop(shot.picture, *ball.circle))
             progress(f"{stream.name}: ball", k + 1, 0)
         views.append(CameraView.of(stream.name, stream.camera, scene))
-        rows.append(row)
         seen = sightings_of(found)
-        sightings[stream.name] = seen if experiment.fixed else locate.fill_gaps(seen, locating)
-    locate.check_seen(sightings)
-    positions = find_positions(sightings, {view.name: view.camera for view in views}, experiment.diameter_mm)
+        sightings[stream.name] = seen if scene.outline else locate.fill_gaps(seen, locating)
+    positions = _positions(sightings, recording)
     X = positions.position_lab_mm
     if experiment.fixed:
         X = X.nanmedian(0).values.expand(len(X), 3).clone()
@@ -162,20 +156,30 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
     return Crops(views=views, crops=rows, position_lab_mm=X, seen=seen_by, radius_mm=radius_mm, fixed=fixed)
 
 
-def _fixed_scene(
-    recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings
-) -> tuple[Outline, CameraScene]:
-    """Return outline and scene of a fixed ball; PaintError if outlines scatter far more in place than in size."""
+def _positions(sightings: Mapping[str, Sightings], recording: Recording) -> Positions:
+    locate.check_seen(sightings)
+    return find_positions(sightings, recording.cameras, recording.experiment.diameter_mm)
+
+
+def _scene(recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings) -> CameraScene:
+    """Return the scene of an only ball; of a fixed one, which is what changes in the pictures, with the outline.
+    PaintError: outlines of a fixed ball scatter far more in place than in size.
+    """
+    if not recording.experiment.fixed:
+        (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
+        return scene
     circle = recording.experiment.circles.get(stream.name)
     pictures = stream.spread((1 if circle else 4) * settings.background_frames)
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     outline, background = fixed_ball(pictures, locating, empty, stream.shown, circle)
-    scene = CameraScene(background=background, diameter_px=2 * outline.radius_px, response=stream.response)
+    scene = CameraScene(
+        background=background, diameter_px=2 * outline.radius_px, response=stream.response, outline=outline
+    )
     wander = 0.0 if circle else wander_px(pictures, scene, locating)
     if wander:
         got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: sways`"
         raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
-    return outline, scene
+    return scene
 
 
 def held_place(
@@ -188,30 +192,27 @@ def held_place(
     """Return an empty record with the views and the positions of a ball: one (1, 3) of a fixed ball, else those of the
     first frames (N, 3), at most `frames_max`, with the cameras that see it, (N, C). Raise as `take_crops`.
     """
-    experiment, views, sightings = recording.experiment, [], {}
+    experiment, views, sightings = recording.experiment, list[CameraView](), dict[str, Sightings]()
     for stream in recording.streams:
-        if experiment.fixed:
-            outline, scene = _fixed_scene(recording, stream, settings, locating)
-            seen = sightings_of([(outline, Reason.OK)])
+        scene = _scene(recording, stream, settings, locating)
+        if scene.outline:
+            seen = sightings_of([(scene.outline, Reason.OK)])
         else:
-            (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
             count = min(frames_max, len(recording.timeline))
             shots = locate.screened_frames(stream, scene.background, 0, count)
             found = side_by_side(partial(_outline, scene, locating), shots)
             seen = smoothed(sightings_of(counted(f"{stream.name}: ball", found, count, progress)), locating)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = seen
-    locate.check_seen(sightings)
+    X = _positions(sightings, recording).position_lab_mm
     use = torch.stack([one.placed for one in sightings.values()], 1)
-    cameras = {view.name: view.camera for view in views}
-    X = find_positions(sightings, cameras, experiment.diameter_mm).position_lab_mm
     radius_mm, fixed = experiment.radius_mm, experiment.fixed
     return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=use, radius_mm=radius_mm, fixed=fixed)
 
 
 def _outline(scene: CameraScene, locating: LocateSettings, shot: Frame) -> Found:
-    if not shot.usable:
-        return None, shot.reason
+    if scene.outline or not shot.usable:
+        return scene.outline if shot.usable else None, shot.reason
     return find_ball(shot.picture, scene.background, scene.diameter_px, locating)
 
 
@@ -223,9 +224,8 @@ def evenly_spread(rows: Tensor, count: int) -> Tensor:
 def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
     """Cut a disk and its surroundings out of a picture."""
     reach = int(np.ceil(REACH * radius_px)) + 3
-    top, left = max(0, round(v_px) - reach), max(0, round(u_px) - reach)
-    grey = picture[top : round(v_px) + reach + 1, left : round(u_px) + reach + 1].copy()
-    return Crop(grey=grey, top=top, left=left)
+    rows, columns = window_about(round(u_px), round(v_px), reach)
+    return Crop(grey=picture[rows, columns].copy(), top=rows.start, left=columns.start)
 
 
 def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor | None = None) -> list[Crop]:
@@ -245,8 +245,7 @@ def _whole_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) ->
     reach = int(np.ceil(REACH * radius_px)) + 3
     top, left = round(v_px) - reach, round(u_px) - reach
     grey = np.zeros((2 * reach + 1, 2 * reach + 1), picture.dtype)
-    there = np.s_[max(0, top) : max(0, top + 2 * reach + 1), max(0, left) : max(0, left + 2 * reach + 1)]
-    part = picture[there]
+    part = picture[window_about(round(u_px), round(v_px), reach)]
     grey[max(0, -top) :, max(0, -left) :][: part.shape[0], : part.shape[1]] = part
     return Crop(grey=grey, top=top, left=left)
 
@@ -305,23 +304,12 @@ class Disks:
         """Side of the pictures, px."""
         return self.layers.shape[-1]
 
-    @property
-    def sight_lab(self) -> Tensor:
-        """Unit vectors from the ball to the cameras, (N, C, 3) float64."""
-        return -self.R_lab_view[..., 2].double()
-
     def sight_cosines(self, R_lab_body: Tensor, rows: Tensor) -> Tensor:
         """Return the cosine between the nearest lines of sight in the body for all pairs of instants (K,), (K, K)."""
-        in_body = (R_lab_body[rows].mT[:, None] @ self.sight_lab[rows][..., None])[..., 0]
+        in_body = (R_lab_body[rows].mT[:, None] @ -self.R_lab_view[rows][..., 2, None].double())[..., 0]
         cosine = torch.einsum("acx,bdx->abcd", in_body, in_body)
         both = self.seen[rows][:, None, :, None] & self.seen[rows][None, :, None, :]
         return torch.where(both, cosine, -1.0).flatten(2).amax(2)
-
-    @classmethod
-    def joined(cls, parts: Sequence["Disks"]) -> "Disks":
-        """Join instants of the same cameras."""
-        joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in BY_INSTANT}
-        return cls(share=parts[0].share, **joined)
 
 
 def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:

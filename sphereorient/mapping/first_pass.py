@@ -20,6 +20,7 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.threads import Progress, counted, silent
 from sphereorient.follow.chunk import LEAST_CHANGE
 from sphereorient.locate import Background, Frame, screened_frames
+from sphereorient.locate.outline import coarser
 from sphereorient.mapping.adjustment import Adjustment, adjusted, cells_of, place_metric, within_limb
 from sphereorient.mapping.disks import FOLLOWED, Crop, Crops, cut_out, evenly_spread
 from sphereorient.mapping.paint_cells import BallView
@@ -75,21 +76,15 @@ class CoarserPictures:
         if self.factor == 1:
             return shots
         # Pictures that show nothing are not looked at.
-        return [Frame(shown=_coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in shots]
-
-
-def _coarser(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    height, width = (side // factor for side in picture.shape)
-    whole = picture[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        return [Frame(shown=coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in shots]
 
 
 def _coarser_view(view: CameraView, factor: int) -> CameraView:
     if factor == 1:
         return view
     scene, shown = view.background, view.background.shown
-    mean, noise = (_coarser(part, factor) for part in (scene.mean, scene.noise))
-    shown = None if shown is None else _coarser(shown.astype(np.float32), factor) == 1.0
+    mean, noise = (coarser(part, factor) for part in (scene.mean, scene.noise))
+    shown = None if shown is None else coarser(shown.astype(np.float32), factor) == 1.0
     background = Background(mean=mean, noise=noise / np.float32(factor), full_scale=scene.full_scale, shown=shown)
     diameter_px = view.diameter_px / factor
     coarse = replace(view.scene, background=background, diameter_px=diameter_px)
@@ -134,14 +129,6 @@ class EvenLight:
         return whole
 
 
-class _Place:
-    """Where a frame shows the ball: its position, and the parts of all cameras' pictures, made even."""
-
-    def __init__(self, ball: Crops, position_lab_mm: Tensor) -> None:
-        self.X = position_lab_mm  # (3,)
-        self.even = [EvenLight(view, self.X, ball.radius_mm) for view in ball.views]
-
-
 class FirstPass:
     """Follows a ball in its place by the map of the frames before: the body frame is the lab at the first one."""
 
@@ -151,7 +138,8 @@ class FirstPass:
         """
         radius_mm = place.radius_mm
         self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
-        self._ball, self._here = place, _Place(place, place.usual)
+        self._ball = place
+        self._go_to(place.usual)
         self._views = self._views_at(place.usual)  # of a fixed ball
         known = place.position_lab_mm[torch.isfinite(place.position_lab_mm).all(1)]
         sizes = [view.radius_px(known, radius_mm).max() for view in place.views]
@@ -174,6 +162,11 @@ class FirstPass:
         self._lost = 0  # frames that are not explained, in a row
         self._usual, self._count = 0.0, 1  # score of frames that are, and their number
 
+    def _go_to(self, position_lab_mm: Tensor) -> None:
+        """Take what the pictures show at a position (3,) from now on."""
+        self._X = position_lab_mm
+        self._even = [EvenLight(view, self._X, self._ball.radius_mm) for view in self._ball.views]
+
     def next(
         self, time_s: float, shots: Sequence[Frame], there: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Poses, bool]:
@@ -188,19 +181,18 @@ class FirstPass:
         if not bool(use.any()):
             return no_pose(len(shots), reason), False
         if there is not None:
-            self._here = _Place(self._ball, there[0])
-        even = [light(shot.picture) for light, shot in zip(self._here.even, shots, strict=True)]
+            self._go_to(there[0])
+        even = [light(shot.picture) for light, shot in zip(self._even, shots, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
-            self._grow(even, use, R, self._here.X)  # the map is this frame
+            self._grow(even, use, R, self._X)  # the map is this frame
             self._before = time_s, R
             return self._told(self._settled([even], R[None], use), use, reason), True
         step_s, before = time_s - self._before[0], self._before[1]
         fit, searched = self._fitted(max(step_s, 0.0), before, even, use)
         if fit is None:
             self._lost, self._rate, self._change = self._lost + 1, *torch.zeros(2, 3, dtype=torch.float64)
-            why = [Reason.LOW_SCORE if one is Reason.OK else one for one in reason]
-            return no_pose(len(shots), why, use), True
+            return no_pose(len(shots), reason, use), True
         R = fit.R_lab_body[0]
         rate = so3.log(R @ before.mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
         rate = rate * (not searched)
@@ -223,8 +215,8 @@ class FirstPass:
         for k, use in enumerate(crops.seen):
             pictures, X = crops.pictures(torch.tensor([k]))[0], crops.place(k)
             if not crops.fixed:
-                self._here = _Place(self._ball, X)
-            even = [light(one) for light, one in zip(self._here.even, pictures, strict=True)]
+                self._go_to(X)
+            even = [light(one) for light, one in zip(self._even, pictures, strict=True)]
             self._grow(even, use, R_lab_body[k], X)
         return self
 
@@ -241,7 +233,7 @@ class FirstPass:
 
     def _grow(self, even: Sequence[NDArray[np.float32]], use: Tensor, R_lab_body: Tensor, X: Tensor) -> None:
         views = self._views if self._ball.fixed else self._views_at(X)
-        for view, light, one, seen in zip(views, self._here.even, even, use.tolist(), strict=True):
+        for view, light, one, seen in zip(views, self._even, even, use.tolist(), strict=True):
             if seen:
                 self.cells.add(view, torch.from_numpy(one), light.counts, (light.left, light.top), R_lab_body)
 
@@ -269,7 +261,7 @@ class FirstPass:
         """Return the best fit near any of many orientations (M, 3, 3)."""
         frames, begin = self._start([even], R, use)
         level = self._fitter.optics.fine
-        one = self._fitter.pixels(frames, self._here.X[None], level).thinned(TRIED_EVERY)
+        one = self._fitter.pixels(frames, self._X[None], level).thinned(TRIED_EVERY)
         tried = self._fitter.fit(one.where(torch.arange(len(use)).repeat(len(R))), begin, level, TRIED_STEPS)
         best = _mean_score(tried, use).topk(TRIED_BEST).indices
         fit = self._settled([even] * TRIED_BEST, tried.R_lab_body[best], use)
@@ -280,9 +272,9 @@ class FirstPass:
     ) -> tuple[list[list[NDArray[np.float32]]], PoseStart]:
         """Return whole pictures, and the start of fits at orientations (B, 3, 3)."""
         shapes = [view.camera.image_size[::-1] for view in self._fitter.views]
-        lights = list(zip(self._here.even, shapes, strict=True))
+        lights = list(zip(self._even, shapes, strict=True))
         frames = [[light.framed(one, shape) for (light, shape), one in zip(lights, row, strict=True)] for row in even]
-        many = self._here.X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
+        many = self._X.expand(len(R), 3), R, use.expand(len(R), -1), self._precision.expand(len(R), 3, 3)
         return frames, PoseStart(*many, held=True)
 
     def _settled(self, even: Sequence[Sequence[NDArray[np.float32]]], R: Tensor, use: Tensor) -> FittedPoses:

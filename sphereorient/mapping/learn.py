@@ -361,16 +361,11 @@ def times_seen(state: State, direction_body: Tensor) -> Tensor:
             away = (far**2 + radius_mm**2 - 2 * far * radius_mm * towards).sqrt()
             visible = (far * towards - radius_mm) / away > SHOWN_MIN
             if view.background.shown is not None:
-                visible &= _not_hidden(view, state.position_lab_mm[k] + radius_mm * (direction_body @ R.mT))
+                shown, place = view.background.shown, state.position_lab_mm[k] + radius_mm * (direction_body @ R.mT)
+                u, v = view.camera.project(place).nan_to_num().round().long().unbind(-1)
+                visible &= torch.from_numpy(shown)[v.clamp(0, shown.shape[0] - 1), u.clamp(0, shown.shape[1] - 1)]
             seen += visible
     return seen
-
-
-def _not_hidden(view: CameraView, place_lab_mm: Tensor) -> Tensor:
-    width, height = view.camera.image_size
-    u, v = view.camera.project(place_lab_mm).nan_to_num().round().long().unbind(-1)
-    shown = torch.from_numpy(view.background.shown)
-    return shown[v.clamp(0, height - 1), u.clamp(0, width - 1)]
 
 
 def write_kept(path: Path, parts: dict[str, Tensor]) -> None:

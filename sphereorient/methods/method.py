@@ -65,7 +65,7 @@ class Learnt:
     score_min: float
     right_score: float
     usual_apart_rad: float
-    limb_px: torch.Tensor | None = None  # (C,), see `SphereModel`; None: of an older version
+    limb_px: torch.Tensor | None = None  # (C,), see `SphereModel`
     instants: int = 1  # of the exposure that fits render
     most_hidden: float = 0.0  # share of a disk that occluders may cover
     together: bool = False
@@ -150,7 +150,7 @@ def load_learnt(path: Path) -> dict[str, Learnt]:
             schema = file.attrs.get("schema")
             if schema not in (SCHEMA, SCHEMA_OF_SEVERAL):
                 raise TrackError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema), do=do))
-            if file.attrs.get("sha256") not in (None, digest(file)):  # None: of an older version
+            if file.attrs.get("sha256") != digest(file):
                 raise ValueError("a checksum that does not fit")
             scenes = _read_scenes(file)
             return {name: _read(group, scenes) for name, group in ball_groups(file).items()}
@@ -253,30 +253,19 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
 
 def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     """Read what was learnt of one ball; of several, each has its own diameters and responses of the cameras."""
-    sizes = file.attrs.get("diameter_px", [scene.diameter_px for scene in scenes.values()])
-    responses = map(_response, file.attrs.get("response", ["null"] * len(scenes)))  # older files hold none
-    own = zip(scenes.items(), sizes, responses, strict=True)
+    responses = map(json.loads, file.attrs["response"])
+    known = [one and Response(**one | {"table": tuple(map(tuple, one["table"]))}) for one in responses]
+    own = zip(scenes.items(), file.attrs["diameter_px"], known, strict=True)
     scenes = {name: replace(scene, diameter_px=float(px), response=one) for (name, scene), px, one in own}
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
-    lasting = Lasting.none(len(scenes))
-    if "lasting" in file:
-        kept = {part: torch.from_numpy(values[()]) for part, values in file["lasting"].items()}
-        lasting = Lasting.of_older(**kept) if "alone" not in kept else Lasting(**kept)
+    lasting = Lasting(**{part: torch.from_numpy(file[f"lasting/{part}"][()]) for part in LASTING})
     told = {name: kind(file.attrs[name]) for name, kind in KINDS.items() if name in file.attrs}
-    told = {"still_blur_px": told["blur_px"], "limb_blur_px": told["blur_px"]} | told  # an older version knew one blur
-    of_limb = "limb_blur_px" if told["still_blur_px"] == told["blur_px"] else "still_blur_px"
-    told.setdefault("still_limb_blur_px", told[of_limb])
     told |= {name: torch.from_numpy(file[name][()]) for name in TENSORS if name in file}
     process = _process(file["process"]) if "process" in file else None
     return Learnt(
         scenes=scenes, light=light_of(parts, bool(light.attrs["known"])), lasting=lasting, process=process, **told
     )
-
-
-def _response(text: str) -> Response | None:
-    told = json.loads(text)
-    return None if told is None else Response(**told | {"table": tuple(map(tuple, told["table"]))})
 
 
 def _process(group: h5py.Group) -> ProcessNoise:
@@ -294,16 +283,13 @@ def write_poses(poses: Measured, path: Path) -> None:
     with whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA_OF_POSES
         for ball, of_ball in poses.items():
-            _write_poses(of_ball, ball_group(file, ball))
+            group = ball_group(file, ball)
+            group["count"] = np.array([len(one) for one in of_ball])
+            group["use"] = np.stack([one.use.numpy() for one in of_ball])
+            group["reason"] = np.array([[str(why) for why in one.reason] for one in of_ball], "S16")
+            for name in POSE_PARTS:
+                group[name] = torch.cat([getattr(one, name) for one in of_ball]).numpy()
         file.attrs["sha256"] = digest(file)
-
-
-def _write_poses(poses: list[Poses], group: h5py.Group) -> None:
-    group["count"] = np.array([len(one) for one in poses])
-    group["use"] = np.stack([one.use.numpy() for one in poses])
-    group["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
-    for name in POSE_PARTS:
-        group[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
 
 
 def read_poses(path: Path) -> Measured | None:

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk, perspective_centre_lab_mm, sphere_radius_px
-from sphereorient.cameras.response import Response
 from sphereorient.files.picture import OnDemand
 from sphereorient.locate import Background, CameraScene
-from sphereorient.locate.outline import Outline
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
@@ -32,17 +30,12 @@ FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CameraView:
+class CameraView(CameraScene):
     """One calibrated camera and its movie's empty scene; made by the pipeline, read by the fits."""
 
     name: str
     camera: Camera
-    background: Background
-    diameter_px: float  # of the sphere in the middle of the volume
     sight: LinesOfSight
-    merit_min: float = 0.0  # see `CameraScene`
-    response: Response | None = None
-    outline: Outline | None = None  # of a ball that stays in its place, see `CameraScene`
 
     @classmethod
     def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":

@@ -21,20 +21,9 @@ from sphereorient.cameras import in_air, sphere_disk_px
 from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.files.compiled import compiled, record
 from sphereorient.files.threads import cores
-from sphereorient.pose import fit
-from sphereorient.pose import residuals as in_torch
+from sphereorient.pose import fit as in_torch
+from sphereorient.pose import residuals as residuals_in_torch
 from sphereorient.pose.camera_view import CameraView, FrameDisks
-from sphereorient.pose.fit import (
-    AGAIN,
-    COVERED,
-    FIRST_EVERY,
-    HOPELESS,
-    LEAST_OF_WINDOW,
-    MARGIN_PX,
-    MOST_EACH,
-    WINDOW_PX,
-    further_steps,
-)
 from sphereorient.pose.model import IN_SIGHT, UNSEEN, SphereModel, SphereView
 from sphereorient.pose.pixels import Pixels, Stencil, thinned_places, thinned_stencil
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses, PoseStart, pose_arrays
@@ -97,7 +86,7 @@ def residuals(
     cameras = len(model.light.noise)
     begin = PoseStart(X, R, torch.ones(len(X), cameras, dtype=torch.bool))
     if body_of(X) is IN_TORCH or pixels.grey.dtype != torch.float32:
-        return in_torch.residuals(pixels, X, R, state, model)
+        return residuals_in_torch.residuals(pixels, X, R, state, model)
     (L, P), counts = pixels.grey.shape, torch.empty_like(pixels.inside)
     task, at = _task_on(pixels, begin, model)
     told = torch.empty(L, sum(TOLD.values()), P)
@@ -117,8 +106,8 @@ def residuals(
     view = SphereView(**{name: parts[name] for name in OF_VIEW}, known=known, blur=blur[:, None])
     light = parts["difference"], parts["black"], parts["beside"]
     others = {name: parts[name] for name in OF_FIT} | {"deviation": deviation.float(), "inside": counts}
-    own = in_torch.own_columns(view, *light[:2], model.shading), coefficients.float()
-    return in_torch.with_design(view, light, own, model.shading, **others)
+    own = residuals_in_torch.own_columns(view, *light[:2], model.shading), coefficients.float()
+    return residuals_in_torch.with_design(view, light, own, model.shading, **others)
 
 
 def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
@@ -208,7 +197,7 @@ def settle(
     near.axes = at(torch.stack(axes, 1))
     near.moved = at(begin.moved, torch.float64) if instants > 1 else None
     if disks.hidden is not None:
-        near.some_hidden = at(disks.hidden[:, thinned_places(disks.hidden.shape[1], FIRST_EVERY)])
+        near.some_hidden = at(disks.hidden[:, thinned_places(disks.hidden.shape[1], in_torch.FIRST_EVERY)])
         near.all_hidden = at(disks.hidden)
     fit = _into(near.task, begin.use)
     _run("settle", near, poses)
@@ -260,7 +249,7 @@ def _alone(
     """Return the record of `settle_alone` but for the pose and its frames, and what it points to."""
     nowhere = PoseStart(torch.zeros(1, 3), torch.zeros(1, 3, 3), torch.zeros(1, len(views), dtype=torch.bool))
     near, at, alive = _near(views, nowhere, model, stencil, instants, most_hidden)
-    near.radius_mm, near.hopeless, near.again = radius_mm, HOPELESS, AGAIN
+    near.radius_mm, near.hopeless, near.again = radius_mm, in_torch.HOPELESS, in_torch.AGAIN
     near.axes = at(torch.stack([view.sight.axes for view in views])[None])
     return near, (at, alive)
 
@@ -270,9 +259,9 @@ def _near(
 ) -> tuple[Any, "_Addresses", object]:
     """Return the record of fits but for their frames, with what gives further addresses and what else it points to."""
     task, at = _task_of(begin, model, instants)
-    some, more = further_steps(model)
+    some, more = in_torch.further_steps(model)
     near = Near(task=task, some_more=some, all_more=more, near_rad=model.near_rad, most_hidden=hidden)
-    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, FIRST_EVERY), stencil))
+    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, in_torch.FIRST_EVERY), stencil))
     known = [_of_view(view) for view in views]
     scene = (_Scene * len(views))(*(one[0] for one in known))
     near.scene = ctypes.addressof(scene)
@@ -325,7 +314,12 @@ def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
     numbers = {"unseen_most": UNSEEN, "known_least": KNOWN, "cover_least": COVER_MIN, "noise_least": NOISE_MIN}
     numbers |= {"tukey2": TUKEY**2, "outliers": OUTLIERS, "edges": EDGES, "edge_most": EDGE_MOST}
     numbers |= {"edge_far": EDGE_FAR, "edge_px": EDGE_PX, "in_sight": IN_SIGHT}
-    numbers |= {"covered": COVERED, "most_each": MOST_EACH, "least_of_window": LEAST_OF_WINDOW, "margin": MARGIN_PX}
+    numbers |= {
+        "covered": in_torch.COVERED,
+        "most_each": in_torch.MOST_EACH,
+        "least_of_window": in_torch.LEAST_OF_WINDOW,
+        "margin": in_torch.MARGIN_PX,
+    }
     n_difference, n_black = model.shading.counts
     task = _Task(
         radius_mm=model.radius_mm,
@@ -338,7 +332,7 @@ def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
         depths=0 if light.cover is None else len(light.cover),
         n_difference=n_difference,
         n_black=n_black,
-        window=WINDOW_PX // 2,
+        window=in_torch.WINDOW_PX // 2,
         **numbers,
         **{name: at(part, torch.float32) for name, part in pointers.items()},
     )
@@ -370,7 +364,7 @@ class Body(NamedTuple):
     settle: Callable[[FrameDisks, PoseStart, SphereModel, int, float, bool], tuple[FittedPoses, Tensor]]
 
 
-IN_TORCH = Body(fit.disks, fit.refine, fit.kept, fit.settle)
+IN_TORCH = Body(in_torch.disks, in_torch.refine, in_torch.kept, in_torch.settle)
 COMPILED = Body(disks, refine, kept, settle)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import sphere_disk_px
 from sphereorient.pose.camera_view import CameraView, FrameDisks
-from sphereorient.pose.model import Shading, SphereModel, by_pose
+from sphereorient.pose.model import SphereModel, by_pose
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart, moved_to
 from sphereorient.pose.residuals import (
@@ -143,12 +143,15 @@ def refine(
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, model.radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
+    tiles = tile_scores(at, mixed, pixels.tile)  # errors of neighbours are dependent
+    # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
+    few = tiles.shape[2] / max(tiles.shape[2] - 6 - sum(model.shading.counts), 1)
     last = _Last(
         step=step,
         whole=whole,
         information=information,
         pull=pull,
-        shared=by_pose(_shared_scores(tile_scores(at, mixed, pixels.tile), model.shading), cameras),
+        shared=by_pose(few * (tiles @ tiles.mT), cameras),
         to_centre=X[:, None] - origin,
         paint_step=by_pose(at.lit[:, : pixels.inner].double().median(-1).values, cameras),
     )
@@ -203,7 +206,10 @@ def _covariance(last: _Last, pixels: Pixels, begin: PoseStart, model: SphereMode
         found = (model.limb_px[:, None].to(lured) * lured).sum(1)[..., None]
         covariance = covariance + found @ found.mT
     finest_mm = px_mm[..., 0].masked_fill(~begin.use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    aside_px = (_limb_moved_px(last.paint_step, model) * seen).amax(1)
+    # By how much stray light, were it unknown, would move the limb: it is not known much better than that.
+    stray = model.light.stray.double()
+    share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
+    aside_px = (model.blur_px * share.sqrt() / last.paint_step.clamp_min(1.0) * seen).amax(1)
     aside_mm = (aside_px * finest_mm)[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / model.radius_mm, aside_mm], dim=1).square())
     any_seen = (last.whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
@@ -221,15 +227,6 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
     return step * (0.1 / size.clamp_min(0.1))[:, None]
 
 
-def _limb_moved_px(step: Tensor, model: SphereModel) -> Tensor:
-    """Return by how much stray light, were it unknown, would move the limbs of B * C disks, (B, C): it is not known
-    much better than that, as it does not end at the limb. `step` (B, C): grey levels from black to white paint.
-    """
-    stray = model.light.stray.double()
-    share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
-    return model.blur_px * share.sqrt() / step.clamp_min(1.0)
-
-
 def _limb_coverage(at: Residuals, pixels: Pixels, to_centre: Tensor, model: SphereModel) -> Tensor:
     """Return the share of the limb of L disks whose pixels count, (L,): border, masks, occluders, shadow and unknown
     paint take some. `to_centre` (L, 3), mm.
@@ -242,14 +239,6 @@ def _limb_coverage(at: Residuals, pixels: Pixels, to_centre: Tensor, model: Sphe
     whole = 2 * math.pi * model.radius_mm / px_mm.square() / (1 - (model.radius_mm / distance).square()).square()
     share: Tensor = (place_px2 * limb / whole).clamp_max(1.0)
     return share
-
-
-def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:
-    """Sum over tiles the outer products of their scores (L, 6, T), (L, 6, 6): errors of neighbours are dependent."""
-    count, fitted = tiles.shape[2], 6 + sum(shading.counts)
-    # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
-    few = count / max(count - fitted, 1)
-    return few * (tiles @ tiles.mT)
 
 
 def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:

@@ -16,6 +16,7 @@ from sphereorient.pose.camera_view import (
     Optics,
     PyramidLevel,
     Shown,
+    Steps,
     size_steps,
     widest_px,
 )
@@ -33,8 +34,6 @@ from sphereorient.sphere.texture_table import TextureTable
 CPU = torch.device("cpu")
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
-
-Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
 
 
 class DisksPx(NamedTuple):
@@ -75,6 +74,10 @@ class Fitter:
                 near_rad=longest_near_rad(level.blur_px, self.widest_px),
             )
         return self._models[level]
+
+    def with_blur(self, paint: TextureTable, blur_px: float, limb_blur_px: float | None = None) -> "Fitter":
+        """Return a fitter of paint whose pictures have a blur, px, and their limb another one; see `Optics`."""
+        return replace(self, optics=Optics(paint, blur_px, widest_px(self.views), limb_blur_px))
 
     def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, glints: bool = True) -> "Fitter":
         """Return a fitter with the light, of the same kind, and the noise of fitted pictures; see `Light.learnt`."""

@@ -35,14 +35,6 @@ class Lasting:
         zeros = torch.zeros(cameras, 6, 6, dtype=torch.float64)
         return cls(covariance=zeros[0], own_rad2=zeros[:, :3, :3], alone=zeros)
 
-    @classmethod
-    def of_older(cls, covariance: Tensor, own_rad2: Tensor) -> "Lasting":
-        """Return those of a file that holds no `alone`: each camera's rotation, and the position of all."""
-        alone = covariance.repeat(len(own_rad2), 1, 1)
-        alone[:, :3, 3:] = alone[:, 3:, :3] = 0.0
-        alone[:, :3, :3] = own_rad2
-        return cls(covariance=covariance, own_rad2=own_rad2, alone=alone)
-
     def of(self, *cameras: int) -> "Lasting":
         """Return those of some cameras."""
         own, alone = self.own_rad2[list(cameras)], self.alone[list(cameras)]

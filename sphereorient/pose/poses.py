@@ -138,9 +138,10 @@ def best_poses(found: Sequence[Poses]) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -> Poses:
-    """Return a frame without any pose."""
+    """Return a frame without any pose; of a camera with the reason OK the score was too low."""
     use = torch.zeros(cameras, dtype=torch.bool) if use is None else use
-    return Poses(**blank_parts(cameras, 0), use=use, reason=tuple(reason))
+    why = tuple(Reason.LOW_SCORE if one is Reason.OK else one for one in reason)
+    return Poses(**blank_parts(cameras, 0), use=use, reason=why)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

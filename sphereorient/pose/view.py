@@ -24,20 +24,12 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     """Render the sphere at position_lab_mm (L, 3) and R_lab_body (L, 3, 3) through pixels with a Gaussian aperture.
     Where it moves during the exposure, the mean of `pixels.instants` instants of it, the pose in the middle.
     """
-    poses, shares = during_exposure(pixels, position_lab_mm, R_lab_body)
-    views = [_view_at(pixels, X, R, model) for X, R in poses]
-    return views[0] if len(views) == 1 else _mean_view(views, shares)
-
-
-def during_exposure(pixels: Pixels, X: Tensor, R: Tensor) -> tuple[list[tuple[Tensor, Tensor]], list[float]]:
-    """Return positions (L, 3) and rotations (L, 3, 3) of L spheres at the instants that are rendered, and the instants'
-    shares of the light; X and R are those in the middle of the exposure.
-    """
+    X, R = position_lab_mm, R_lab_body
     if pixels.instants == 1:
-        return [(X, R)], [1.0]
+        return _view_at(pixels, X, R, model)
     instants, shares = exposure_instants(pixels.instants)
     turn, move = pixels.moved[:, :3], pixels.moved[:, 3:]
-    return [(X + at * move, so3.exp(at * turn) @ R) for at in instants], shares
+    return _mean_view([_view_at(pixels, X + at * move, so3.exp(at * turn) @ R, model) for at in instants], shares)
 
 
 @cache

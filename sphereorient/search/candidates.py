@@ -4,7 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -111,25 +111,6 @@ class Candidates:
         return torch.tensor([float(own.score[:1].sum()) for own in self.each()], dtype=torch.float64)
 
 
-class Proposer(Protocol):
-    """Proposes orientations for disks cropped to `size_px`: templates, a network, or both."""
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-
-    def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
-        """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk. `least`: in
-        place of `score_min` of templates.
-        """
-
-    def rough(self, disks: Tensor) -> Candidates:
-        """Return the starts from which `propose` climbs: right to the step of its grid, in a quarter of the time."""
-
-    def likeness(self, disks: Tensor) -> Tensor:
-        """Return how much disks (F, S, S) look like the ball in its best orientation, (F,); cheaper than `propose`."""
-
-
 def check_disks(disks: Tensor, height: int, width: int) -> None:
     """Raise ShapeError unless the disks are (F, height, width)."""
     if disks.shape[1:] != (height, width):
@@ -146,21 +127,23 @@ class Proposals:
     reason: tuple[Reason, ...]  # of each disk, one after the other: why it has none; `OK` where it has one
 
 
-class DiskSearch(nn.Module, ABC):
-    """A proposer as a module: `propose` is its work, a call accepts disks of any leading shape."""
+class Proposer(nn.Module, ABC):
+    """Proposes orientations for disks: templates, a network, or both. A call accepts disks of any leading shape."""
 
-    size_px: int
+    size_px: int  # side of the disks
 
     @abstractmethod
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
-        """Propose orientations for (F, S, S) float32 grey disks."""
+        """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk. `least`: in
+        place of `score_min` of templates.
+        """
 
     def rough(self, disks: Tensor) -> Candidates:
-        """Return the proposals: this one does not climb."""
+        """Return the starts from which `propose` climbs: right to the step of its grid, in a quarter of the time."""
         return self.propose(disks)
 
     def likeness(self, disks: Tensor) -> Tensor:
-        """Return how much disks (F, S, S) look like the ball in its best orientation, (F,)."""
+        """Return how much disks (F, S, S) look like the ball in its best orientation, (F,); cheaper than `propose`."""
         return self.propose(disks).best_score
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> Proposals:
@@ -180,10 +163,11 @@ class DiskSearch(nn.Module, ABC):
         )
 
 
-class FallbackProposer:
+class FallbackProposer(Proposer):
     """Asks one proposer, and a second one where no score reaches `sure`; the second's answers come first there."""
 
     def __init__(self, first: Proposer, second: Proposer, sure: float) -> None:
+        super().__init__()
         self._first, self._second, self._sure = first, second, sure
         self.size_px = first.size_px
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
+from sphereorient.search.candidates import BATCH, Candidates, Proposer, check_disks, distinct
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
@@ -25,7 +25,7 @@ TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
-class GreySearch(DiskSearch):
+class GreySearch(Proposer):
     """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
     Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import Reason
-from sphereorient.search.candidates import BATCH, Candidates, DiskSearch, check_disks, distinct
+from sphereorient.search.candidates import BATCH, Candidates, Proposer, check_disks, distinct
 from sphereorient.search.settings import OrientSettings
 from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view
 from sphereorient.sphere.texture import known_paint, reduced_texture
@@ -115,7 +115,7 @@ def _moving_threshold(one_hot: Tensor, fallback: Tensor, share: float, contrast_
     return rows[..., low] * (1 - share_up) + rows[..., high] * share_up
 
 
-class TemplateBank(DiskSearch):
+class TemplateBank(Proposer):
     """Search all of SO(3) for the views of a texture map that look like a disk in black and white.
     Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
 

@@ -303,15 +303,6 @@ def test_a_key_that_the_method_does_not_read_is_refused_with_the_nearest_one_tha
         check_settings(load_settings(None, [override]), method)
 
 
-def test_a_key_of_the_other_method_in_a_file_is_left_aside_at_its_default_and_else_refused(tmp_path):
-    settings, (remark,) = read_settings(write(tmp_path, "orient:\n  fine_step_deg: 3.0\n"), [], "precise")
-    assert settings == Settings()
-    assert "method precise does not read orient: left aside" in remark
-    with pytest.raises(SettingsError, match=r"orient\.fine_step_deg: expected a key that method precise reads"):
-        read_settings(write(tmp_path, "orient:\n  fine_step_deg: 2.0\n"), [], "precise")
-    assert read_settings(write(tmp_path, "orient:\n  fine_step_deg: 2.0\n"), [], "paper")[1] == []
-
-
 def test_every_key_is_read_by_a_method_and_each_method_accepts_the_defaults():
     assert METHODS == ("precise", "paper", "map", "report")
     assert set(READERS) == set(DEFAULTS)

@@ -17,6 +17,7 @@ from excerpt_examples import shortened
 from run_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import OutputError, TrackError
+from sphereorient.files.hdf5 import digest
 from sphereorient.methods.settings import load_settings
 from sphereorient.run import FolderStore, Request
 from sphereorient.run import run as run_request
@@ -139,7 +140,7 @@ def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
     with h5py.File(other, "r+") as file:
         file.move("cameras/cam2", "cameras/left")
         file.attrs["cameras"] = ["cam1", "left"]
-        del file.attrs["sha256"]
+        file.attrs["sha256"] = digest(file)
     with pytest.raises(TrackError, match="expected what was learnt of cam2"):
         tracked(request_of(tmp_path, learnt=other))
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, permutations
+from itertools import combinations, compress, permutations
 
 import torch
 from torch import Tensor
@@ -169,11 +169,13 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     if not sure:  # wrong cameras spoil every pose of all pictures
         return math.inf, math.inf
     whole = [k for k in sure if bool(found[k].use.all())]
-    if len(whole) < sum(_torn(fitter, found[k]) for k in sure):
-        return math.inf, math.inf  # outlines that miss each other already
+    showing = {k: _showing(fitter, found[k]) for k in sure}
+    torn = [any(why in TORN for why in compress(found[k].reason, shown)) for k, shown in showing.items()]
+    if len(whole) < sum(torn):  # a camera that should show it sees it elsewhere, or nothing
+        return math.inf, math.inf
     if cameras == 1 or not whole:
         return 1.0, 0.0
-    whole = [k for k in whole if _in_view(fitter, found[k].position_lab_mm[:1])] or whole
+    whole = [k for k in whole if all(showing[k])] or whole
     tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
     gains, rays, alone, covariance_rad2 = [], [], [], []
     for camera, view in enumerate(fitter.views):
@@ -206,18 +208,10 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     return gain, float(gap_px.quantile(0.75))
 
 
-def _torn(fitter: Fitter, poses: Poses) -> bool:
-    """Return whether a camera that should show the whole sphere at the best pose sees it elsewhere, or nothing."""
+def _showing(fitter: Fitter, poses: Poses) -> list[bool]:
+    """Return which cameras should show the whole disk of a sphere at its best pose."""
     X = poses.position_lab_mm[:1]
-    return any(
-        why in TORN and bool(view.shows_whole(view.camera.project(X), view.radius_px(X, fitter.radius_mm)).all())
-        for view, why in zip(fitter.views, poses.reason, strict=True)
-    )
-
-
-def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
-    """Return whether all cameras show the whole disk of a sphere at a position (1, 3), mm."""
-    X, radius_mm = position_lab_mm, fitter.radius_mm
-    return all(
-        bool(view.shows_whole(view.camera.project(X), view.radius_px(X, radius_mm)).all()) for view in fitter.views
-    )
+    return [
+        bool(view.shows_whole(view.camera.project(X), view.radius_px(X, fitter.radius_mm)).all())
+        for view in fitter.views
+    ]

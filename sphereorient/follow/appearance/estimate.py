@@ -30,8 +30,6 @@ from sphereorient.follow.appearance.worn import without_worn
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.camera_view import CameraView, Optics, widest_px
-from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import lasting_errors
 from sphereorient.pose.lights.kinds import lit_in_the_lab
 from sphereorient.pose.poses import Poses
@@ -53,9 +51,7 @@ def estimate_appearance(
     `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
     the motion while the shutter is open counts as blur. `among`: of several balls, with poses that are known; then
     cameras that see another ball do not disagree.
-
-    Raises:
-        ExperimentError: no frame has a pose, or none is better than wrong poses.
+    Raises ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
     search, found, sample, odds = _chosen(for_blur(first), frames, among)
     given = settings.blur_px is not None
@@ -83,7 +79,9 @@ def estimate_appearance(
     sure = [frames[k] for k in proven(found)] if among is None else []
     alone = among is None and sample.camera is None  # a ball, and all cameras together
     views = with_least_merit(search, sure, sample.poses[2]) if alone else studied.fitter.views
-    fitter, fit, use = _as_followed(studied, views), studied.fit, studied.use
+    fitter, fit, use = studied.fitter, studied.fit, studied.use
+    most_px = WIDER * float(fitter.disks_px(fit.position_lab_mm).largest_px.max())
+    fitter = replace(fitter, views=views, widest_px=most_px, limb_px=limb_px(fitter, fit, use))
     # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
     lasting = lasting_errors(studied.pixels, fit, use, fitter.model(), with_more_blur(studied) if coded else None)
     return Appearance(
@@ -130,15 +128,7 @@ def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
     fitter, blur_px = search.fitter, studied.fitter.optics.blur_px
     if abs(blur_px / fitter.optics.blur_px - 1) <= BLUR_FAR_OFF or darkest_white(studied.fitter) is not None:
         return None
-    optics = Optics(studied.paint, blur_px, widest_px(fitter.views))
-    return replace(search, fitter=replace(fitter, optics=optics))
-
-
-def _as_followed(studied: Studied, views: Sequence[CameraView]) -> Fitter:
-    """Return the fitter of frames that are followed, with the largest disk and the place of the limb."""
-    fitter = studied.fitter
-    widest = WIDER * float(fitter.disks_px(studied.fit.position_lab_mm).largest_px.max())
-    return replace(fitter, views=views, widest_px=widest, limb_px=limb_px(fitter, studied.fit, studied.use))
+    return replace(search, fitter=fitter.with_blur(studied.paint, blur_px))
 
 
 def _score_min(studied: Studied, still: float, best: float, wrong: float) -> float:

@@ -12,7 +12,7 @@ from sphereorient.follow.appearance.agreement import TRIED
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import CLEAR, Following, Studied
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.pose.camera_view import FINEST_PX, Optics, widest_px
+from sphereorient.pose.camera_view import FINEST_PX
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.pose.poses import PoseStart, best_poses
@@ -96,5 +96,5 @@ def _exposed(
     # What is left of the blur once the motion is taken out sets how far apart instants may be.
     left_px = math.sqrt(max(blur_px**2 - float(width_px.square().nanmean()) / 12, FINEST_PX**2))
     instants = 1 + math.ceil(float(width_px.nanquantile(0.9)) / (APART_BLURS * left_px))
-    optics = Optics(studied.paint, left_px, widest_px(fitter.views))
-    return replace(fitter, optics=optics, instants=min(max(2, instants), MOST_INSTANTS)), moved
+    fitter = fitter.with_blur(studied.paint, left_px)
+    return replace(fitter, instants=min(max(2, instants), MOST_INSTANTS)), moved

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.record import Studied, enough_of, soft
-from sphereorient.locate.outline import Outline
-from sphereorient.pose.camera_view import FINEST_PX, Optics, level_of, widest_px
+from sphereorient.locate.outline import Outline, window_about
+from sphereorient.pose.camera_view import FINEST_PX, level_of, widest_px
 from sphereorient.pose.fit import USUALLY_HIDDEN
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lasting import limb_wider_px
@@ -40,14 +40,11 @@ def estimate_blur_px(disks: Iterable[tuple[NDArray[np.generic], Outline]]) -> fl
     A first guess, biased by noise and paint without edges. 0 without disks.
     Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
     """
-    found = [steepest_blur_px(_about(*disk)) for disk in disks]
+    found = []
+    for picture, disk in disks:
+        about = window_about(round(disk.u_px), round(disk.v_px), round(AROUND * disk.radius_px))
+        found.append(steepest_blur_px(picture[about].astype(np.float32)))
     return float(np.median(found)) if found else 0.0
-
-
-def _about(picture: NDArray[np.generic], disk: Outline) -> NDArray[np.float32]:
-    reach = round(AROUND * disk.radius_px)
-    u, v = round(disk.u_px), round(disk.v_px)
-    return picture[max(0, v - reach) : v + reach + 1, max(0, u - reach) : u + reach + 1].astype(np.float32)
 
 
 def steepest_blur_px(picture: NDArray[np.float32]) -> float:
@@ -90,7 +87,6 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
     """Estimate light, then blur unless it is `given`, then light again, until the blur stays.
     Where the first guess of the blur is far off, one round is not enough.
     """
-    diameter_px = widest_px(studied.fitter.views)
     studied = studied.lit()
     slow = soft(studied.fitter)  # there each round moves the blur by little
     for done in range(1 if given else BLUR_ROUNDS):
@@ -98,7 +94,7 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
         if not given:
             fitter, fits = studied.fitter, (studied.pixels, studied.fit, studied.use)
             blur_px = best_blur_px(fitter, studied.paint, *fits, FINEST if done else FINER)
-            studied = replace(studied, fitter=replace(fitter, optics=Optics(studied.paint, blur_px, diameter_px)))
+            studied = replace(studied, fitter=fitter.with_blur(studied.paint, blur_px))
         studied = studied.lit()
         if not slow and abs(studied.fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
             break

@@ -9,7 +9,6 @@ from torch import Tensor
 from sphereorient.cameras.response import Response
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.pose.camera_view import Optics, widest_px
 from sphereorient.pose.lasting import response_exponents
 from sphereorient.pose.model import SphereModel
 
@@ -51,8 +50,7 @@ def _clipped(studied: Studied) -> Tensor:
 def with_more_blur(studied: Studied) -> SphereModel:
     """Return the model of paint that is blurred a little more."""
     optics = studied.fitter.optics
-    more = Optics(studied.paint, MORE * optics.blur_px, widest_px(studied.fitter.views), optics.limb_blur_px)
-    return replace(studied.fitter, optics=more).model()
+    return studied.fitter.with_blur(studied.paint, MORE * optics.blur_px, optics.limb_blur_px).model()
 
 
 def _responding(studied: Studied, gamma: Tensor) -> Studied:

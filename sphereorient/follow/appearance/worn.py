@@ -8,7 +8,6 @@ from torch import Tensor
 
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
-from sphereorient.pose.camera_view import Optics, widest_px
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.lights.kinds import some_of
 from sphereorient.pose.pixels import Pixels
@@ -47,8 +46,8 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
         for changed in rounds:  # worn paint bends the light and the poses that it is found with
             worn = worn_cells(pixels, fit, use, now.model(), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
-            optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views), fitter.optics.limb_blur_px)
-            now = replace(now, optics=optics).with_light_of(pixels, fit, use, glints=False)
+            now = now.with_blur(paint, fitter.optics.blur_px, fitter.optics.limb_blur_px)
+            now = now.with_light_of(pixels, fit, use, glints=False)
             fit = now.again(pixels, fit, use)
         return now, fit, worn
 

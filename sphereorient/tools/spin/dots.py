@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.errors import PaintError, check_tail, refusal
 from sphereorient.search import GreySearch, GreySearchSettings
-from sphereorient.search.candidates import Candidates, DiskSearch
+from sphereorient.search.candidates import Candidates, Proposer
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture import map_directions
@@ -85,7 +85,7 @@ class DotTable:
         return replace(self, radius_deg=math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low)))
 
 
-class DotSearch(DiskSearch):
+class DotSearch(Proposer):
     """Search all of SO(3) for a table of dots: the grey search proposes; missing dots count, other dark hardly."""
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
