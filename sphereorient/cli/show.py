@@ -163,6 +163,9 @@ def export(given: _ExportOptions) -> None:
     from sphereorient.report.export import export_track, format_of
 
     to = format_of(given.out, given.to)
+    if given.axes is not None and to != "fictrac":
+        do = "write --to fictrac, or leave out --axes"
+        raise SettingsError(refusal("--axes", expected="FicTrac's table", got=str(to), do=do))
     loaded = tracks_in(given.track, given.sphere)
     paths = _paths(given.out, loaded)
     axes = None

@@ -215,6 +215,9 @@ def live(given: _LiveOptions) -> None:
         if len(experiment.names) > 1 and any(form != "json" for _, form in outputs):
             got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
             raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
+        if given.axes is not None and not {"fictrac", "marked"} & {form for _, form in outputs}:
+            got, do = ", ".join(given.to or ()) or "none", "add --to tcp:PORT, or leave out --axes"
+            raise SettingsError(refusal("--axes", expected="an output with FicTrac's table", got=got, do=do))
         if given.page is not None:
             page = PageProcess(given.experiment, given.names, given.page, _tell)
             opened.callback(page.close)

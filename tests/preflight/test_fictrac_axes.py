@@ -10,20 +10,21 @@ import fictrac_axes as script
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
+from conftest import REPO, SHARED
 from fictrac_axes import FicTracSetUp, fictrac_columns
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from sphereorient.cameras import PinholeCamera
 from sphereorient.cli import app
-from sphereorient.errors import ExperimentError
+from sphereorient.errors import ExperimentError, SettingsError
 from sphereorient.preflight.fictrac import fictrac_axes
 from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.walk import FICTRAC, FicTracAxes
 
 SAMPLE = SHARED / "real" / "fictrac"
+EXCERPT = REPO / "synthetic_data" / "excerpt"
 SIZE, FRAMES = (384, 288), 200
 LIMB = np.array([[63, 171], [81, 145], [106, 135], [150, 160]], float)  # below the middle, to the left
 COLUMNS = [k for k in range(1, 21) if k != 4]  # rotations and walk
@@ -148,3 +149,18 @@ def test_live_on_the_sample_turns_about_fictracs_axes(tmp_path, monkeypatch):
     assert ours[-1, 16] % (2 * np.pi) == pytest.approx(theirs[-1, 16] - 2 * np.pi, abs=0.4)
     np.testing.assert_allclose(ours[-1, 14:16], theirs[-1, 14:16], atol=1.6)
     np.testing.assert_array_equal(ours[:, [0, 22]], theirs[:, [0, 22]])  # both counters
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("live", EXCERPT / "experiment.yaml", "--source", "movie-fast", "--to", "p.jsonl", "--axes", "config.txt"),
+        ("export", "track.h5", "--out", "t.csv", "--axes", "config.txt"),
+    ],
+)
+def test_axes_without_fictracs_table_are_refused(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("config.txt").write_text("vfov : 45\n")
+    done = CliRunner().invoke(app, list(map(str, words)))
+    assert isinstance(done.exception, SettingsError) or done.exit_code == 2
+    assert "--axes" in f"{done.output}{done.exception}"
