@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.calibration.comparison import Seen, other_readings
 from sphereorient.calibration.contradictions import FEWEST, OUTLINES, compare_cameras, majority, said_alone
-from sphereorient.cameras import Camera, nearest_point
+from sphereorient.cameras import Camera, nearest_point, perspective_centre_lab_mm
 from sphereorient.errors import SphereOrientError
 from sphereorient.experiment import Experiment
 from sphereorient.methods.method import Learnt
@@ -160,9 +160,9 @@ def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> 
 
 
 def expected_outline_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-    """Return the outline (..., AROUND, 2), px, of a sphere at (..., 3), mm, lab; a port's effect is negligible."""
+    """Return the outline (..., AROUND, 2), px, of a sphere at (..., 3), mm, lab."""
     rim, sight = rim_directions(camera, position_lab_mm, AROUND)
-    distance = (position_lab_mm @ camera.R_cam_lab.mT + camera.T_cam_lab_mm).norm(dim=-1)
+    distance = (position_lab_mm - perspective_centre_lab_mm(camera, position_lab_mm)).norm(dim=-1)
     sine = (radius_mm / distance).clamp_max(0.99)[..., None, None]
     toward = (1 - sine.square()).sqrt() * rim - sine * sight[..., None, :]
     return camera.project(position_lab_mm[..., None, :] + radius_mm * toward)
