@@ -302,6 +302,10 @@ def test_the_oldest_versions_that_are_tried_are_allowed_ones():
         assert allowed[name].contains(f"{version.rstrip('.')}"), (name, version)
 
 
+def test_no_sentence_of_the_docs_stands_twice_and_words_do_not_grow(capsys):
+    assert docs_words.main() == 0, capsys.readouterr().out
+
+
 def test_a_sentence_that_stands_twice_is_found_whatever_its_marks():
     once = "The ball is found by its outline in each picture."
     first = f"# Title\n\n{once}\n\n```\n{once}\n```\n\n| {once} |\n"
