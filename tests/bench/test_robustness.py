@@ -359,6 +359,7 @@ def test_the_figure_shows_the_hardest_first_and_all_methods(tmp_path):
     assert above.get_lines()[2].get_ydata().tolist() == [0.02]
     assert "wrong" in below.get_ylabel()
     page = markdown(whole)
-    assert "| defocus | 0.7 px of sigma | 0.02, 0.02; 0, 0 | 1.5, 1.5; 0, 0 |" in page
+    assert "| defocus | 0.02 | 1.5 |" in page
+    assert "| spin | 20 (50, 0) |" in page  # median, and shares that are wrong and lost
     write_table([whole], tmp_path / "results.csv")
     assert (tmp_path / "results.csv").read_text().count("\n") == 5

@@ -15,6 +15,7 @@ from conftest import REPO, SHARED
 from map_examples import mapped
 from renders import error_deg
 
+from sphereorient.cameras import PinholeCamera
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.experiment.recording import CameraStream, Recording, TextureMap
@@ -101,8 +102,15 @@ def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
     R = exp(torch.tensor([[0.3, -1.2, 0.4], [2.0, 0.5, -0.7]], dtype=torch.float64))
     X = torch.tensor([[0.5, 0.2, -0.1], [-0.3, 0.4, 0.0]], dtype=torch.float64)
     middles = torch.tensor([[0.0, 0.0, 5.0], [4.0, 1.0, 0.0]], dtype=torch.float64)
-    turns = exp(torch.tensor([[0.1, 0.2, 0.3], [1.0, -2.0, 0.4]], dtype=torch.float64))
-    cameras = [SimpleNamespace(R_cam_lab=C, T_cam_lab_mm=-C @ m) for C, m in zip(turns, middles, strict=True)]
+    ahead = -torch.nn.functional.normalize(middles, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(ahead.new_tensor([[0.0, 1.0, 0.0]]), ahead), dim=-1)
+    turns = torch.stack([right, torch.linalg.cross(ahead, right), ahead], dim=1)
+    lens = {
+        "image_size": (200, 200),
+        "f_px": torch.tensor(100.0).double(),
+        "centre_px": torch.full((2,), 99.5).double(),
+    }
+    cameras = [PinholeCamera(R_cam_lab=C, T_cam_lab_mm=-C @ m, **lens) for C, m in zip(turns, middles, strict=True)]
     state = SimpleNamespace(
         R_lab_body=R,
         position_lab_mm=X,
