@@ -108,12 +108,13 @@ def _some(names: Sequence[str]) -> str:
 def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str, str]]:
     frames = sum(len(track) for track in tracks.values())
     valid = sum(int(track.valid.sum()) for track in tracks.values())
+    shown = frames - sum(int(track.without_ball.sum()) for track in tracks.values())
     sigma = np.concatenate([quality.stated_error(track.orientation_cov) for track in tracks.values()])
     sigma = sigma[np.isfinite(sigma)]
     median = f"{np.rad2deg(np.median(sigma)):.2g}\u00b0" if len(sigma) else "unknown"
     found = [
         (f"{frames:,}", "frames"),
-        (f"{100 * valid / max(frames, 1):.4g} %", "valid"),
+        (f"{100 * valid / max(shown, 1):.4g} %", "valid" if shown == frames else f"of {shown:,} with a ball valid"),
         (f"{summary.ensemble.segments:,}", "segment" if summary.ensemble.segments == 1 else "segments"),
         (median, "stated error of the orientation, median"),
     ]
