@@ -38,6 +38,7 @@ from sphereorient import so3
 from sphereorient.pose import compiled
 from sphereorient.pose import residuals as residuals_module
 from sphereorient.pose.camera_view import Optics, PyramidLevel
+from sphereorient.pose.fit import longest_near_rad
 from sphereorient.pose.model import FIRST
 from sphereorient.pose.pixels import Pixels, cut_pixels, stacked
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses
@@ -657,3 +658,9 @@ def test_information_without_the_light_is_the_inverse_of_the_poses_covariance(rn
     whole = torch.linalg.solve(normal, gradient[..., None])[..., 0]
     assert_close(step, whole[:, :6], atol=1e-6)
     assert_close(mixed, torch.linalg.solve(normal[:, 6:, 6:], normal[:, 6:, :6]), atol=1e-6)
+
+
+def test_a_step_is_long_by_the_blurs_angle_and_sooner_where_edges_fall_between_pixels():
+    assert longest_near_rad(0.62, 30.0) == longest_near_rad(0.9, 40.0)  # wide enough: the largest
+    assert 400 * longest_near_rad(0.62, 400.0) == pytest.approx(200 * longest_near_rad(0.62, 200.0))
+    assert longest_near_rad(0.45, 70.0) < 0.5 * longest_near_rad(0.55, 70.0)
