@@ -11,7 +11,6 @@ from torch import Tensor
 from sphereorient.cameras.checks import camera_error, check_points
 
 PARALLEL = 1e-6  # sine of the angle of two lines of sight a unit apart that are parallel
-ASIDE = 1e-3  # of the distance: lines of sight about a point
 ASYMMETRY = 1e-6  # of the correlation matrix: covariances written with seven digits pass
 
 
@@ -233,17 +232,15 @@ def perspective_centre_lab_mm(camera: Camera, position_lab_mm: Tensor) -> Tensor
     a port its image; of parallel lines a point far away.
     """
     X = position_lab_mm.double()
-    middle = camera.rays(camera.project(X))
-    helper = torch.eye(3).double()[middle.direction_lab.abs().argmin(-1)]
-    across = torch.nn.functional.normalize(_cross(middle.direction_lab, helper), dim=-1)
-    aside = ASIDE * (X - middle.origin_lab_mm).norm(dim=-1, keepdim=True)
-    around = torch.stack([across, _cross(middle.direction_lab, across)])
-    beside = camera.rays(camera.project(X + aside * around))
-    if torch.equal(beside.origin_lab_mm[0], middle.origin_lab_mm):
-        return middle.origin_lab_mm
-    sine = _cross(middle.direction_lab.expand_as(around), beside.direction_lab).norm(dim=-1).mean(0)
-    distance: Tensor = aside / sine[..., None].maximum(PARALLEL * aside)
-    return X - distance * middle.direction_lab
+    uv = camera.project(X)
+    near = camera.rays(torch.stack([uv, uv + uv.new_tensor([1.0, 0.0]), uv + uv.new_tensor([0.0, 1.0])]))
+    origin, direction = near.origin_lab_mm, near.direction_lab
+    if torch.equal(origin[0], origin[1]):
+        return origin[0]
+    aside = _cross(X - origin[1:], direction[1:]).norm(dim=-1).mean(0)  # of X, from the lines through the next pixels
+    sine = _cross(direction[:1].expand_as(direction[1:]), direction[1:]).norm(dim=-1).mean(0)
+    distance: Tensor = aside / sine.maximum(PARALLEL * aside)
+    return X - distance[..., None] * direction[0]
 
 
 def sphere_disk_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:

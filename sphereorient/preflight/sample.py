@@ -116,7 +116,8 @@ def sample_movie(
 
     def at_size(size_px: float) -> MovieSample:
         around = (stream.photograph or stays) and empty is None
-        background = _surroundings(some) if around else learn_background(some, size_px, settings, empty, stream.shown)
+        guess = replace(_surroundings(some), shown=stream.shown) if around else None
+        background = guess or learn_background(some, size_px, settings, empty, stream.shown)
         look = MovieSample(**read, stream=stream, background=background, diameter_px=size_px, expected_px=diameter_px)
         return _searched(look, settings)
 

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, cast
@@ -296,7 +297,7 @@ class Trajectory:
         figure.suptitle(f"{self.title or 'trajectory'}: {len(self)} frames, {self.method}")
         return figure
 
-    @property
+    @cached_property
     def without_ball(self) -> Bools:
         """Frames in which no camera that has a picture shows a ball, (N,) bool."""
         if not self.cameras:

@@ -16,8 +16,11 @@ from conftest import REPO, SHARED
 from preflight_examples import PAINTED, Example, checked, clean_example, complaints, of, write
 
 from sphereorient.errors import MovieError
+from sphereorient.experiment.recording import open_recording
+from sphereorient.locate import LocateSettings
 from sphereorient.methods.settings import load_settings
 from sphereorient.preflight import Severity, preflight
+from sphereorient.preflight.sample import sample_movie
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
@@ -150,6 +153,19 @@ def test_a_fixed_ball_is_better_off_with_pictures_without_it(clean, tmp_path):
     without = checked(still, tmp_path / "without", sphere=sphere, backgrounds=None)
     assert of(without, "background cam1").severity is WARNING
     assert of(without, "ball cam1").severity is OK
+
+
+def test_a_ball_in_its_place_that_nobody_finds_is_looked_for_where_the_mask_shows_it(clean, tmp_path):
+    path = write(
+        clean, tmp_path, backgrounds=None, masks={"cam1": "mask.png"}, sphere={"diameter": 18.0, "fixed": True}
+    )
+    mask = np.full(clean.pictures["cam1"].shape[1:], 255, np.uint8)
+    mask[:20] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    with open_recording(path, textured=False) as recording:
+        stream = recording.streams[0]
+        sample = sample_movie(stream, None, LocateSettings(), stays=True)
+        np.testing.assert_array_equal(sample.background.shown, stream.shown)
 
 
 @pytest.mark.slow
