@@ -46,7 +46,7 @@ types: setup
 # The site, out/site/index.html: every tutorial runs, every link is followed, any warning fails.
 docs: setup
 	$(BIN)/python -m pip install -q $(INDEX) -e '.[docs]'
-	$(BIN)/mkdocs build
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 # The tables and figures of the docs that are older than the code that they measure: hours where all are.
 figures: setup

@@ -22,10 +22,10 @@ from sphereorient.trajectory.walk import walk_of
 place = TemporaryDirectory()
 folder = Path(place.name)
 settings = SynthSettings(
-    frames=120,
+    frames=90,
     frame_rate=100.0,
-    image_size=(240, 200),
-    diameter_px=90.0,
+    image_size=(200, 160),
+    diameter_px=72.0,
     velocity_rms=0.0,
     volume_mm=1e-3,
     omega_rms=4.0,
@@ -33,13 +33,13 @@ settings = SynthSettings(
     exposure=0.001,
 )
 write_synthetic_experiment(folder, settings)
-(height, focal_px) = 200, float(load_cameras(folder / "cameras.yaml")["cam1"].f_mm) / 0.02
+(height, focal_px) = 160, float(load_cameras(folder / "cameras.yaml")["cam1"].f_mm) / 0.02
 (folder / "cameras.yaml").unlink()
 (folder / "experiment.yaml").unlink()
 (folder / "texture.png").unlink()
 
 # %% [markdown]
-# ## What FicTrac was told
+# ## The configuration of FicTrac
 #
 # `vfov` is the field of view from top to bottom. `c2a_r` turns the camera's axes into the animal's: here they are the
 # same.

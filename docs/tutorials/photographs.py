@@ -18,7 +18,7 @@ from sphereorient.synth import SynthSettings, write_synthetic_experiment
 place = TemporaryDirectory()
 folder = Path(place.name)
 settings = SynthSettings(
-    frames=60, image_size=(220, 220), diameter_px=80.0, velocity_rms=0.0, volume_mm=1e-3, omega_rms=40.0, omega_time=0.2
+    frames=24, image_size=(150, 150), diameter_px=56.0, velocity_rms=0.0, volume_mm=1e-3, omega_rms=40.0, omega_time=0.2
 )
 experiment = write_synthetic_experiment(folder, settings)
 
@@ -26,7 +26,7 @@ experiment = write_synthetic_experiment(folder, settings)
 # The frames are shuffled: nothing follows from their order any more.
 
 # %%
-order = np.random.default_rng(0).permutation(60)
+order = np.random.default_rng(0).permutation(24)
 for name in ("cam1", "cam2"):
     np.save(folder / f"{name}.npy", open_movie(folder / f"{name}.mkv").sample(order.tolist()))
 text = experiment.read_text().replace("cam1.mkv", "cam1.npy").replace("cam2.mkv", "cam2.npy")
