@@ -12,6 +12,7 @@ import pytest
 from conftest import REPO
 
 sys.path.insert(0, str(REPO / "scripts"))
+import mutants
 import rooms
 
 
@@ -81,3 +82,7 @@ def test_a_script_uses_names_that_exist(path):
 def test_no_room_is_larger_than_its_ceiling():
     assert set(rooms.ceilings()) == set(rooms.ORDER)
     assert rooms.too_large() == []
+
+
+def test_each_mutant_changes_a_text_of_the_code():
+    assert [one.name for one in mutants.read() if not one.files()] == []
