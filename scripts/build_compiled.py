@@ -61,6 +61,6 @@ class Readme(MetadataHookInterface):
 
     def update(self, metadata: dict[str, Any]) -> None:
         text = Path(self.root, "README.md").read_text(encoding="utf-8")
-        text = re.sub(r"!\[[^\]]*\]\((?!https?:)[^)]*\)\n*", "", text)
+        text = re.sub(r"(!\[[^\]]*\]\((?!https?:)[^)]*\)|<img [^>]*>)\n*", "", text)
         text = re.sub(r"\[([^\]]*)\]\((?!https?:)[^)]*\)", r"\1", text)
         metadata["readme"] = {"content-type": "text/markdown", "text": text}

@@ -265,13 +265,6 @@ def doctor(as_json: Annotated[bool, Option("--json", help="Print all of it as on
         raise typer.Exit(1)
 
 
-@app.command(hidden=True)
-def info() -> None:
-    """Do what `doctor` does, whose name this was."""
-    typer.echo("note: `info` is called `doctor` now; its old name goes with the next version.", err=True)
-    doctor(as_json=False)
-
-
 def _print_findings(found: dict[str, Any]) -> None:
     fits = found.pop("live_one_camera", [])
     for name, value in found.items():

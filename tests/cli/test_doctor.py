@@ -12,7 +12,6 @@ import pytest
 from sphereorient.bench.doctor import fit_speed, machine
 from sphereorient.bench.score import orientations_at
 from sphereorient.cli import main
-from sphereorient.cli.app import app
 from sphereorient.trajectory.rotations import rotations
 
 FIT = {"diameter_px": 40.0, "error_deg": 0.1, "cpu_ms": 2.0, "now_ms": 4.0, "hz_free_core": 350.0}
@@ -60,14 +59,11 @@ def test_a_machine_in_order_is_told_as_one_object(command):
     assert fit["hz_free_core"] * fit["cpu_ms"] < 1000, "the loop cannot compute all the time"
 
 
-def test_info_is_its_old_name_and_says_so_once(no_fit, command):
-    code, said, errors = command("info")
-    assert code == 0
-    assert len(errors) == 1
-    assert "`doctor`" in errors[0]
+def test_findings_are_printed(no_fit, command):
+    code, said, errors = command("doctor")
+    assert (code, errors) == (0, [])
     for words in ("torch ", "camera:0 (640 x 480 px)", "pylon: no answer", "hz_free_core", "cores free"):
         assert words in said
-    assert {one.name or one.callback.__name__: one.hidden for one in app.registered_commands}["info"]
 
 
 @pytest.mark.slow
