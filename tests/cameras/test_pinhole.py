@@ -33,8 +33,3 @@ def test_the_middle_of_a_picture_lies_between_its_outer_pixel_centres():
 def test_an_impossible_field_of_view_is_refused(vfov_deg):
     with pytest.raises(CameraError, match="vfov_deg: expected an angle between 0 and 180"):
         focal_of_field(288, vfov_deg)
-
-
-def test_a_negative_focal_length_is_refused():
-    with pytest.raises(CameraError, match="f_px: expected above zero"):
-        pinhole(f_px=f64(-1.0))
