@@ -85,7 +85,7 @@ def test_only_balls_that_look_alike_are_exchanged_and_one_without_frames_takes_w
 def test_a_track_of_one_ball_is_no_track_of_several(tmp_path):
     truth = write_truth(tmp_path / "truth.h5", "ab")
     track = replace(tracks_of(truth, {"a": "a"})["a"], sphere="")
-    with pytest.raises(TrackError, match="expected the truth of one ball, got that of a, b"):
+    with pytest.raises(TrackError, match="that of a, b"):
         score_track(track, tmp_path / "truth.h5")
 
 
@@ -116,7 +116,7 @@ def test_a_scene_has_as_many_balls_cameras_and_paints_as_its_plan(tmp_path):
     assert (base.balls, base.paints, base.cameras, base.volume_mm, base.frames) == (4, 3, 3, 45.0, 30)
     assert list(default_cameras(base)) == ["cam1", "cam2", "cam3"]
     assert plan.per_litre == pytest.approx(4 / 0.38170, rel=1e-4)  # a sphere of 45 mm: 0.3817 l
-    with pytest.raises((SettingsError, ValueError), match="got uneven_light, highlights, occlusion, bubbles; leave"):
+    with pytest.raises((SettingsError, ValueError), match="uneven_light, highlights"):
         BenchSettings(balls=2)
     alone = Results(settings=BenchSettings(degradations=(), frames=30), versions={}, outcomes=[])
     with pytest.raises(BenchError, match="none in common"):

@@ -106,13 +106,6 @@ def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monk
     assert "sphereorient calibrate" in (tmp_path / "cameras.yaml").read_text().splitlines()[0]
 
 
-@pytest.mark.slow
-def test_quiet_prints_nothing(tmp_path, monkeypatch, capsys):
-    code, out, err = run(monkeypatch, capsys, "calibrate", tables(tmp_path), "-o", tmp_path / "c.yaml", "--quiet")
-    assert (code, out, err) == (0, "", "")
-    assert (tmp_path / "c.yaml").is_file()
-
-
 def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     path = write(tmp_path, {"surveyed": document()["surveyed"] | {"pose": 99}}, drawn=False)
     code, out, err = run(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")

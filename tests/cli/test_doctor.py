@@ -118,7 +118,8 @@ def test_a_package_too_old_is_one_line_with_the_command_that_mends_it(no_fit, mo
     )
     code, said, errors = command("doctor")
     assert code == 1
-    assert errors == ["broken: kornia: expected >=0.9.0, got 0.8; run `pip install 'kornia>=0.9.0'`."]
+    (line,) = errors
+    assert "got 0.8; run `pip install 'kornia>=0.9.0'`" in line
     assert "hz" not in said, "nothing that it measured could be trusted"
 
 
