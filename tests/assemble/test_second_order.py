@@ -365,7 +365,7 @@ def test_a_short_movie_is_a_path(frames):
 
 def test_parts_of_unequal_size_are_refused():
     hypotheses = pooled(turning(5), standing(5))
-    with pytest.raises(ShapeError, match=r"score: expected shape \(5, 2\), got \(4, 2\); "):
+    with pytest.raises(ShapeError, match="score: expected shape"):
         physical_path(replace(hypotheses, nll=hypotheses.nll[:4]), times(5), SETTINGS)
-    with pytest.raises(ShapeError, match=r"time_s: expected shape \(5,\), got \(4,\); "):
+    with pytest.raises(ShapeError, match="time_s: expected shape"):
         physical_path(hypotheses, times(4), SETTINGS)

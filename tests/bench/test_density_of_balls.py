@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from overlay_examples import command
 from scipy.spatial.transform import Rotation
-from test_robustness import outcome, run_command
+from test_robustness import outcome
 
 from sphereorient.bench import BenchSettings, Results, run_benchmarks, scenes_of
 from sphereorient.bench.figures import density_figure, write_table
@@ -212,7 +213,7 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
         return curve()
 
     monkeypatch.setattr("sphereorient.bench.run_benchmarks", planned)
-    code, told, _ = run_command(monkeypatch, capsys, "balls", "--out", tmp_path / "run", "--balls", "1,4")
+    code, told, _ = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", "--balls", "1,4")
     assert code == 0
     assert "density.png" in told
     assert len([line for line in told.splitlines() if "2.6" in line or "10.5" in line]) == 4
@@ -235,7 +236,7 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
     ],
 )
 def test_bad_numbers_are_one_line(tmp_path, monkeypatch, capsys, arguments, words):
-    code, _, said = run_command(monkeypatch, capsys, "balls", "--out", tmp_path / "run", *arguments)
+    code, _, said = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", *arguments)
     assert code == 2, said
     assert len(said.strip().splitlines()) == 1
     assert words in said

@@ -31,5 +31,5 @@ def test_the_middle_of_a_picture_lies_between_its_outer_pixel_centres():
 
 @pytest.mark.parametrize("vfov_deg", [0.0, -3.0, 180.0, math.nan])
 def test_an_impossible_field_of_view_is_refused(vfov_deg):
-    with pytest.raises(CameraError, match="vfov_deg: expected an angle between 0 and 180"):
+    with pytest.raises(CameraError, match="vfov_deg: expected an angle"):
         focal_of_field(288, vfov_deg)

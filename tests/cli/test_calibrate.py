@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +8,9 @@ import pytest
 import torch
 from calibrate_examples import F_PX, PITCH, document, true_cameras, write
 from conftest import REPO
+from overlay_examples import command
 
-from sphereorient import cli, so3
+from sphereorient import so3
 from sphereorient.calibration.self_calibration import (
     check_cameras,
     check_lines,
@@ -25,15 +25,6 @@ from sphereorient.errors import CameraError, TrackError
 from sphereorient.trajectory import CameraTrack, Reason, Trajectory
 
 FRAMES = 120
-
-
-def run(monkeypatch, capsys, *arguments):
-    """Run the command line as a shell would; returns exit code, what it printed, and its complaints."""
-    monkeypatch.setattr(sys, "argv", ["sphereorient", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
 
 
 def tables(folder):
@@ -97,7 +88,7 @@ def track_of(calibrated, truly, contradicts=0):
 def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monkeypatch, capsys):
     source = tables(tmp_path)
     before = {path.name for path in tmp_path.iterdir()}
-    code, out, _ = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml")
+    code, out, _ = command(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml")
     assert code == 0
     assert {path.name for path in tmp_path.iterdir()} - before == {"cameras.yaml", "cameras.png"}
     assert list(load_cameras(tmp_path / "cameras.yaml")) == ["cam1", "cam2"]
@@ -108,7 +99,7 @@ def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monk
 
 def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     path = write(tmp_path, {"surveyed": document()["surveyed"] | {"pose": 99}}, drawn=False)
-    code, out, err = run(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")
+    code, out, err = command(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")
     assert code == 2
     assert out == ""
     assert err.strip().startswith("sphereorient: ")  # the bar of progress leaves an empty line
@@ -126,7 +117,9 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
         raise CameraError("no room left on the disk")
 
     monkeypatch.setattr("sphereorient.cameras.save_cameras", full)
-    code, _, err = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml", "-q", "--force")
+    code, _, err = command(
+        monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml", "-q", "--force"
+    )
     assert code == 2
     assert "no room" in err
     assert (tmp_path / "cameras.png").read_text() == (tmp_path / "cameras.yaml").read_text() == "old"
@@ -144,7 +137,7 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
 def test_an_output_that_would_harm_is_refused_before_any_work(tmp_path, monkeypatch, capsys, out, words):
     source = tables(tmp_path)
     text = source.read_text()
-    code, _, err = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / out)
+    code, _, err = command(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / out)
     assert code == 2
     assert words in err
     assert source.read_text() == text
@@ -158,7 +151,7 @@ def test_refine_with_a_track_repairs_bumped_cameras(tmp_path, monkeypatch, capsy
     track_of(calibrated, truly).save(tmp_path / "track.h5")
     repaired = tmp_path / "repaired.yaml"
     given = ("calibrate", tmp_path / "cameras.yaml", "--refine-with", tmp_path / "track.h5", "--out", repaired)
-    code, out, _ = run(monkeypatch, capsys, *given)
+    code, out, _ = command(monkeypatch, capsys, *given)
     assert code == 0
     assert "cam2: rotated by 0.2" in out
     assert "not determined by the sphere, kept: cam1: all (the lab frame)" in out
@@ -220,10 +213,10 @@ def test_the_command_check_cameras_reads_a_track(tmp_path, monkeypatch, capsys):
 
     cameras = load_experiment(path).cameras
     track_of(cameras, cameras, contradicts=100).save(tmp_path / "track.h5")
-    code, out, _ = run(monkeypatch, capsys, "check-cameras", path, "--track", tmp_path / "track.h5")
+    code, out, _ = command(monkeypatch, capsys, "check-cameras", path, "--track", tmp_path / "track.h5")
     assert code == 0
     assert "lines of sight miss each other by 0.0" in out
     assert "--refine-with" in out
-    code, _, err = run(monkeypatch, capsys, "check-cameras", path, "--track", Path("nothing.h5"))
+    code, _, err = command(monkeypatch, capsys, "check-cameras", path, "--track", Path("nothing.h5"))
     assert code == 2
     assert err.count("\n") == 1
