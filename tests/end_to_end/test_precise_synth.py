@@ -42,6 +42,7 @@ from sphereorient.trajectory import Flag, Reason, Trajectory
 EXCERPT = REPO / "synthetic_data" / "excerpt"
 Rendered = Callable[..., Movies]
 NONE = np.zeros(0, np.int64)
+SHORT = {"omega_rms": mean_turn(4.5), "frames": 48, "image_size": (200, 200), "diameter_px": 44.0, "seed": 4}
 
 
 @pytest.fixture(scope="session")
@@ -72,7 +73,7 @@ def held(rendered: Rendered) -> Movies:
 
 @pytest.fixture
 def short(rendered: Rendered) -> Movies:
-    return rendered(omega_rms=mean_turn(4.5), frames=48, image_size=(200, 200), diameter_px=44.0, seed=4)
+    return rendered(**SHORT)
 
 
 def rest(movies: Movies, lost: np.ndarray) -> np.ndarray:
@@ -387,9 +388,9 @@ def test_movies_of_a_few_frames_are_tracked(short, tmp_path, count):
     assert not (np.abs(track.omega_lab) > 300).any()
 
 
-def test_one_frame_with_the_ball_among_many_without(short, tmp_path):
+def test_one_frame_with_the_ball_among_many_without(rendered, tmp_path):
     without = np.r_[0:5, 6:12]
-    movies = short.frames(slice(0, 12)).without_ball(without)
+    movies = rendered(**SHORT | {"frames": 12}).without_ball(without)
     track = tracked(movies, tmp_path)
     check_right(track, movies, np.array([5]))
     check_nothing(track, without)
