@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from assemble_examples import RATE_HZ, candidates_of, times, turned_deg, turning
-from conftest import assert_close
+from conftest import assert_close, slow
 from second_order_examples import (
     Hypotheses,
     flagged,
@@ -46,7 +46,7 @@ def test_errata_a6_a_false_candidate_that_stands_still_deceives_the_paper_and_no
     assert (path.probability > 0.99).all()
 
 
-@pytest.mark.parametrize("deg_per_frame", [1.2, 3.7, 22.0, 45.0])
+@pytest.mark.parametrize("deg_per_frame", [1.2, slow(3.7), slow(22.0), 45.0])
 def test_a_false_candidate_that_stands_still_loses_although_the_pictures_favour_it(deg_per_frame, rng):
     R = turning(120, deg_per_frame)
     path = physical_path(pooled(seen(standing(120), rng), seen(R, rng), nll=[0.0, 2.0]), times(120), SETTINGS)
@@ -63,7 +63,7 @@ def test_a_sphere_at_rest_is_found_all_the_same(rng):
 
 
 @pytest.mark.parametrize("deg_per_frame", [3.7, 22.0])
-@pytest.mark.parametrize("length", [1, 3, 8])
+@pytest.mark.parametrize("length", [1, slow(3), 8])
 def test_a_stuck_candidate_that_is_the_only_one_for_a_while_is_skipped_and_not_followed(length, deg_per_frame, rng):
     R = turning(120, deg_per_frame)
     shown = seen(R, rng)
@@ -99,7 +99,7 @@ def test_thirty_per_cent_of_the_frames_may_be_missing(deg_per_frame, rng):
     assert dropped.segment.unique().tolist() == [0]
 
 
-@pytest.mark.parametrize("deg_per_frame", [22.0, 45.0])
+@pytest.mark.parametrize("deg_per_frame", [slow(22.0), 45.0])
 def test_a_fast_sphere_among_false_candidates_is_tracked_without_a_lost_or_wrong_frame(deg_per_frame, rng):
     R = turning(150, deg_per_frame)
     false = so3.random_rotations((2, 150), generator=rng)
@@ -199,7 +199,7 @@ def test_turns_are_those_from_the_orientation_before():
     assert not torch.allclose(so3.exp(path.turn_rad[5]), R[3].mT @ R[5], atol=1e-4)  # the same turn in body axes
 
 
-@pytest.mark.parametrize("deg_per_frame", [3.7, 22.0])
+@pytest.mark.parametrize("deg_per_frame", [3.7, slow(22.0)])
 def test_twins_that_turn_alike_are_flagged_with_even_odds(deg_per_frame, rng):
     """A map that looks the same after half a turn about the body's z axis."""
     R = turning(150, deg_per_frame)

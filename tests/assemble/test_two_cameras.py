@@ -9,7 +9,7 @@ import figure_repair
 import pytest
 import torch
 from assemble_examples import candidates_of, noisy, single, times, turned_deg, turning
-from conftest import REPO, assert_close
+from conftest import REPO, assert_close, slow
 from torch import Tensor
 
 from sphereorient import so3
@@ -227,7 +227,7 @@ def test_a_false_segment_is_dropped_where_the_other_camera_saw_nothing_unless_th
     assert has(track, Flag.AMBIGUOUS) == (list(range(26, 30)) if guessed else [])
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2)])
 def test_planted_false_stretches_are_found_between_spikes_and_none_of_their_frames_is_left(seed):
     numbers = figure_repair.repaired(seed)
     planted, between_spikes, false, replaced, dropped, left, frames, rms_deg = numbers.values()
@@ -313,7 +313,7 @@ def test_weights_follow_a_camera_that_becomes_noisy_for_a_while(rng):
 @pytest.mark.parametrize(
     ("first", "second", "within"),
     # equal cameras: only the scale counts, and the median of chi square is not its mean (a ratio of 0.89)
-    [(0.02, 0.02, 0.06), (0.02, 0.04, 0.15), (0.06, 0.03, 0.15)],
+    [(0.02, 0.02, 0.06), slow(0.02, 0.04, 0.15), (0.06, 0.03, 0.15)],
 )
 def test_sigma_is_the_error_per_axis_of_the_mean(rng, first, second, within):
     R = turning(4000, 0.3)
