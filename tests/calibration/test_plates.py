@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from calibrate_examples import PITCH, SIZE, Posed, document, pictures, plate_poses, true_cameras, write
+from calibrate_examples import PITCH, SIZE, Posed, document, pictures, plate_poses, true_cameras, write, write_tables
 from calibration_examples import triangulated_error_mm
 from conftest import SHARED
 from rich.console import Console
@@ -219,20 +219,10 @@ def test_poses_too_alike_are_refused_and_the_loose_parameter_is_named(tmp_path):
     refused(path, r"got loose: .*cam[12]\.\w+ \(sigma")
 
 
-def table_of(camera, points, noise_px=0.02, seed=0):
-    uv = camera.project(points).numpy() + noise_px * np.random.default_rng(seed).normal(size=(len(points), 2))
-    rows = [",".join(f"{number:.6f}" for number in row) for row in np.column_stack([points.numpy(), uv])]
-    return "\n".join(["x,y,z,u,v", *rows])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["tsai", "brown", "pinhole"])
 def test_cameras_come_out_of_tables_of_points(tmp_path, model):
-    points = 35 * (2 * torch.rand(80, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
-    for name, camera in true_cameras().items():
-        (tmp_path / f"{name}.csv").write_text(table_of(camera, points))
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv", "cam2": "cam2.csv"}}
-    result = calibrate_cameras(write(tmp_path, keys | {"model": model}, drawn=False))
+    result = calibrate_cameras(write_tables(tmp_path, model=model))
     assert triangulated_error_mm(result.cameras, true_cameras()) < 0.05
     assert result.rms_px("cam1") < 0.05
     calibration_figure(result, tmp_path / "figure.png")
@@ -241,20 +231,17 @@ def test_cameras_come_out_of_tables_of_points(tmp_path, model):
 
 
 def test_a_table_with_a_wrong_row_names_it_as_an_outlier(tmp_path):
-    points = 35 * (2 * torch.rand(80, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
-    lines = table_of(true_cameras()["cam1"], points).splitlines()
+    path = write_tables(tmp_path, points={"cam1": "cam1.csv"})
+    lines = (tmp_path / "cam1.csv").read_text().splitlines()
     start, _, last = lines[8].rpartition(",")
     lines[8] = f"{start},{float(last) + 3.0}"
     (tmp_path / "cam1.csv").write_text("\n".join(lines))
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv"}}
-    result = calibrate_cameras(write(tmp_path, keys, drawn=False))
+    result = calibrate_cameras(path)
     assert np.flatnonzero(~result.pictures[0].used).tolist() == [7]
 
 
 def test_too_few_points_are_refused_with_the_table_s_name(tmp_path):
-    (tmp_path / "cam1.csv").write_text("x,y,z,u,v\n1,2,3,4,5\n2,3,4,5,6\n")
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv"}}
-    refused(write(tmp_path, keys, drawn=False), r"cam1.csv, points")
+    refused(write_tables(tmp_path, count=2), "cam1.csv, points")
 
 
 @pytest.mark.slow
