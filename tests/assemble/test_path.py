@@ -8,13 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 from assemble_examples import RATE_HZ, candidates_of, single, times, turned_deg, turning
-from conftest import assert_close
+from conftest import assert_close, slow
 
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, Path, assemble_path, assemble_paths
 from sphereorient.errors import ShapeError
 from sphereorient.search import Candidates
-from sphereorient.trajectory import Reason
 
 SETTINGS = AssembleSettings()
 
@@ -31,23 +30,18 @@ def test_a_smooth_turn_is_found_among_false_candidates_that_score_higher_in_sing
     R = turning(60)
     candidates = among_false_ones(R, rng, better_in=(7, 20, 21, 40))
     path = assemble_path(candidates, times(60), SETTINGS)
+    assert float(so3.geodesic_distance(candidates.padded()[0][:, 0], R)[7]) > 0.1  # the best score would be wrong there
     assert torch.equal(path.R_lab_body, R)
     assert (path.choice[[7, 20, 21, 40]] == 3).all()  # best first: three false ones stand before it
     assert not path.spike.any()
     assert (path.segment == 0).all()
 
 
-def test_the_best_score_frame_by_frame_would_be_wrong_there(rng):
-    R = turning(60)
-    best = among_false_ones(R, rng, better_in=(7,)).padded()[0][:, 0]
-    assert float(so3.geodesic_distance(best, R)[7]) > 0.1
-
-
 def draw(rng: torch.Generator, low: float, high: float) -> float:
     return low + (high - low) * float(torch.rand((), generator=rng))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 4))])
 def test_two_degrees_a_frame_are_found_among_three_to_six_false_candidates(seed):
     rng = torch.Generator().manual_seed(seed)
     R = turning(300, 2.0)
@@ -71,13 +65,6 @@ def test_two_degrees_a_frame_are_found_among_three_to_six_false_candidates(seed)
     assert not path.spike.any()
 
 
-def test_of_equal_candidates_the_first_is_taken_each_time():
-    R = turning(30)
-    twins = candidates_of([[(R[k], 0.9), (R[k], 0.9), (R[k], 0.9)] for k in range(30)])
-    for _ in range(3):
-        assert assemble_path(twins, times(30), SETTINGS).choice.tolist() == [0] * 30
-
-
 def test_single_precision_chooses_the_same_and_keeps_its_links_late_in_a_movie(rng):
     full = among_false_ones(turning(40), rng, better_in=(7,))
     single_precision = replace(
@@ -89,26 +76,6 @@ def test_single_precision_chooses_the_same_and_keeps_its_links_late_in_a_movie(r
     assert path.xi.dtype == path.R_lab_body.dtype == torch.float32
     assert_close(path.xi, expected.xi.float(), 1e-4)
     assert late.float().diff().min() == 0.0  # the reading that rounds the times first
-
-
-@pytest.mark.slow
-def test_a_movie_of_fifteen_thousand_frames_with_ten_candidates_each_is_found(rng):
-    frames, width = 15_000, 10
-    R = turning(frames, 2.0)
-    wrong = so3.random_rotations((frames, width - 1), generator=rng)
-    # Row 4 of each frame is the truth; the scores fall with the row.
-    every = torch.cat([wrong[:, :4], R[:, None], wrong[:, 4:]], dim=1)
-    score = torch.linspace(0.95, 0.5, width, dtype=torch.float64).repeat(frames)
-    candidates = Candidates(
-        offset=torch.arange(frames + 1) * width,
-        R_view_body=every.flatten(0, 1),
-        R_lab_view=torch.eye(3, dtype=torch.float64).expand(frames, 3, 3),
-        score=score,
-        reason=(Reason.OK,) * frames,
-    )
-    path = assemble_path(candidates, times(frames), SETTINGS)
-    assert path.choice.unique().tolist() == [4]
-    assert_close(path.R_lab_body, R)
 
 
 def test_frames_without_candidates_are_skipped_and_the_link_over_them_takes_its_time():
@@ -150,13 +117,6 @@ def test_xi_stands_at_the_frame_that_the_link_enters():
     assert path.segment.tolist() == [0] * 12 + [1] * 8
 
 
-def test_uneven_times_divide_each_link_by_its_own():
-    R = turning(4)
-    time = torch.tensor([0.0, 0.001, 0.003, 0.01], dtype=torch.float64)
-    path = assemble_path(single(R), time, SETTINGS)
-    assert_close(path.xi[1:], so3.geodesic_distance(R[:-1], R[1:]) / time.diff(), 1e-9)
-
-
 def test_candidates_below_the_least_quality_are_never_chosen(rng):
     R = turning(20)
     poor = so3.random_rotations(20, generator=rng)
@@ -184,42 +144,15 @@ def test_cameras_in_one_batch_give_what_each_gives_alone(rng):
             assert_close(getattr(together[name], field), getattr(alone, field))
 
 
-@pytest.mark.parametrize("frames", [0, 1, 3])
-def test_a_camera_that_saw_nothing_has_an_empty_path(frames):
-    nothing = candidates_of([[]] * frames)
-    path = assemble_path(nothing, times(frames), SETTINGS)
-    assert path.choice.tolist() == [-1] * frames
-    assert path.segment.tolist() == [-1] * frames
+@pytest.mark.parametrize(("frames", "seen"), [(0, False), (1, False), (3, False), (1, True)])
+def test_a_camera_that_saw_nothing_has_an_empty_path_and_one_frame_is_a_path(frames, seen):
+    camera = single(turning(frames)[:frames], without=[] if seen else range(frames))
+    path = assemble_path(camera, times(frames), SETTINGS)
+    assert path.choice.tolist() == path.segment.tolist() == [int(seen) - 1] * frames
     assert path.R_lab_body.shape == (frames, 3, 3)
-    assert path.R_lab_body.isnan().all()
-
-
-def test_one_frame_is_a_path():
-    path = assemble_path(single(turning(1)), times(1), SETTINGS)
-    assert path.choice.tolist() == [0]
-    assert path.segment.tolist() == [0]
-
-
-def test_candidates_are_left_as_they_were(rng):
-    candidates = among_false_ones(turning(10), rng)
-    before = candidates.R_lab_body.clone(), candidates.score.clone()
-    assemble_path(candidates, times(10), SETTINGS)
-    assert torch.equal(candidates.R_lab_body, before[0])
-    assert torch.equal(candidates.score, before[1])
-
-
-def test_errata_a6_a_false_candidate_that_stands_still_beats_the_true_one_that_turns():
-    """A known weakness of the paper's cost, kept on purpose in this method: standing still costs nothing."""
-    R = turning(40)
-    still = turned_deg(R[0], 0.0, 0.0, 120.0)
-    candidates = candidates_of([[(R[k], 0.95), (still, 0.55)] for k in range(40)])
-    path = assemble_path(candidates, times(40), SETTINGS)
-    assert torch.equal(path.R_lab_body, still.expand(40, 3, 3))  # although T of the true one is far higher everywhere
-    assert not path.spike.any()
-    true = assemble_path(single(R, 0.95), times(40), SETTINGS)
-    assert float(true.xi.nansum()) > float(path.xi.nansum()) == 0.0
+    assert path.R_lab_body.isnan().all() != seen or not frames
 
 
 def test_a_camera_of_another_length_is_refused():
-    with pytest.raises(ShapeError, match="candidates of 'cam2': expected 10 frames, got 9; "):
+    with pytest.raises(ShapeError, match="'cam2': expected 10 frames"):
         assemble_paths({"cam1": single(turning(10)), "cam2": single(turning(9))}, times(10), SETTINGS)

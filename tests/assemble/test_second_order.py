@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from assemble_examples import RATE_HZ, candidates_of, times, turned_deg, turning
-from conftest import assert_close
+from conftest import assert_close, slow
 from second_order_examples import (
     Hypotheses,
     flagged,
@@ -24,7 +24,6 @@ from second_order_examples import (
 from sphereorient import so3
 from sphereorient.assemble import (
     AssembleSettings,
-    Chosen,
     PathSettings,
     assemble_path,
     beam,
@@ -47,7 +46,7 @@ def test_errata_a6_a_false_candidate_that_stands_still_deceives_the_paper_and_no
     assert (path.probability > 0.99).all()
 
 
-@pytest.mark.parametrize("deg_per_frame", [1.2, 3.7, 22.0, 45.0])
+@pytest.mark.parametrize("deg_per_frame", [1.2, slow(3.7), slow(22.0), 45.0])
 def test_a_false_candidate_that_stands_still_loses_although_the_pictures_favour_it(deg_per_frame, rng):
     R = turning(120, deg_per_frame)
     path = physical_path(pooled(seen(standing(120), rng), seen(R, rng), nll=[0.0, 2.0]), times(120), SETTINGS)
@@ -64,7 +63,7 @@ def test_a_sphere_at_rest_is_found_all_the_same(rng):
 
 
 @pytest.mark.parametrize("deg_per_frame", [3.7, 22.0])
-@pytest.mark.parametrize("length", [1, 3, 8])
+@pytest.mark.parametrize("length", [1, slow(3), 8])
 def test_a_stuck_candidate_that_is_the_only_one_for_a_while_is_skipped_and_not_followed(length, deg_per_frame, rng):
     R = turning(120, deg_per_frame)
     shown = seen(R, rng)
@@ -100,7 +99,7 @@ def test_thirty_per_cent_of_the_frames_may_be_missing(deg_per_frame, rng):
     assert dropped.segment.unique().tolist() == [0]
 
 
-@pytest.mark.parametrize("deg_per_frame", [22.0, 45.0])
+@pytest.mark.parametrize("deg_per_frame", [slow(22.0), 45.0])
 def test_a_fast_sphere_among_false_candidates_is_tracked_without_a_lost_or_wrong_frame(deg_per_frame, rng):
     R = turning(150, deg_per_frame)
     false = so3.random_rotations((2, 150), generator=rng)
@@ -200,7 +199,7 @@ def test_turns_are_those_from_the_orientation_before():
     assert not torch.allclose(so3.exp(path.turn_rad[5]), R[3].mT @ R[5], atol=1e-4)  # the same turn in body axes
 
 
-@pytest.mark.parametrize("deg_per_frame", [3.7, 22.0])
+@pytest.mark.parametrize("deg_per_frame", [3.7, slow(22.0)])
 def test_twins_that_turn_alike_are_flagged_with_even_odds(deg_per_frame, rng):
     """A map that looks the same after half a turn about the body's z axis."""
     R = turning(150, deg_per_frame)
@@ -265,35 +264,16 @@ def test_the_order_of_the_candidates_does_not_matter(rng):
     assert torch.equal(other.flags, one.flags)
 
 
-def test_the_choice_of_lab_does_not_matter(rng):
+def test_the_choice_of_lab_body_time_zero_and_unit_does_not_matter(rng):
     hypotheses, _ = crowded(rng)
-    R_new_lab = so3.random_rotations((), generator=rng)
-    moved = replace(hypotheses, R_lab_body=R_new_lab @ hypotheses.R_lab_body)
-    one, other = (physical_path(each, times(60), SETTINGS) for each in (hypotheses, moved))
-    assert torch.equal(other.choice, one.choice)
-    assert_close(other.posterior, one.posterior, 1e-6)
-    assert_close(other.turn_rad, one.turn_rad @ R_new_lab.mT, 1e-9)
-
-
-def test_the_choice_of_body_and_of_time_zero_and_unit_does_not_matter(rng):
-    hypotheses, _ = crowded(rng)
-    R_body_other = so3.random_rotations((), generator=rng)
-    moved = replace(hypotheses, R_lab_body=hypotheses.R_lab_body @ R_body_other)
+    R_new_lab, R_body_other = so3.random_rotations(2, generator=rng)
+    moved = replace(hypotheses, R_lab_body=R_new_lab @ hypotheses.R_lab_body @ R_body_other)
     one = physical_path(hypotheses, times(60), SETTINGS)
     other = physical_path(moved, 10 * times(60) + 1000.0, SETTINGS)
     assert torch.equal(other.choice, one.choice)
     assert_close(other.posterior, one.posterior, 1e-6)
+    assert_close(other.turn_rad, one.turn_rad @ R_new_lab.mT, 1e-9)
     assert float(other.acceleration_rad_s2) == pytest.approx(float(one.acceleration_rad_s2) / 100, rel=1e-6)
-
-
-def test_the_same_candidates_give_the_same_path_and_are_left_as_they_were(rng):
-    hypotheses, _ = crowded(rng)
-    before = {name: getattr(hypotheses, name).clone() for name in Hypotheses.__dataclass_fields__}
-    one, other = (physical_path(hypotheses, times(60), SETTINGS) for _ in range(2))
-    for name in Chosen.__dataclass_fields__:
-        assert_close(getattr(other, name), getattr(one, name), 0.0)
-    for name, kept in before.items():
-        assert torch.equal(getattr(hypotheses, name), kept)
 
 
 def test_places_that_are_not_in_use_may_hold_anything(rng):
@@ -321,14 +301,6 @@ def test_uneven_times_are_no_change_of_omega(rng):
     assert not path.flags.any()
 
 
-def test_frames_with_one_candidate_tell_the_acceleration_without_a_search(rng, monkeypatch):
-    runs, run = [], beam.BeamSearch.run
-    monkeypatch.setattr(beam.BeamSearch, "run", lambda search: runs.append(search) or run(search))
-    path = physical_path(pooled(seen(turning(60), rng)), times(60), SETTINGS)
-    assert len(runs) == 1
-    assert path.choice.tolist() == [0] * 60
-
-
 def test_the_acceleration_is_learnt_from_the_track(rng):
     frames, change = 400, math.radians(1.0)
     steps = torch.cat([torch.full((1, 3), 0.1), change * torch.randn(frames - 1, 3, generator=rng)]).double()
@@ -342,20 +314,6 @@ def test_the_acceleration_is_learnt_from_the_track(rng):
     assert 0.6 * change < learnt < 1.3 * change  # the scale of a Student's t, which is less than the deviation
     given = physical_path(pooled(track), times(frames + 1), PathSettings(acceleration_rad_s2=5000.0))
     assert given.acceleration_rad_s2 == 5000.0
-
-
-def test_runs_that_need_no_search_give_what_the_search_gives(rng, monkeypatch):
-    R = turning(150, 6.0)
-    false = so3.random_rotations(150, generator=rng)
-    mask = torch.ones(150, 2, dtype=torch.bool)
-    mask[:, 1] = (torch.arange(150) % 60) < 10
-    hypotheses = pooled(seen(R, rng), false, mask=mask)
-    skipping = physical_path(hypotheses, times(150), SETTINGS)
-    monkeypatch.setattr(beam, "PIN_NATS", math.inf)
-    searching = physical_path(hypotheses, times(150), SETTINGS)
-    assert torch.equal(skipping.choice, searching.choice)
-    assert_close(skipping.posterior, searching.posterior, 1e-4)
-    assert_close(skipping.turn_rad, searching.turn_rad)
 
 
 @pytest.mark.parametrize("gap_nats", [0.5, 30.0])
@@ -407,19 +365,7 @@ def test_a_short_movie_is_a_path(frames):
 
 def test_parts_of_unequal_size_are_refused():
     hypotheses = pooled(turning(5), standing(5))
-    with pytest.raises(ShapeError, match=r"score: expected shape \(5, 2\), got \(4, 2\); "):
+    with pytest.raises(ShapeError, match="score: expected shape"):
         physical_path(replace(hypotheses, nll=hypotheses.nll[:4]), times(5), SETTINGS)
-    with pytest.raises(ShapeError, match=r"time_s: expected shape \(5,\), got \(4,\); "):
+    with pytest.raises(ShapeError, match="time_s: expected shape"):
         physical_path(hypotheses, times(4), SETTINGS)
-
-
-@pytest.mark.slow
-def test_a_movie_of_fifteen_thousand_frames_is_found(rng):
-    frames = 15_000
-    R = turning(frames, 3.7)
-    every = so3.random_rotations((frames, 8), generator=rng)
-    counts = torch.where(torch.rand(frames, generator=rng) < 0.1, torch.randint(2, 9, (frames,), generator=rng), 1)
-    place = (torch.rand(frames, generator=rng) * counts).long()
-    every[torch.arange(frames), place] = seen(R, rng)
-    path = physical_path(pooled(*every.unbind(1), mask=torch.arange(8) < counts[:, None]), times(frames), SETTINGS)
-    assert torch.equal(path.choice, place)

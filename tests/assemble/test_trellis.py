@@ -1,9 +1,10 @@
-"""The cheapest path: against dijkstra and against all paths, as a batch, at the edges, and its gradient."""
+"""The cheapest path of both orders: against dijkstra and all paths, as a batch, and its gradient; the paper's edges."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,46 +13,19 @@ from conftest import assert_close
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
+from trellis_examples import ORDERS, Costs, all_paths, batched, cheapest, even_costs, random_costs, soft
 
 from sphereorient import so3
-from sphereorient.assemble import edge_costs, shortest_path, trellis
+from sphereorient.assemble import edge_costs, shortest_path
 from sphereorient.errors import ShapeError
 
 SEEDS = range(6)
-
-
-def random_graph(
-    shape: tuple[int, ...], width: int, seed: int, *, ties: bool = False, dtype: torch.dtype = torch.float64
-) -> tuple[Tensor, Tensor]:
-    """Edge costs and mask with holes anywhere, the ends too; whole numbers where ties are wanted."""
-    rng = torch.Generator().manual_seed(seed)
-    *batch, steps = shape
-    edges = torch.rand(*batch, max(steps - 1, 0), width, width, generator=rng, dtype=torch.float64) + 0.1
-    if ties:
-        edges = (3 * edges).round()
-    mask = torch.rand(*shape, width, generator=rng) < 0.7
-    mask &= torch.rand(*shape, 1, generator=rng) < 0.75
-    return edges.to(dtype), mask
-
-
-def visited(mask: Tensor) -> list[int]:
-    return torch.nonzero(mask.any(-1))[:, 0].tolist()
-
-
-def cost_of(edges: Tensor, steps: list[int], places: tuple[int, ...]) -> float:
-    """Cost of one path: the edges that enter a step come from the step visited last."""
-    return sum(float(edges[step - 1, a, b]) for step, a, b in zip(steps[1:], places[:-1], places[1:], strict=True))
-
-
-def all_paths(edges: Tensor, mask: Tensor) -> dict[tuple[int, ...], float]:
-    steps = visited(mask)
-    open_places = [torch.nonzero(mask[step])[:, 0].tolist() for step in steps]
-    return {places: cost_of(edges, steps, places) for places in itertools.product(*open_places)}
+TIES = pytest.mark.parametrize("ties", [False, True], ids=["distinct", "ties"])
 
 
 def by_dijkstra(edges: Tensor, mask: Tensor) -> float:
     """The same minimum from scipy: one node a candidate, a source before all and a sink behind."""
-    steps, width = visited(mask), mask.shape[1]
+    steps, width = torch.nonzero(mask.any(-1))[:, 0].tolist(), mask.shape[1]
     if not steps:
         return 0.0
     source, sink = mask.numel(), mask.numel() + 1
@@ -71,62 +45,44 @@ def by_dijkstra(edges: Tensor, mask: Tensor) -> float:
     return float(dijkstra(graph, indices=source)[sink]) - 2.0
 
 
-def assert_is_a_path(choice: Tensor, mask: Tensor) -> None:
-    there = choice >= 0
-    assert torch.equal(there, mask.any(-1))
-    assert mask[there].gather(1, choice[there, None]).all()
-
-
-@pytest.mark.parametrize("ties", [False, True], ids=["distinct", "ties"])
+@TIES
 @pytest.mark.parametrize("seed", SEEDS)
 def test_cost_agrees_with_dijkstra_where_frames_are_empty_and_candidates_masked(seed, ties):
-    edges, mask = random_graph((60,), 5, seed, ties=ties)
-    path = shortest_path(edges, mask)
-    assert math.isclose(float(path.cost), by_dijkstra(edges, mask), abs_tol=1e-10)
-    assert_is_a_path(path.choice, mask)
+    costs = random_costs((60,), 5, seed, order=1)
+    edges = costs.pair.abs() + 0.1
+    edges = edges.round() if ties else edges
+    path = shortest_path(edges, costs.mask)
+    assert math.isclose(float(path.cost), by_dijkstra(edges, costs.mask), abs_tol=1e-10)
+    there = path.choice >= 0
+    assert torch.equal(there, costs.mask.any(-1))
+    assert costs.mask[there].gather(1, path.choice[there, None]).all()
 
 
-@pytest.mark.parametrize("ties", [False, True], ids=["distinct", "ties"])
+@ORDERS
+@TIES
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_path_of_all_paths_is_cheaper(seed, ties):
-    edges, mask = random_graph((8,), 3, seed, ties=ties)
-    path = shortest_path(edges, mask)
-    every = all_paths(edges, mask)
-    assert math.isclose(float(path.cost), min(every.values()), abs_tol=1e-12)
-    places = tuple(path.choice[path.choice >= 0].tolist())
-    assert math.isclose(every[places], min(every.values()), abs_tol=1e-12)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_of_equally_cheap_paths_the_one_with_the_lowest_indices_from_the_end_is_taken(seed):
-    edges, mask = random_graph((7,), 3, seed, ties=True)
-    every = all_paths(edges, mask)
+def test_of_all_paths_the_cheapest_is_taken_and_of_equal_ones_that_of_the_lowest_indices_from_the_end(
+    seed, ties, order
+):
+    costs = random_costs((7,), 3, seed, order=order, walls=0.15 * (seed % 2))
+    costs = costs.each(torch.round) if ties else costs
+    path, (steps, every) = cheapest(costs), all_paths(costs)
     least = min(every.values())
-    lowest_from_the_end = min((places for places, cost in every.items() if cost == least), key=lambda p: p[::-1])
-    choice = shortest_path(edges, mask).choice
-    assert tuple(choice[choice >= 0].tolist()) == lowest_from_the_end
+    assert_close(path.cost, torch.tensor(least, dtype=torch.float64), 1e-11)
+    expected = torch.full((7,), -1)
+    if least < float("inf"):
+        best = [places for places, cost in every.items() if cost == least]
+        expected[steps] = torch.tensor(min(best, key=lambda places: places[::-1]))
+    assert torch.equal(path.choice, expected)
 
 
-def test_all_costs_equal_gives_the_first_open_candidate_everywhere():
-    mask = torch.tensor([[True, True], [False, True], [True, True]])
-    path = shortest_path(torch.ones(2, 2, 2), mask)
-    assert path.choice.tolist() == [0, 1, 0]
-    assert float(path.cost) == 2.0
-
-
-def test_the_minimum_is_global_and_not_the_cheapest_next_step():
-    edges = torch.tensor([[[1.0, 2.0], [9.0, 9.0]], [[9.0, 9.0], [1.0, 9.0]]])
-    path = shortest_path(edges, torch.ones(3, 2, dtype=torch.bool))
-    assert path.choice.tolist() == [0, 1, 0]  # a greedy walk goes 0, 0, 0 and pays 10
-    assert float(path.cost) == 3.0
-
-
-def test_rows_are_where_an_edge_comes_from_and_columns_where_it_goes():
-    edges = torch.full((1, 2, 2), 5.0)
-    edges[0, 0, 1] = 1.0
-    choice = shortest_path(edges, torch.ones(2, 2, dtype=torch.bool)).choice
-    assert choice.tolist() == [0, 1]
-    assert choice.tolist() != [1, 0]  # the other reading
+def test_edges_and_triples_are_in_the_order_of_time():
+    pair = torch.full((1, 2, 2), 5.0)
+    pair[0, 0, 1] = 1.0
+    assert shortest_path(pair, torch.ones(2, 2) > 0).choice.tolist() == [0, 1]  # read backwards it would be 1, 0
+    triple = torch.full((1, 2, 2, 2), 5.0)
+    triple[0, 0, 1, 1] = 1.0
+    assert shortest_path(None, torch.ones(3, 2) > 0, None, triple).choice.tolist() == [0, 1, 1]
 
 
 def test_an_edge_over_an_empty_step_leads_from_the_step_before_it():
@@ -139,133 +95,99 @@ def test_an_edge_over_an_empty_step_leads_from_the_step_before_it():
     assert float(path.cost) == 2.0
 
 
-def test_a_batch_is_the_stack_of_its_movies(batch, dtype):
-    edges, mask = random_graph((*batch, 12), 4, 3, dtype=dtype)
-    path = shortest_path(edges, mask)
+@ORDERS
+def test_a_batch_is_the_stack_of_its_movies(order, batch, dtype, tolerance):
+    costs = random_costs((*batch, 12), 4, 3, order=order).each(lambda part: part.to(dtype))
+    path = cheapest(costs)
     assert path.choice.shape == (*batch, 12)
     assert path.cost.shape == batch
     assert path.cost.dtype == dtype
     for at in itertools.product(*map(range, batch)):
-        single = shortest_path(edges[at], mask[at])
+        single = cheapest(costs[at])
         assert torch.equal(path.choice[at], single.choice)
-        assert_close(path.cost[at], single.cost)
+        assert_close(path.cost[at], single.cost, 10 * tolerance)
 
 
-def test_movies_of_different_length_and_different_holes_give_in_a_batch_what_they_give_alone():
-    lengths = [20, 13, 1, 17]
-    singles = [random_graph((n,), 4, seed) for seed, n in enumerate(lengths)]
-    edges = torch.full((len(lengths), 19, 4, 4), 1e-3, dtype=torch.float64)  # padding that would be cheap
-    mask = torch.zeros(len(lengths), 20, 4, dtype=torch.bool)
-    for row, (n, (edge, here)) in enumerate(zip(lengths, singles, strict=True)):
-        edges[row, : n - 1], mask[row, :n] = edge, here
-    together = shortest_path(edges, mask)
-    for row, (n, (edge, here)) in enumerate(zip(lengths, singles, strict=True)):
-        alone = shortest_path(edge, here)
-        assert torch.equal(together.choice[row, :n], alone.choice)
-        assert (together.choice[row, n:] == -1).all()
-        assert_close(together.cost[row], alone.cost)
+@ORDERS
+def test_movies_of_different_length_and_different_holes_give_in_a_batch_what_they_give_alone(order):
+    singles = [random_costs((n,), 4, seed, order=order) for seed, n in enumerate([12, 9, 2, 1, 11])]
+    whole = batched(singles)
+    paths, softs = cheapest(whole), soft(whole)
+    for row, costs in enumerate(singles):
+        n, path, alone = len(costs.mask), cheapest(costs), soft(costs)
+        assert torch.equal(paths.choice[row, :n], path.choice)
+        assert (paths.choice[row, n:] == -1).all()
+        assert_close(paths.cost[row], path.cost)
+        assert_close(softs.free_energy[row], alone.free_energy)
+        assert_close(softs.marginals[row, :n], alone.marginals)
+        assert not softs.marginals[row, n:].any()
 
 
-def test_steps_before_the_first_and_behind_the_last_candidate_do_not_count():
-    edges, _ = random_graph((9,), 3, 0)
-    mask = torch.ones(9, 3, dtype=torch.bool)
-    mask[:2], mask[7:] = False, False
-    path, middle = shortest_path(edges, mask), shortest_path(edges[2:6], mask[2:7])
-    assert path.choice.tolist() == [-1, -1, *middle.choice.tolist(), -1, -1]
-    assert_close(path.cost, middle.cost)
-
-
+@ORDERS
 @pytest.mark.parametrize("seed", SEEDS)
-def test_single_precision_takes_the_same_path(seed):
-    edges, mask = random_graph((60,), 5, seed)
-    path, expected = shortest_path(edges.float(), mask), shortest_path(edges, mask)
+def test_single_precision_takes_the_same_path(order, seed):
+    costs = random_costs((60,), 5, seed, order=order)
+    path, expected = cheapest(costs.each(Tensor.float)), cheapest(costs)
     assert torch.equal(path.choice, expected.choice)
     assert path.cost.dtype == torch.float32
     assert_close(path.cost, expected.cost.float(), 1e-4)  # a sum of about 40 edges
 
 
-@pytest.mark.parametrize("ties", [False, True], ids=["distinct", "ties"])
-def test_the_same_graph_gives_the_same_path_each_time(ties):
-    edges, mask = random_graph((2, 1, 3, 40), 5, 4, ties=ties)
-    first = shortest_path(edges, mask)
-    for _ in range(5):
-        again = shortest_path(edges.clone(), mask.clone())
-        assert torch.equal(again.choice, first.choice)
-        assert torch.equal(again.cost, first.cost)
-
-
 @pytest.mark.parametrize("poison", [torch.inf, torch.nan, -100.0], ids=str)
 def test_what_stands_on_edges_of_masked_candidates_does_not_matter(poison):
-    edges, mask = random_graph((30,), 4, 1)
+    costs = random_costs((30,), 4, 1, order=1)
+    edges, mask = costs.pair, costs.mask
     clean = shortest_path(edges, mask)
     held = torch.cummax(torch.where(mask.any(1), torch.arange(30), -1), 0).values[:-1]
     usable = mask[held.clamp_min(0)][:, :, None] & (held >= 0)[:, None, None] & mask[1:, None, :]
-    dirty = shortest_path(torch.where(usable, edges, poison), mask)
+    spoilt = torch.where(usable, edges, poison).requires_grad_()
+    dirty = shortest_path(spoilt, mask)
     assert torch.equal(dirty.choice, clean.choice)
-    assert_close(dirty.cost, clean.cost)
+    assert_close(dirty.cost.detach(), clean.cost)
+    dirty.cost.backward()
+    assert torch.isfinite(spoilt.grad).all()
 
 
-def test_infinite_edges_are_avoided_and_where_they_cannot_be_there_is_no_path():
-    edges = torch.ones(3, 2, 2)
-    edges[1, 0] = torch.inf
-    mask = torch.ones(4, 2, dtype=torch.bool)
-    assert shortest_path(edges, mask).choice[1] == 1
-    edges[1] = torch.inf
-    path = shortest_path(edges, mask)
-    assert torch.isinf(path.cost)
-    assert (path.choice == -1).all()
-
-
-@pytest.mark.parametrize(("steps", "width"), [(0, 3), (1, 3), (4, 0), (5, 1)])
-def test_movies_without_steps_links_or_choice_are_data(steps, width):
-    path = shortest_path(torch.ones(max(steps - 1, 0), width, width), torch.ones(steps, width, dtype=torch.bool))
+@ORDERS
+@pytest.mark.parametrize(("steps", "width"), [(0, 3), (1, 3), (2, 2), (4, 0), (5, 1)])
+def test_movies_without_steps_links_or_choice_are_data(order, steps, width):
+    costs = even_costs(steps, width, order=order)
+    path, found = cheapest(costs), soft(costs)
+    least = max(steps - 1, 0) + max(steps - 2, 0) * (order - 1) if width else 0
     assert path.choice.tolist() == [0 if width else -1] * steps
-    assert float(path.cost) == (max(steps - 1, 0) if width else 0)
+    assert float(path.cost) == least
+    assert found.marginals.shape == (steps, width)
+    assert found.pair_marginals.shape == (max(steps - 1, 0), width, width)
+    if steps and width:
+        assert_close(found.marginals, torch.full((steps, width), 1 / width).double(), 1e-6)
+        assert float(found.free_energy) == pytest.approx(least - steps * math.log(width), abs=1e-6)
 
 
-def test_a_movie_without_candidates_costs_nothing_and_chooses_nothing():
-    path = shortest_path(torch.ones(4, 3, 3), torch.zeros(5, 3, dtype=torch.bool))
-    assert path.choice.tolist() == [-1] * 5
-    assert float(path.cost) == 0.0
+@ORDERS
+def test_costs_that_do_not_fit_the_mask_are_refused(order):
+    costs = even_costs(4, 3, order=order)
+    for name in costs.parts:
+        for path in (cheapest, soft):
+            with pytest.raises(ShapeError, match=f"{'edge' if name == 'pair' else name}_cost: expected"):
+                path(replace(costs, **{name: torch.ones(7, *costs.parts[name].shape[1:])}))
 
 
-def test_costs_that_do_not_fit_the_mask_are_refused():
-    with pytest.raises(ShapeError, match="edge_cost: expected"):
-        shortest_path(torch.ones(4, 3, 3), torch.ones(4, 3, dtype=torch.bool))
+def test_a_path_without_edges_and_triples_is_refused():
+    with pytest.raises(ShapeError, match="edge_cost: expected costs"):
+        shortest_path(None, torch.ones(4, 3, dtype=torch.bool))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_gradient_of_the_cost_is_one_on_the_edges_taken_and_zero_elsewhere(seed):
-    edges, mask = random_graph((15,), 4, seed)
-    edges.requires_grad_()
-    path = shortest_path(edges, mask)
-    path.cost.backward()
-    expected = torch.zeros_like(edges)
-    steps = visited(mask)
-    for a, b in itertools.pairwise(steps):
-        expected[b - 1, path.choice[a], path.choice[b]] = 1.0
-    assert torch.equal(edges.grad, expected)
-
-
-def test_gradient_agrees_with_differences():
-    edges, mask = random_graph((3, 9), 3, 5)
-    edges.requires_grad_()
-    assert torch.autograd.gradcheck(lambda e: shortest_path(e, mask).cost, (edges,))
-
-
-def test_gradient_is_finite_where_padding_is_infinite():
-    edges, mask = random_graph((10,), 3, 2)
-    edges = torch.where(mask[1:, None, :], edges, torch.inf).requires_grad_()
-    shortest_path(edges, mask).cost.backward()
-    assert torch.isfinite(edges.grad).all()
-
-
-def test_inputs_are_left_as_they_were():
-    edges, mask = random_graph((10,), 3, 2)
-    before = edges.clone(), mask.clone()
-    shortest_path(edges, mask)
-    assert torch.equal(edges, before[0])
-    assert torch.equal(mask, before[1])
+@ORDERS
+def test_gradient_of_the_least_cost_is_one_on_what_the_path_pays(order):
+    costs = random_costs((2, 6), 2, 5, order=order).each(Tensor.requires_grad_)
+    path = cheapest(costs)
+    path.cost.sum().backward()
+    taken = torch.nn.functional.one_hot(path.choice.clamp_min(0), 2) * (path.choice >= 0)[..., None]
+    assert_close(costs.node.grad, taken.double())
+    names, parts = zip(*costs.parts.items(), strict=True)
+    assert torch.autograd.gradcheck(
+        lambda *given: cheapest(Costs(mask=costs.mask, **dict(zip(names, given, strict=True)))).cost, parts
+    )
 
 
 def test_edge_cost_is_angle_times_doubt_over_seconds():
@@ -298,13 +220,11 @@ def test_edge_costs_of_a_batch_are_the_stack_of_single_ones(batch, rng):
         assert_close(cost[at], edge_costs(R[at], score[at], time[at]))
 
 
-def test_edge_costs_do_not_depend_on_how_many_are_computed_at_once(rng, monkeypatch):
-    R = so3.random_rotations((2, 6, 3), generator=rng)
-    score = torch.rand(2, 6, 3, generator=rng, dtype=torch.float64)
-    time = torch.arange(6.0, dtype=torch.float64).expand(2, 6)
-    whole = edge_costs(R, score, time)
-    monkeypatch.setattr(trellis, "PAIRS_AT_ONCE", 1)
-    assert_close(edge_costs(R, score, time), whole)
+def test_edge_costs_do_not_depend_on_how_many_are_computed_at_once(rng):
+    R = so3.random_rotations((6, 200), generator=rng)  # so many that one link is a piece of its own
+    score, time = torch.rand(6, 200, generator=rng, dtype=torch.float64), torch.arange(6.0, dtype=torch.float64)
+    few = slice(0, 3)
+    assert_close(edge_costs(R, score, time)[:, few, few], edge_costs(R[:, few], score[:, few], time))
 
 
 @pytest.mark.parametrize("steps", [0, 1])
@@ -341,13 +261,6 @@ def test_edge_costs_keep_single_precision_beside_times_in_double(rng):
     assert cost.dtype == torch.float32
     angle = so3.geodesic_distance(R[:-1, :, None], R[1:, None])
     assert_close(cost, angle * 0.4 * 600, 1e-2)  # rad/s of some hundred; whole steps of dt would be half off
-
-
-def test_edge_costs_leave_their_inputs_as_they_were(rng):
-    inputs = (so3.random_rotations((4, 3), generator=rng), torch.full((4, 3), 0.8), torch.arange(4.0))
-    before = [each.clone() for each in inputs]
-    edge_costs(*inputs)
-    assert all(map(torch.equal, inputs, before))
 
 
 def test_edge_costs_refuse_scores_of_other_frames():

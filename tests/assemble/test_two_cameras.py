@@ -9,7 +9,7 @@ import figure_repair
 import pytest
 import torch
 from assemble_examples import candidates_of, noisy, single, times, turned_deg, turning
-from conftest import REPO, assert_close
+from conftest import REPO, assert_close, slow
 from torch import Tensor
 
 from sphereorient import so3
@@ -84,9 +84,11 @@ def as_pair(wrong: str, deceived, right):
     return (deceived, right) if wrong == "cam1" else (right, deceived)
 
 
-def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other(wrong):
+@pytest.mark.parametrize(("false_score", "true_score"), [(0.9, 0.85), (0.99, 0.7)])
+def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other_whatever_the_scores(wrong, false_score, true_score):
     R = turning(60)
-    track = contradiction(*as_pair(wrong, sees(R, false_in=STRETCH), sees(R)), deceived=[wrong])
+    pair = as_pair(wrong, sees(R, false_in=STRETCH, false_score=false_score), sees(R, true_score=true_score))
+    track = contradiction(*pair, deceived=[wrong])
     right = {"cam1": "cam2", "cam2": "cam1"}[wrong]
     assert_close(track.R_lab_body, R, 1e-9)
     assert_close(track.R_lab_body_of[wrong], R)
@@ -98,12 +100,6 @@ def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other(wrong):
     assert has(track, Flag.SPIKE) == []
     assert (track.segment == 0).all()
     assert (disagreement_rad(track) < 1e-6).all()
-
-
-def test_the_deceived_camera_loses_although_its_false_candidate_scores_higher(wrong):
-    R = turning(60)
-    pair = as_pair(wrong, sees(R, false_in=STRETCH, false_score=0.99), sees(R, true_score=0.7))
-    assert_close(contradiction(*pair, deceived=[wrong]).R_lab_body, R, 1e-9)
 
 
 def test_the_nearest_candidate_within_the_limit_is_taken_and_not_the_best(wrong):
@@ -190,19 +186,6 @@ def test_a_larger_margin_makes_more_of_the_repairs_a_guess():
     assert has(contradiction(first, second, settings=loose), Flag.AMBIGUOUS) == list(STRETCH)
 
 
-@pytest.mark.parametrize(
-    ("early", "late"),
-    [(range(20, 25), range(60, 70)), (range(20, 30), range(30, 45))],
-    ids=["apart", "told apart by the spike between them"],
-)
-def test_stretches_with_different_culprits_are_decided_each_by_itself(early, late):
-    R = turning(90)
-    track = contradiction(sees(R, false_in=early), sees(R, false_in=late), deceived=["cam1", "cam2"])
-    assert_close(track.R_lab_body, R, 1e-9)
-    assert mended(track, "cam1") == list(early)
-    assert mended(track, "cam2") == list(late)
-
-
 def test_a_camera_that_sees_something_else_in_each_frame_loses_all_of_them(rng, wrong):
     """Pieces of one frame, without a candidate that both have: continuity with what was decided before must lead."""
     R = turning(60)
@@ -244,7 +227,7 @@ def test_a_false_segment_is_dropped_where_the_other_camera_saw_nothing_unless_th
     assert has(track, Flag.AMBIGUOUS) == (list(range(26, 30)) if guessed else [])
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2)])
 def test_planted_false_stretches_are_found_between_spikes_and_none_of_their_frames_is_left(seed):
     numbers = figure_repair.repaired(seed)
     planted, between_spikes, false, replaced, dropped, left, frames, rms_deg = numbers.values()
@@ -259,14 +242,21 @@ def test_planted_false_stretches_are_found_between_spikes_and_none_of_their_fram
         assert table in (REPO / "docs" / "assembly.md").read_text()
 
 
-@pytest.mark.parametrize("between", [1, 10], ids=["agreeing_frame", "long_hole"])
-def test_what_lies_between_two_stretches_splits_them(between):
-    R = turning(60)
-    early, late = range(20, 24), range(24 + between, 26 + between)
-    first, second = sees(R, false_in=early), sees(R, false_in=late)
-    if between == 10:  # cam2 saw nothing, and what follows has nothing to do with what was before
-        second = sees(R, false_in=late, nothing_in=range(24, 34))
-    track = contradiction(first, second, deceived=["cam1", "cam2"])
+@pytest.mark.parametrize(
+    ("early", "late", "nothing_in"),
+    [
+        (range(20, 25), range(60, 70), ()),
+        (range(20, 30), range(30, 45), ()),
+        (range(20, 24), range(25, 27), ()),
+        (range(20, 24), range(34, 36), range(24, 34)),
+    ],
+    ids=["apart", "a spike between", "an agreeing frame between", "a long hole of cam2 between"],
+)
+def test_stretches_with_different_culprits_are_decided_each_by_itself(early, late, nothing_in):
+    R = turning(90)
+    seen = sees(R, false_in=early), sees(R, false_in=late, nothing_in=nothing_in)
+    track = contradiction(*seen, deceived=["cam1", "cam2"])
+    assert_close(track.R_lab_body, R, 1e-9)
     assert mended(track, "cam1") == list(early)
     assert mended(track, "cam2") == list(late)
 
@@ -323,7 +313,7 @@ def test_weights_follow_a_camera_that_becomes_noisy_for_a_while(rng):
 @pytest.mark.parametrize(
     ("first", "second", "within"),
     # equal cameras: only the scale counts, and the median of chi square is not its mean (a ratio of 0.89)
-    [(0.02, 0.02, 0.06), (0.02, 0.04, 0.15), (0.06, 0.03, 0.15)],
+    [(0.02, 0.02, 0.06), slow(0.02, 0.04, 0.15), (0.06, 0.03, 0.15)],
 )
 def test_sigma_is_the_error_per_axis_of_the_mean(rng, first, second, within):
     R = turning(4000, 0.3)
@@ -392,20 +382,6 @@ def test_two_cameras_that_never_saw_the_sphere_together_have_no_sigma():
     track = fused({"cam1": single(R, without=range(20, 40)), "cam2": single(R, without=range(20))})
     assert_close(track.R_lab_body, R)
     assert track.sigma_rad.isnan().all()
-
-
-def test_a_camera_that_saw_nothing_leaves_the_other_alone():
-    R = turning(20)
-    track = fused({"cam1": single(R), "cam2": single(R, without=range(20))})
-    assert_close(track.R_lab_body, R)
-    assert has(track, Flag.ONE_CAMERA) == list(range(20))
-
-
-def test_motionless_identical_tracks_have_equal_finite_weights():
-    R = turning(1).expand(30, 3, 3)
-    track = fused({"cam1": single(R), "cam2": single(R)})
-    assert_close(track.weight["cam1"], torch.full((30,), 0.5, dtype=torch.float64))
-    assert_close(track.R_lab_body, R)
 
 
 def test_a_track_without_any_scatter_does_not_get_all_the_weight(rng):
@@ -495,13 +471,6 @@ def test_two_of_three_cameras_overrule_the_third_whatever_its_score(wrong):
     assert_close(dropped.R_lab_body, turning(60), 1e-9)
     assert (dropped.weight[wrong][list(STRETCH)] == 0).all()
     assert has(dropped, Flag.ONE_CAMERA) == []
-
-
-def test_where_only_two_of_three_cameras_see_the_sphere_the_better_one_of_these_leads():
-    R = turning(60)
-    track = contradiction(sees(R, false_in=STRETCH), sees(R), sees(R, nothing_in=STRETCH))
-    assert_close(track.R_lab_body, R, 1e-9)
-    assert mended(track, "cam1") == list(STRETCH)
 
 
 def test_the_sigma_of_three_cameras_is_the_error_of_their_mean(rng):

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
+import pytest
 import torch
 from torch import Tensor
+
+from sphereorient.assemble import ShortestPath, SoftPath, shortest_path, soft_path
+
+ORDERS = pytest.mark.parametrize("order", [1, 2])
 
 
 @dataclass(frozen=True)
@@ -17,6 +23,27 @@ class Costs:
     pair: Tensor  # (N - 1, C, C)
     node: Tensor  # (N, C)
     triple: Tensor | None = None  # (N - 2, C, C, C)
+
+    @property
+    def parts(self) -> dict[str, Tensor]:
+        """All costs by name, without the mask."""
+        return {name: part for name, part in vars(self).items() if name != "mask" and part is not None}
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> Costs:
+        """Change all costs."""
+        return replace(self, **{name: change(part) for name, part in self.parts.items()})
+
+    def __getitem__(self, at: tuple[int, ...]) -> Costs:
+        """One movie of a batch."""
+        return replace(self.each(lambda part: part[at]), mask=self.mask[at])
+
+
+def cheapest(costs: Costs) -> ShortestPath:
+    return shortest_path(costs.pair, costs.mask, costs.node, costs.triple)
+
+
+def soft(costs: Costs, temperature: float = 1.0) -> SoftPath:
+    return soft_path(costs.pair, costs.mask, temperature, costs.node, costs.triple)
 
 
 def random_costs(
@@ -35,6 +62,25 @@ def random_costs(
     pair = draw(max(steps - 1, 0), width, width)
     triple = draw(max(steps - 2, 0), width, width, width) if order == 2 else None
     return Costs(mask=mask, pair=pair, node=node, triple=triple)
+
+
+def even_costs(steps: int, width: int, *, order: int) -> Costs:
+    """Each pair and each triple costs 1, a candidate by itself nothing; without holes."""
+    pair, triple = (torch.ones(max(steps - back, 0), *[width] * (back + 1), dtype=torch.float64) for back in (1, 2))
+    mask = torch.ones(steps, width, dtype=torch.bool)
+    return Costs(mask=mask, pair=pair, node=torch.zeros(steps, width).double(), triple=triple if order == 2 else None)
+
+
+def batched(movies: Sequence[Costs]) -> Costs:
+    """Movies of different length as one batch; the padding would be cheap."""
+
+    def joined(name: str) -> Tensor:
+        parts = [getattr(movie, name) for movie in movies]
+        longest = max(parts, key=len)
+        whole = torch.full_like(longest, -50.0) if name != "mask" else torch.zeros_like(longest)
+        return torch.stack([torch.cat([part, whole[len(part) :]]) for part in parts])
+
+    return Costs(**{name: joined(name) for name in ("mask", *movies[0].parts)})
 
 
 def cost_of(costs: Costs, steps: list[int], places: tuple[int, ...]) -> float:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from bench_robustness import markdown
+from overlay_examples import command
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -31,7 +31,7 @@ from sphereorient.bench.run import (
     trackers_of,
 )
 from sphereorient.bench.score import aligned_errors_deg, orientations_at, read_fictrac, true_orientations
-from sphereorient.cli import app, main
+from sphereorient.cli import app
 from sphereorient.errors import BenchError, OutputError, SettingsError, TrackError
 from sphereorient.trajectory import CameraTrack, Trajectory
 
@@ -251,14 +251,6 @@ def test_the_papers_method_on_a_small_run(tmp_path):
         assert 0.1 < line.p50_deg < 3
 
 
-def run_command(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["sphereorient", "bench", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    said = capsys.readouterr()
-    return int(stopped.value.code or 0), said.out, said.err
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -270,7 +262,7 @@ def run_command(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, words):
-    code, _, said = run_command(monkeypatch, capsys, "robustness", "--out", tmp_path / "run", *arguments)
+    code, _, said = command(monkeypatch, capsys, "bench", "robustness", "--out", tmp_path / "run", *arguments)
     assert code == 2
     assert len(said.strip().splitlines()) == 1
     assert words in said
@@ -283,13 +275,15 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
     monkeypatch.setattr("sphereorient.bench.write_scene", lambda folder, scene: seen.append(scene))
     out = tmp_path / "scenes"
     out.mkdir()
-    assert run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)[0] == 0
+    assert command(monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config)[0] == 0
     assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 12), ("defocus-2-0-0", 12)]
     seen.clear()
-    run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config, "--levels", "4", "--frames", "15")
+    command(
+        monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config, "--levels", "4", "--frames", "15"
+    )
     assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
     config.write_text("level: [2]\n")
-    code, _, said = run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)
+    code, _, said = command(monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config)
     assert (code, len(said.strip().splitlines())) == (2, 1)
     assert "write 'levels'" in said
 
@@ -297,10 +291,10 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
 def test_compare_as_a_command(tmp_path, monkeypatch, capsys):
     save_results(results(outcome()), tmp_path / "old.json")
     save_results(results(outcome(orientation_deg=(0.2,) * FRAMES)), tmp_path / "new.json")
-    code, told, _ = run_command(monkeypatch, capsys, "compare", tmp_path / "new.json", tmp_path / "old.json")
+    code, told, _ = command(monkeypatch, capsys, "bench", "compare", tmp_path / "new.json", tmp_path / "old.json")
     assert code == 1
     assert "worse: defocus 1, precise: median error, degrees 0.02 -> 0.2" in told
-    assert run_command(monkeypatch, capsys, "compare", tmp_path / "old.json", tmp_path / "old.json")[0] == 0
+    assert command(monkeypatch, capsys, "bench", "compare", tmp_path / "old.json", tmp_path / "old.json")[0] == 0
 
 
 def test_fictracs_file_is_read_and_scored(truth, tmp_path):

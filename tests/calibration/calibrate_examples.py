@@ -107,6 +107,18 @@ def document() -> dict[str, Any]:
     }
 
 
+def write_tables(folder: Path, count: int = 80, **changes: Any) -> Path:
+    """Write calibration.yaml of a table of points with noise for each camera."""
+    points = 35 * (2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
+    for name, camera in true_cameras().items():
+        uv = camera.project(points).numpy() + 0.02 * np.random.default_rng(0).normal(size=(count, 2))
+        table = np.column_stack([points.numpy(), uv])
+        np.savetxt(folder / f"{name}.csv", table, "%.6f", delimiter=",", header="x,y,z,u,v", comments="")
+    tables = {"cam1": "cam1.csv", "cam2": "cam2.csv"}
+    keys = {"plate": None, "surveyed": None, "pictures": None, "points": tables} | changes
+    return write(folder, keys, drawn=False)
+
+
 def write(folder: Path, changes: Mapping[str, Any] | None = None, drawn: bool = True) -> Path:
     """Write calibration.yaml and its pictures; a change to None takes a key away."""
     content = {key: value for key, value in (document() | dict(changes or {})).items() if value is not None}

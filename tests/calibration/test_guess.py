@@ -11,7 +11,6 @@ from calibration_examples import (
     planted,
     port,
     vector,
-    view,
     views,
 )
 
@@ -129,12 +128,3 @@ def test_a_guess_from_points_in_the_lab_is_near_the_camera(walls, rng):
     )
     missed = (found.project(points) - true.project(points)).norm(dim=-1)
     assert float(missed.max()) < 15
-
-
-def test_a_view_of_the_plate_is_right_handed(rng):
-    """The plate's z towards the viewer: seen from behind, x to the right would be y to the wrong side."""
-    rig = planted(rng)
-    one = view(rig, "cam1", 0, rng, noise_px=0.0)
-    at = {tuple(index): uv for index, uv in zip(one.index.tolist(), one.uv_px, strict=True)}
-    x, y = at[(1, 0)] - at[(0, 0)], at[(0, 1)] - at[(0, 0)]
-    assert x[0] * y[1] - x[1] * y[0] < 0  # rows run up in the picture, whose v runs down

@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from calibrate_examples import PITCH, SIZE, Posed, document, pictures, plate_poses, true_cameras, write
+from calibrate_examples import PITCH, SIZE, Posed, document, pictures, plate_poses, true_cameras, write, write_tables
+from calibration_examples import triangulated_error_mm
 from conftest import SHARED
 from rich.console import Console
 
 from sphereorient import so3
+from sphereorient.calibration.bundle import Rig
 from sphereorient.calibration.calibrated import parameters_table, pictures_table, summary
 from sphereorient.calibration.document import load_calibration
 from sphereorient.calibration.plates import calibrate_cameras, see_pictures, tie_floating
@@ -36,17 +38,11 @@ def result(source):
     return calibrate_cameras(source)
 
 
-def cube_error_mm(found, true, half_mm=30.0):
-    points = half_mm * (2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double() - 1)
-    rays = [found[name].rays(true[name].project(points)) for name in true]
-    return float((triangulate(*rays)[0] - points).norm(dim=-1).square().mean().sqrt())
-
-
 @pytest.mark.slow
 def test_cameras_come_out_of_pictures(result):
     true = true_cameras()
     assert result.rms_px("cam1") < 0.03
-    assert cube_error_mm(result.cameras, true) < 0.01
+    assert triangulated_error_mm(result.cameras, true) < 0.01
     between = [rig["cam2"].R_cam_lab @ rig["cam1"].R_cam_lab.mT for rig in (result.cameras, true)]
     assert math.degrees(float(so3.geodesic_distance(*between))) < 0.03
     assert float(result.cameras["cam1"].f_mm) / PITCH[0] == pytest.approx(900.0, rel=1e-3)
@@ -141,7 +137,7 @@ def test_a_picture_without_fiducials_is_tied_through_the_other_camera(tmp_path):
     (one,) = (one for one in result.pictures if one.picture.path.name == "cam2_02.png")
     assert one.reason == ""
     assert one.rms_px < 0.03
-    assert cube_error_mm(result.cameras, true_cameras()) < 0.01
+    assert triangulated_error_mm(result.cameras, true_cameras()) < 0.01
 
 
 @pytest.mark.slow
@@ -152,7 +148,7 @@ def test_a_floating_picture_of_a_pose_that_nobody_else_saw_is_left_out_with_the_
     (one,) = (one for one in result.pictures if one.picture.path.name == "cam1_04.png")
     assert "cam1_04.png" in one.reason
     assert len(one.used) == 0
-    assert cube_error_mm(result.cameras, true_cameras()) < 0.01
+    assert triangulated_error_mm(result.cameras, true_cameras()) < 0.01
 
 
 def refused(path, words):
@@ -167,7 +163,7 @@ def test_no_dots_found_is_said_with_the_first_reason(tmp_path):
     for name in pictures():
         if name.startswith("cam2"):
             cv2.imwrite(str(tmp_path / name), np.full(SIZE[::-1], 90, np.uint8))
-    refused(path, r"cam2: expected pictures of the plate, got none of 5; the first: .*cam2_00.png")
+    refused(path, "cam2: .* none of 5; .*cam2_00.png")
 
 
 @pytest.mark.slow  # draws six pictures anew
@@ -176,7 +172,7 @@ def test_no_fiducials_in_any_picture_of_a_camera_is_refused(tmp_path):
     for name in pictures():
         if name.startswith("cam1"):
             redrawn(tmp_path, name, small=((0, 0), (3, 0), (0, 2)))
-    refused(path, r"cam1: expected pictures of the plate, got none of 6; the first: .*larger dots")
+    refused(path, "cam1: .* none of 6; .*larger dots")
 
 
 @pytest.mark.slow
@@ -186,9 +182,9 @@ def test_a_grid_of_another_size_is_refused_or_does_no_harm(source, tmp_path, col
     plate = document()["plate"] | {"columns": columns, "rows": rows}
     path = write(tmp_path, {"plate": plate})
     if columns < 11:
-        refused(path, r"cam1: expected pictures of the plate, got none of 6; the first: .*7")
+        refused(path, "cam1: .* none of 6; .*7")
     else:
-        assert cube_error_mm(calibrate_cameras(path).cameras, true_cameras()) < 0.01
+        assert triangulated_error_mm(calibrate_cameras(path).cameras, true_cameras()) < 0.01
 
 
 def write_empty(folder):
@@ -203,47 +199,31 @@ def write_empty(folder):
 def test_pictures_of_another_size_are_refused_before_any_work(tmp_path):
     path = write_empty(tmp_path)
     cv2.imwrite(str(tmp_path / "cam2_03.png"), np.zeros((200, 300), np.uint8))
-    refused(path, r"cam2_03.png: expected 480 x 400 px, got 300 x 200 px; correct image_size")
+    refused(path, "cam2_03.png: .* got 300 x 200")
 
 
 def test_pictures_that_are_missing_or_none_are_refused(tmp_path):
     path = write_empty(tmp_path)
     (tmp_path / "cam1_01.png").unlink()
-    refused(path, r"cam1_01.png: expected a picture, got no such file")
+    refused(path, "cam1_01.png: .* no such file")
     (tmp_path / "cam1_01.png").write_text("no picture")
-    refused(path, r"cam1_01.png: expected a picture, got a file that is no picture or too large")
+    refused(path, "cam1_01.png: .* no picture")
     (tmp_path / "cam1_01.png").write_bytes(b"")
-    refused(path, r"cam1_01.png: expected a picture, got a file that is no picture or too large")
+    refused(path, "cam1_01.png: .* no picture")
 
 
 @pytest.mark.slow
 def test_poses_too_alike_are_refused_and_the_loose_parameter_is_named(tmp_path):
     entries = [{"pose": row, "cam1": "cam1_00.png", "cam2": "cam2_00.png"} for row in range(4)]
     path = write(tmp_path, {"pictures": entries})
-    refused(path, r"expected poses that determine all parameters.*got loose: .*cam[12]\.\w+ \(sigma .*add pictures")
-
-
-@pytest.mark.slow
-def test_two_pictures_are_too_few(tmp_path):
-    path = write(tmp_path, {"pictures": document()["pictures"][:2]})
-    refused(path, r"3 pictures or more")
-
-
-def table_of(camera, points, noise_px=0.02, seed=0):
-    uv = camera.project(points).numpy() + noise_px * np.random.default_rng(seed).normal(size=(len(points), 2))
-    rows = [",".join(f"{number:.6f}" for number in row) for row in np.column_stack([points.numpy(), uv])]
-    return "\n".join(["x,y,z,u,v", *rows])
+    refused(path, r"got loose: .*cam[12]\.\w+ \(sigma")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["tsai", "brown", "pinhole"])
 def test_cameras_come_out_of_tables_of_points(tmp_path, model):
-    points = 35 * (2 * torch.rand(80, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
-    for name, camera in true_cameras().items():
-        (tmp_path / f"{name}.csv").write_text(table_of(camera, points))
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv", "cam2": "cam2.csv"}}
-    result = calibrate_cameras(write(tmp_path, keys | {"model": model}, drawn=False))
-    assert cube_error_mm(result.cameras, true_cameras()) < 0.05
+    result = calibrate_cameras(write_tables(tmp_path, model=model))
+    assert triangulated_error_mm(result.cameras, true_cameras()) < 0.05
     assert result.rms_px("cam1") < 0.05
     calibration_figure(result, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").is_file()
@@ -251,20 +231,17 @@ def test_cameras_come_out_of_tables_of_points(tmp_path, model):
 
 
 def test_a_table_with_a_wrong_row_names_it_as_an_outlier(tmp_path):
-    points = 35 * (2 * torch.rand(80, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
-    lines = table_of(true_cameras()["cam1"], points).splitlines()
+    path = write_tables(tmp_path, points={"cam1": "cam1.csv"})
+    lines = (tmp_path / "cam1.csv").read_text().splitlines()
     start, _, last = lines[8].rpartition(",")
     lines[8] = f"{start},{float(last) + 3.0}"
     (tmp_path / "cam1.csv").write_text("\n".join(lines))
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv"}}
-    result = calibrate_cameras(write(tmp_path, keys, drawn=False))
+    result = calibrate_cameras(path)
     assert np.flatnonzero(~result.pictures[0].used).tolist() == [7]
 
 
 def test_too_few_points_are_refused_with_the_table_s_name(tmp_path):
-    (tmp_path / "cam1.csv").write_text("x,y,z,u,v\n1,2,3,4,5\n2,3,4,5,6\n")
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv"}}
-    refused(write(tmp_path, keys, drawn=False), r"cam1.csv, points")
+    refused(write_tables(tmp_path, count=2), "cam1.csv, points")
 
 
 @pytest.mark.slow
@@ -278,13 +255,8 @@ def test_a_wall_that_does_not_stand_before_the_camera_is_refused(tmp_path):
 def test_a_tie_needs_a_pose_that_somebody_knows(source, result):
     document = load_calibration(source)
     views = see_pictures(document, lambda stage, done, total: None)
-    assert tie_floating(document, _rig(result), views) == {}
-
-
-def _rig(result):
-    from sphereorient.calibration.bundle import Rig
-
-    return Rig(cameras=result.cameras, R_lab_plate=result.R_lab_plate, T_lab_plate_mm=result.T_lab_plate_mm)
+    rig = Rig(cameras=result.cameras, R_lab_plate=result.R_lab_plate, T_lab_plate_mm=result.T_lab_plate_mm)
+    assert tie_floating(document, rig, views) == {}
 
 
 @pytest.mark.shared

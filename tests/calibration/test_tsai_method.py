@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from camera_examples import behind_port, f64, port, tsai, turned
-from conftest import assert_close
+from conftest import assert_close, slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -68,20 +68,23 @@ PLACES = {"space": in_space, "plane": in_plane}
 
 
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("kappa1", [0.0, 2.2e-4, 2e-3, -2e-3])
+@pytest.mark.parametrize("kappa1", [0.0, slow(2.2e-4), slow(2e-3), -2e-3])
 def test_a_planted_camera_comes_back(place, kappa1):
     camera, points = planted(kappa1=kappa1), PLACES[place]()
     assert_same_camera(calibrate_tsai(points, camera.project(points), SIZE, PITCH), camera)
 
 
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("T_mm", [(0.0, 0.0, 520.0), (0.0, 25.0, 520.0), (25.0, 0.0, 520.0), (400.0, -9e3, 9e2)])
+@pytest.mark.parametrize(
+    "T_mm", [(0.0, 0.0, 520.0), slow((0.0, 25.0, 520.0)), slow((25.0, 0.0, 520.0)), (400.0, -9e3, 9e2)]
+)
 def test_it_does_not_matter_where_the_labs_origin_appears(place, T_mm):
-    camera = planted(T_cam_lab_mm=f64((3.0, -4.0, 520.0)))
+    pitch = (0.02, 0.025)
+    camera = planted(T_cam_lab_mm=f64((3.0, -4.0, 520.0)), pixel_pitch_mm=f64(pitch))
     shift = camera.R_cam_lab.mT @ (camera.T_cam_lab_mm - f64(T_mm))  # the same scene in another lab
     moved = replace(camera, T_cam_lab_mm=f64(T_mm))
     points = PLACES[place]() + shift
-    assert_same_camera(calibrate_tsai(points, moved.project(points), SIZE, PITCH), moved, tolerance=1e-7)
+    assert_same_camera(calibrate_tsai(points, moved.project(points), SIZE, pitch), moved, tolerance=1e-7)
 
 
 @pytest.mark.slow
@@ -169,17 +172,11 @@ def test_the_centre_and_sx_are_found_where_they_are_asked_for():
     assert rms_px(held, points, pixels) > 0.3
 
 
-def test_pixels_that_are_not_square_are_taken_into_account():
-    camera = planted(pixel_pitch_mm=f64((0.02, 0.025)))
-    points = in_space()
-    assert_same_camera(calibrate_tsai(points, camera.project(points), SIZE, (0.02, 0.025)), camera)
-
-
-@pytest.mark.parametrize("relief_mm", [0.02, 0.1, 0.3, 1.0])
-def test_a_plate_that_is_not_quite_flat_is_taken_as_it_is(relief_mm):
+@pytest.mark.parametrize(("relief_mm", "tilt_rad"), [(0.02, 0.4), (0.3, 0.4), (1.0, 0.4), (0.0, 0.1)])
+def test_a_plate_that_is_not_quite_flat_or_hardly_tilted_is_taken_as_it_is(relief_mm, tilt_rad):
     plane = in_plane()
     heights = torch.randn(len(plane), 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    points, camera = plane + relief_mm * heights * turned((0.1, 0.3, -0.4))[:, 2], square_on(0.4)
+    points, camera = plane + relief_mm * heights * turned((0.1, 0.3, -0.4))[:, 2], square_on(tilt_rad)
     assert_same_camera(calibrate_tsai(points, camera.project(points), SIZE, PITCH), camera)
     found = calibrate_tsai(points, noisy(camera, points), SIZE, PITCH)
     assert float(found.f_mm) == pytest.approx(45.0, abs=4 * found.covariance.sigmas["f"])
@@ -217,13 +214,7 @@ def test_a_plane_parallel_to_the_sensor_is_refused(tilt_rad, sigma_px):
     assert "\n" not in str(refused.value)
 
 
-def test_a_plane_at_six_degrees_is_enough():
-    points, camera = in_plane(), square_on(0.1)
-    found = calibrate_tsai(points, noisy(camera, points), SIZE, PITCH)
-    assert float(found.f_mm) == pytest.approx(45.0, abs=4 * found.covariance.sigmas["f"])
-
-
-@pytest.mark.parametrize("mirror", [(-1, 1, 1), (1, -1, 1), (1, 1, -1)])
+@pytest.mark.parametrize("mirror", [(-1, 1, 1), slow((1, -1, 1)), slow((1, 1, -1))])
 def test_mirrored_points_are_refused(mirror):
     points, camera = in_space(), planted()
     with pytest.raises(CameraError, match="mirror image"):
@@ -232,9 +223,8 @@ def test_mirrored_points_are_refused(mirror):
 
 def test_pixels_of_other_points_are_refused():
     points, camera = in_space(), planted()
-    for order in (torch.arange(60).roll(1), torch.arange(59, -1, -1)):
-        with pytest.raises(CameraError, match="order"):
-            calibrate_tsai(points, camera.project(points)[order], SIZE, PITCH)
+    with pytest.raises(CameraError, match="order"):
+        calibrate_tsai(points, camera.project(points).roll(1, 0), SIZE, PITCH)
     far = camera.project(points)
     far[5] += 100.0
     with pytest.raises(CameraError, match="rms"):
@@ -244,7 +234,7 @@ def test_pixels_of_other_points_are_refused():
 def test_too_few_points_are_refused_and_just_enough_are_not():
     camera, space, plane = planted(), in_space(), in_plane()[[0, 12, 84, 156, 30]]
     for points, line in (
-        (space[:6], "expected 7 or more in space, got 6"),
+        (space[:6], "7 or more in space"),
         (plane[:4], "5 or more"),
         (plane[:0], "5 or more"),
     ):
@@ -271,7 +261,7 @@ def test_numbers_that_are_not_finite_are_refused_with_their_row(bad):
     for which, name in ((0, "x_lab_mm"), (1, "uv_px")):
         arrays = [points.clone(), pixels.clone()]
         arrays[which][3, 1] = bad
-        with pytest.raises(CameraError, match=f"{name}, row 3: expected finite numbers"):
+        with pytest.raises(CameraError, match=f"{name}, row 3"):
             calibrate_tsai(*arrays, SIZE, PITCH)
 
 
@@ -280,7 +270,7 @@ def test_arrays_of_other_shapes_and_impossible_sensors_are_refused():
     pixels = planted().project(points)
     with pytest.raises(ShapeError, match="60 points and 59 pixels"):
         calibrate_tsai(points, pixels[1:], SIZE, PITCH)
-    with pytest.raises(ShapeError, match=r"x_lab_mm: expected shape \(n, 3\)"):
+    with pytest.raises(ShapeError, match="x_lab_mm: expected shape"):
         calibrate_tsai(points[None], pixels[None], SIZE, PITCH)
     with pytest.raises(CameraError, match="pixel_pitch_mm: expected above zero"):
         calibrate_tsai(points, pixels, SIZE, (0.02, 0.0))
@@ -291,7 +281,7 @@ def test_arrays_of_other_shapes_and_impossible_sensors_are_refused():
 def test_parameters_that_cannot_be_fitted_are_refused():
     square, points = planted(kappa1=0.0), in_space()  # without distortion one scale of f and both pitches is open
     names = ("f", "pixel_pitch_u", "pixel_pitch_v", *ROTATION, *TRANSLATION)
-    with pytest.raises(CameraError, match="expected a determined camera, got no information on f, pixel_pitch_u"):
+    with pytest.raises(CameraError, match="no information on f, pixel_pitch_u"):
         fit_to_points(square, names, points, square.project(points))
-    with pytest.raises(CameraError, match="expected 5 or more for 9 parameters, got 4"):
+    with pytest.raises(CameraError, match="5 or more for 9"):
         fit_to_points(square, names, points[:4], square.project(points[:4]))

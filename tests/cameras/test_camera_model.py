@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -23,8 +25,9 @@ from conftest import assert_close
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sphereorient.cameras import Camera, TsaiCamera, centre_lab_mm, perspective_centre_lab_mm, sphere_radius_px
-from sphereorient.errors import ShapeError
+from sphereorient.cameras import Camera, centre_lab_mm, perspective_centre_lab_mm, sphere_radius_px
+from sphereorient.cameras.model import focal_of_field, middle_of_picture
+from sphereorient.errors import CameraError, ShapeError
 
 CAMERAS = {
     "tsai": tsai(),
@@ -35,6 +38,8 @@ CAMERAS = {
     "fisheye": fisheye(),
     "telecentric": telecentric(),
 }
+WALLS = {f"{name}, port": behind_port(CAMERAS[name]) for name in ("tsai", "openptv", "fisheye", "telecentric")}
+CAMERAS |= WALLS
 
 
 @pytest.fixture(params=CAMERAS.values(), ids=CAMERAS)
@@ -99,11 +104,11 @@ def test_a_batch_is_the_stack_of_its_singles(camera, rng, dtype, batch):
     assert uv_px.shape == (*batch, 2)
     assert rays.origin_lab_mm.shape == rays.direction_lab.shape == (*batch, 3)
     assert uv_px.dtype == rays.origin_lab_mm.dtype == rays.direction_lab.dtype == dtype
-    assert_close(uv_px.double(), camera.project(x_lab_mm.double()), atol=1e-3 if dtype == torch.float32 else 0.0)
+    assert_close(uv_px.double(), camera.project(x_lab_mm.double()), atol=2e-3 if dtype == torch.float32 else 0.0)
     for point, uv, direction in zip(
         x_lab_mm.reshape(-1, 3), uv_px.reshape(-1, 2), rays.direction_lab.reshape(-1, 3), strict=True
     ):
-        assert_close(camera.project(point), uv, atol=1e-3 if dtype == torch.float32 else 1e-10)
+        assert_close(camera.project(point), uv, atol=2e-3 if dtype == torch.float32 else 1e-10)
         assert_close(camera.rays(uv).direction_lab, direction, atol=1e-6 if dtype == torch.float32 else 1e-12)
 
 
@@ -111,7 +116,7 @@ def test_gradients_with_respect_to_points_and_pixels_are_right(camera, rng):
     x_lab_mm = points(rng, 5).requires_grad_()
     assert torch.autograd.gradcheck(camera.project, x_lab_mm)
     uv_px = camera.project(x_lab_mm).detach().requires_grad_()
-    assert torch.autograd.gradcheck(lambda uv: camera.rays(uv).direction_lab, uv_px)
+    assert torch.autograd.gradcheck(lambda uv: (camera.rays(uv).origin_lab_mm, camera.rays(uv).direction_lab), uv_px)
 
 
 def test_a_point_on_the_axis_has_finite_gradients_even_of_second_order(dtype):
@@ -124,7 +129,7 @@ def test_a_point_on_the_axis_has_finite_gradients_even_of_second_order(dtype):
     assert torch.isfinite(second).all()
 
 
-@pytest.mark.parametrize("camera", [each for name, each in CAMERAS.items() if name not in ("fisheye", "telecentric")])
+@pytest.mark.parametrize("camera", list(CAMERAS.values())[:5])
 def test_a_point_behind_the_camera_has_no_picture_and_no_gradient(camera):
     centre = camera.rays(f64((0.0, 0.0))).origin_lab_mm
     axis_lab = camera.R_cam_lab[2]
@@ -149,23 +154,21 @@ def test_R_cam_lab_takes_lab_axes_to_camera_axes_and_v_counts_downwards():
 
 
 def test_parameters_given_as_plain_numbers_keep_all_their_digits():
-    camera = TsaiCamera(
-        image_size=(650, 480),
-        R_cam_lab=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        T_cam_lab_mm=[0.1, 0.2, 0.3],
-        centre_px=(324.1, 239.7),
-        f_mm=45.1,
-        pixel_pitch_mm=(0.02, 0.021),
-        sx=1.03,
-        kappa1=2.2e-4,
-    )
+    camera = tsai(T_cam_lab_mm=[0.1, 0.2, 0.3], f_mm=45.1)
     assert camera.f_mm.item() == 45.1
     assert camera.T_cam_lab_mm.tolist() == [0.1, 0.2, 0.3]
 
 
+@pytest.mark.parametrize("model", [pinhole, brown, fisheye, telecentric])
+def test_a_focal_length_and_a_scale_are_above_zero(model):
+    name = "scale_mm_px" if model is telecentric else "f_px"
+    with pytest.raises(CameraError, match=f"{name}: expected above zero"):
+        model(**{name: -getattr(model(), name)})
+
+
 @pytest.mark.parametrize("method", ["project", "rays", "distort", "undistort"])
 def test_another_last_axis_is_refused(camera, method):
-    with pytest.raises(ShapeError, match=r"expected shape \(\.\.\., [23]\), got \(5, 4\)"):
+    with pytest.raises(ShapeError, match="expected shape"):
         getattr(camera, method)(torch.zeros(5, 4))
 
 
@@ -176,7 +179,7 @@ def test_whole_numbers_are_refused_because_the_camera_would_be_rounded(camera):
 
 @pytest.mark.parametrize("kind", ["pinhole", "tsai", "fisheye", "port", "telecentric"])
 def test_lines_of_sight_about_a_point_meet_in_its_perspective_centre(kind):
-    lens = behind_port(pinhole()) if kind == "port" else (CAMERAS | {"telecentric": telecentric()})[kind]
+    lens = (CAMERAS | {"port": behind_port(pinhole())})[kind]
     X = f64([[4.0, -3.0, 6.0], [0.0, 0.0, 0.0]])
     centre = perspective_centre_lab_mm(lens, X)
     assert centre.shape == X.shape
@@ -191,3 +194,25 @@ def test_lines_of_sight_about_a_point_meet_in_its_perspective_centre(kind):
     # A small sphere's picture is as large as from there: the width of a pixel grows with the distance from it.
     near, far = (sphere_radius_px(lens, X + move * towards, 0.1) for move in (-1.0, 1.0))
     assert_close(near / far, ((X - centre).norm(dim=-1) + 1) / ((X - centre).norm(dim=-1) - 1), atol=3e-3)
+
+
+def test_the_field_of_view_is_that_of_the_full_height():
+    f_px = focal_of_field(288, 45.0)
+    assert f_px == pytest.approx(347.6467, abs=1e-4)  # 144 / tan(22.5 degrees)
+    camera = pinhole(
+        image_size=(384, 288), f_px=f64(f_px), centre_px=middle_of_picture((384, 288)),
+        R_cam_lab=torch.eye(3, dtype=torch.float64),
+    )  # fmt: skip
+    top, bottom = camera.rays(f64([(191.5, -0.5), (191.5, 287.5)])).direction_lab
+    assert math.degrees(torch.acos(top @ bottom)) == pytest.approx(45.0, abs=1e-9)
+    assert abs(191.5 / math.tan(math.radians(22.5)) - f_px) > 100  # the width would give another
+
+
+def test_the_middle_of_a_picture_lies_between_its_outer_pixel_centres():
+    assert_close(middle_of_picture((384, 288)), f64((191.5, 143.5)))
+
+
+@pytest.mark.parametrize("vfov_deg", [0.0, -3.0, 180.0, math.nan])
+def test_an_impossible_field_of_view_is_refused(vfov_deg):
+    with pytest.raises(CameraError, match="vfov_deg: expected an angle"):
+        focal_of_field(288, vfov_deg)

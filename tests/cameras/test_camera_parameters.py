@@ -87,24 +87,24 @@ def test_a_sample_of_the_covariance_moves_the_camera_by_what_it_says(rng):
 
 def test_unknown_and_repeated_names_are_refused_in_one_line():
     one, two = f64([0.1]), f64([0.1, 0.2])
-    with pytest.raises(CameraError, match=r"parameter: expected one of f, .* got 'kapa1'; write 'kappa1' instead"):
+    with pytest.raises(CameraError, match="write 'kappa1'"):
         with_parameters(tsai(), ("kapa1",), one)
     with pytest.raises(CameraError, match="got 'port_offset'"):
         with_parameters(tsai(), ("port_offset",), one)
-    with pytest.raises(CameraError, match="expected different names, got f, f"):
+    with pytest.raises(CameraError, match="different names"):
         with_parameters(tsai(), ("f", "f"), two)
     with pytest.raises(ShapeError, match="delta: expected shape"):
         with_parameters(tsai(), ("f",), two)
     with pytest.raises(CameraError, match="f_mm: expected above zero"):
         with_parameters(tsai(), ("f",), f64([-50.0]))
-    with pytest.raises(CameraError, match="expected a model that names its parameters, got object"):
+    with pytest.raises(CameraError, match="got object"):
         parameter_names(object())
 
 
 def test_a_covariance_that_is_none_is_refused():
-    with pytest.raises(CameraError, match=r"expected 2 rows of 2 numbers, got shape \(1, 1\)"):
+    with pytest.raises(CameraError, match="2 rows of 2"):
         ParameterCovariance(names=("f", "sx"), matrix=f64([[1.0]]))
-    with pytest.raises(CameraError, match="expected different names, got none"):
+    with pytest.raises(CameraError, match="different names"):
         ParameterCovariance(names=(), matrix=torch.zeros(0, 0))
     with pytest.raises(CameraError, match="finite numbers"):
         ParameterCovariance(names=("f",), matrix=f64([[float("nan")]]))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from camera_examples import f64
 from conftest import assert_close
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +17,7 @@ from sphereorient.errors import ShapeError
 Z = f64((0.0, 0.0, 1.0))
 
 
+@settings(deadline=None)
 @given(x=st.floats(-3, 3), y=st.floats(-3, 3), z=st.floats(0.1, 3))
 def test_it_is_the_turn_about_z_cross_direction_that_scipy_makes(x, y, z):
     axis = np.array([-y, x, 0.0])
@@ -31,22 +32,6 @@ def test_its_last_column_is_the_direction_to_the_sphere():
     assert_close(R, f64([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]))
     # The paper's R_persp, read in a frame with z forward, turns the other way: its transpose fails.
     assert not torch.allclose(R.mT @ Z, f64((0.6, 0.0, 0.8)))
-
-
-def test_it_does_not_turn_about_the_line_of_sight(rng):
-    direction = torch.randn(50, 3, generator=rng, dtype=torch.float64).abs()
-    rotvec = Rotation.from_matrix(R_cam_view(direction).numpy()).as_rotvec()
-    assert np.abs(rotvec[:, 2]).max() < 1e-12
-
-
-def test_it_is_a_rotation_in_both_float_types(rng, dtype, tolerance):
-    direction = torch.randn(500, 3, generator=rng, dtype=torch.float64)
-    direction = torch.where(direction[:, 2:] > -2.5, direction, -direction).to(dtype)
-    direction = direction[direction[:, 2] > -0.9 * direction.norm(dim=-1)]
-    R = R_cam_view(direction)
-    assert R.dtype == dtype
-    assert_close(R @ R.mT, torch.eye(3, dtype=dtype).expand_as(R), atol=tolerance * 5)
-    assert_close(torch.linalg.det(R), torch.ones(len(R), dtype=dtype), atol=tolerance * 5)
 
 
 @pytest.mark.parametrize("aside", [0.0, 1e-30, 1e-9, 1e-4])
@@ -76,12 +61,13 @@ def test_a_batch_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
     direction = torch.rand(*batch, 3, generator=rng, dtype=torch.float64).to(dtype) + 0.1
     R = R_cam_view(direction)
     assert R.shape == (*batch, 3, 3)
+    assert R.dtype == dtype
     for single, expected in zip(direction.reshape(-1, 3), R.reshape(-1, 3, 3), strict=True):
         assert_close(R_cam_view(single), expected, atol=tolerance)
 
 
 def test_another_last_axis_is_refused():
-    with pytest.raises(ShapeError, match=r"direction_cam: expected shape \(\.\.\., 3\)"):
+    with pytest.raises(ShapeError, match="direction_cam: expected shape"):
         R_cam_view(torch.zeros(4, 2))
 
 

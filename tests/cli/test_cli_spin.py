@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from overlay_examples import command
 from spin_examples import dot_directions, photograph, spinning
 
 from sphereorient import so3
-from sphereorient.cli import main
 
 STEP_S = 0.004
 OMEGA = torch.tensor([30.0, 250.0, -80.0], dtype=torch.float64)
-
-
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["sphereorient", "spin", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    printed = capsys.readouterr()
-    return int(stop.value.code or 0), printed.out, printed.err
 
 
 @pytest.fixture
@@ -48,8 +39,8 @@ def options(folder):
 
 @pytest.mark.slow
 def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
-    code, said, err = run(
-        monkeypatch, capsys, flight / "pictures", *options(flight), "--dot-radius", 7, "--omega-max", 700
+    code, said, err = command(
+        monkeypatch, capsys, "spin", flight / "pictures", *options(flight), "--dot-radius", 7, "--omega-max", 700
     )
     assert code == 0, err
     result = json.loads((flight / "spin.json").read_text())
@@ -80,7 +71,7 @@ def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
 def test_inputs_that_are_damaged_are_refused_in_one_line(flight, monkeypatch, capsys, changed, says):
     for name, content in changed.items():
         (flight / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    code, _, err = run(monkeypatch, capsys, flight / "pictures", *options(flight))
+    code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures", *options(flight))
     assert code == 2
     assert says in err
     assert err.count("\n") == 1
@@ -99,16 +90,18 @@ def test_inputs_that_are_damaged_are_refused_in_one_line(flight, monkeypatch, ca
     ],
 )
 def test_options_that_are_impossible_are_refused_in_one_line(flight, monkeypatch, capsys, arguments, says):
-    code, _, err = run(monkeypatch, capsys, flight / "pictures", *options(flight), *arguments)
+    code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures", *options(flight), *arguments)
     assert code == 2
     assert says in err
     assert err.count("\n") == 1
 
 
 def test_too_few_photographs_and_missing_ones_are_refused(flight, monkeypatch, capsys):
-    code, _, err = run(monkeypatch, capsys, flight / "pictures" / "0.png", *options(flight))
+    code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures" / "0.png", *options(flight))
     assert code == 2
     assert "3 photographs at least, got 1" in err
-    code, _, err = run(monkeypatch, capsys, *(flight / "pictures" / f"{k}.png" for k in (0, 1, 9)), *options(flight))
+    code, _, err = command(
+        monkeypatch, capsys, "spin", *(flight / "pictures" / f"{k}.png" for k in (0, 1, 9)), *options(flight)
+    )
     assert code == 2
     assert "9.png" in err

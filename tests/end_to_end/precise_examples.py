@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -122,20 +121,3 @@ def rotation_error(track: Trajectory, movies: Movies) -> Floats:
     """Return delta of R_true = exp(delta) R, (N, 3), rad."""
     turn = torch.from_numpy(movies.R_lab_body) @ torch.from_numpy(track.orientation).mT
     return np.asarray(so3.log(torch.nan_to_num(turn)).numpy())
-
-
-def report(name: str, track: Trajectory, movies: Movies, rows: Any = slice(None)) -> None:
-    """Append the figures of a run to the file that PRECISE_FIGURES names, if it names one."""
-    if "PRECISE_FIGURES" not in os.environ:
-        return
-    off = turned_off(track, movies)[rows]
-    place = np.linalg.norm(track.position - movies.position_mm, axis=1)[rows]
-    valid = track.valid[rows]
-    fits, places = np.percentile(off[valid], [50, 95, 100]), np.percentile(place[valid], [50, 95])
-    line = (
-        f"{name:44s} p50/p95/max {fits[0]:.3f} {fits[1]:.3f} {fits[2]:.3f} deg; place {places[0]:.4f} {places[1]:.4f} "
-        f"mm; lost {(~valid).sum()} of {len(valid)}; over 1 deg {(off[valid] > 1).sum()}; "
-        f"segments {track.segment.max() + 1}"
-    )
-    with Path(os.environ["PRECISE_FIGURES"]).open("a") as file:
-        file.write(line + "\n")

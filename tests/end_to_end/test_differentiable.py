@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from dataclasses import dataclass
-from types import ModuleType
 
 import pytest
 import torch
@@ -245,17 +242,6 @@ def test_what_does_not_belong_together_is_refused(rng):
 # --- the example and its page
 
 
-def example() -> ModuleType:
-    path = REPO / "scripts" / "example_differentiable.py"
-    spec = importlib.util.spec_from_file_location("example_differentiable", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_code_of_the_page_is_the_scripts():
     script = (REPO / "scripts" / "example_differentiable.py").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```$", (REPO / "docs" / "differentiable.md").read_text(), re.M | re.S)
@@ -266,7 +252,9 @@ def test_the_code_of_the_page_is_the_scripts():
 
 @pytest.mark.slow  # two minutes of descent
 def test_a_camera_angle_and_a_paint_error_are_recovered_from_a_movie():
-    first, *_, last = example().recover(30).seen
+    from example_differentiable import recover
+
+    first, *_, last = recover(30).seen
     loss, angle_deg, texels, track_deg = range(4)
     assert first[angle_deg] == pytest.approx(0.3, abs=0.01)
     assert last[angle_deg] < 0.4 * first[angle_deg]

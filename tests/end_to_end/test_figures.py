@@ -51,6 +51,7 @@ def test_a_table_goes_between_its_marks_and_nowhere_else(tmp_path):
 
 def test_the_page_of_figures_is_read_as_it_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "PAGE", tmp_path / "figures.md")
+    monkeypatch.setattr(figures, "FIGURES", dict(list(figures.FIGURES.items())[:2]))
     name = next(iter(figures.FIGURES))
     made = figures.Made("2026-11-27", "abc1234", "12", figures.code_of(figures.FIGURES[name]))
     figures.write_page({name: made})

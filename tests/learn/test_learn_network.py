@@ -141,14 +141,6 @@ def test_grey_levels_of_any_scale_give_the_same(rng):
     assert_close(scaled, plain, atol=1e-4)
 
 
-def test_a_disk_does_not_depend_on_the_others(rng):
-    disks = 100 * torch.rand(4, 24, 24, generator=rng)
-    with torch.no_grad():
-        together = untrained().seen(disks)
-        alone = torch.cat([untrained().seen(disk[None]) for disk in disks])
-    assert_close(alone, together, atol=1e-4)
-
-
 def test_a_dark_disk_gives_finite_logits():
     blurs = map_blurs(random_texture("blobs", 4, 64)[None], untrained().settings.nodes)[0]
     with torch.no_grad():
