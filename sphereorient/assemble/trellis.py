@@ -166,10 +166,11 @@ def _laid_out(
     before = places_before(mask)
     edges = like.new_zeros((*mask.shape, width)) if edge_cost is None else rows(edge_cost, 1)
     edges = edges if node_cost is None else edges + rows(node_cost, 0)[..., None, :]
-    edges = torch.where(before[..., :, None] & mask[..., None, :], edges, torch.inf)
+    there = before[..., :, None] & mask[..., None, :]
     if triple_cost is not None:
         edges = rows(triple_cost, 2) + edges[..., None, :, :]
-        edges = torch.where(places_before(before)[..., :, None, None], edges, torch.inf)
+        there = places_before(before)[..., :, None, None] & there[..., None, :, :]
+    edges = torch.where(there, edges, torch.inf)
     # Finite walls: differences of infinities would be NaN. Costs are far smaller.
     state = edges.shape[mask.ndim - 1 : -1]
     start = edges.new_full((math.prod(state),), _wall(edges))

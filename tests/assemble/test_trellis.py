@@ -16,7 +16,7 @@ from torch import Tensor
 from trellis_examples import ORDERS, Costs, all_paths, batched, cheapest, even_costs, random_costs, soft
 
 from sphereorient import so3
-from sphereorient.assemble import edge_costs, shortest_path
+from sphereorient.assemble import edge_costs, shortest_path, soft_path
 from sphereorient.errors import ShapeError
 
 SEEDS = range(6)
@@ -146,6 +146,17 @@ def test_what_stands_on_edges_of_masked_candidates_does_not_matter(poison):
     assert_close(dirty.cost.detach(), clean.cost)
     dirty.cost.backward()
     assert torch.isfinite(spoilt.grad).all()
+
+
+@pytest.mark.parametrize("poison", [torch.inf, torch.nan, -100.0], ids=str)
+def test_what_stands_on_triples_of_masked_candidates_does_not_matter(poison, rng):
+    cost = torch.rand(8, 3, 3, 3, dtype=torch.float64, generator=rng)
+    mask = torch.arange(3) != torch.randint(0, 3, (10, 1), generator=rng)
+    usable = mask[:-2, :, None, None] & mask[1:-1, None, :, None] & mask[2:, None, None, :]
+    spoilt = torch.where(usable, cost, poison)
+    clean, dirty = (soft_path(None, mask, triple_cost=one) for one in (cost, spoilt))
+    assert_close(dirty.marginals, clean.marginals)
+    assert torch.equal(*(shortest_path(None, mask, triple_cost=one).choice for one in (cost, spoilt)))
 
 
 @ORDERS
