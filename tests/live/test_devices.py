@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 from fake_makers import GONE, MAKERS, TIMEOUT, Body, install
-from live_examples import EXCERPT, until
+from live_examples import EXCERPT, excerpt_opened, until
 from overlay_examples import true_track
 from typer.testing import CliRunner
 
@@ -31,9 +31,7 @@ from sphereorient.experiment.experiment import DeviceKeys
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.live.feed import Feed
 from sphereorient.live.live import measured
-from sphereorient.live.loop import open_live
 from sphereorient.live.sources import source_of
-from sphereorient.methods.settings import Settings
 from sphereorient.movies import open_movie
 
 HEIGHT = WIDTH = 650
@@ -452,7 +450,7 @@ def test_a_movie_with_a_rotation_tag_comes_as_track_reads_it(angle, tmp_path):
 
 
 @pytest.mark.slow  # two seconds of a film, and its set-up
-def test_two_cameras_in_step_give_right_poses(monkeypatch):
+def test_two_cameras_in_step_give_right_poses(monkeypatch, tmp_path_factory):
     order, told = [*range(40), *range(38, -1, -1)], []
 
     def film(pictures: list[np.ndarray], seed: int, lost: int, twice: int) -> Iterator[Any]:
@@ -464,7 +462,7 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch):
             for _ in range((n != lost) + (n == twice)):
                 yield pictures[k], zero_s + (1 + 5e-5 * seed) * 0.025 * n, n + 1
 
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         movies = [[picture for picture, _ in stream.pictures()] for stream in opened.recording.streams]
         first, second = body(serial="a"), body(serial="b")
         begun_s = time.perf_counter() + 0.5
