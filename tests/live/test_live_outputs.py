@@ -196,17 +196,6 @@ def test_a_zmq_subscriber_that_does_not_read_loses_lines_and_takes_no_time(publi
         assert 0 < count < 50_000
 
 
-def test_a_zmq_port_in_use_is_told(published):
-    with pytest.raises(OutputError, match="expected a free port"):
-        ZmqOutput("127.0.0.1", published.port)
-
-
-def test_without_zeromq_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "zmq", None)
-    with pytest.raises(OutputError, match=r"pip install 'sphereorient\[live\]'"):
-        ZmqOutput("127.0.0.1", 5555)
-
-
 @pytest.fixture
 def line():
     """A pseudo terminal: the end that a program reads, and the name of the other one."""
@@ -313,14 +302,6 @@ def test_an_osc_reader_gets_a_message_a_frame_in_order():
     assert got[1] == pytest.approx([float(value) for value in numbers(1).values()], nan_ok=True, abs=1e-3)
 
 
-def test_an_osc_reader_that_is_not_there_holds_nothing_up():
-    pytest.importorskip("pythonosc", reason="the extra `live`")
-    output = OscOutput("127.0.0.1", 9)
-    for k in range(LINES):
-        output.send(numbers(k))
-    output.close()
-
-
 @pytest.fixture
 def stream():
     pytest.importorskip("pylsl", reason="the extra `live`")
@@ -386,7 +367,8 @@ def test_lsl_times_are_those_of_the_source_less_the_least_delay(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [("serial", "serial:/dev/x@9600"), ("pylsl", "lsl:x"), ("pythonosc", "osc:9")]
+    ("kind", "name"),
+    [("serial", "serial:/dev/x@9600"), ("pylsl", "lsl:x"), ("pythonosc", "osc:9"), ("zmq", "zmq:5555")],
 )
 def test_without_its_package_an_output_names_the_extra(kind, name, monkeypatch):
     for module in [kind, *(one for one in sys.modules if one.startswith(f"{kind}."))]:

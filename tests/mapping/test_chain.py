@@ -110,12 +110,6 @@ def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
     assert float(taken) < 0.01 * float(disks.layers[:, :, 0].square().mean())
 
 
-def test_the_same_pictures_give_the_same_bytes():
-    disks = disks_of_pictures(pictures(turning(6, 8.0)))
-    one, two = (find_chain(disks, MapSettings()).R_lab_body for _ in range(2))
-    assert torch.equal(one, two)
-
-
 def refused(whole):
     with pytest.raises(PaintError) as told:
         find_chain(disks_of_pictures(whole), MapSettings())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 import time
 from pathlib import Path
 
@@ -14,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 from map_examples import QUICK, rewrite, save_map, unpainted, warped
+from overlay_examples import command as run
 
 from sphereorient import so3
-from sphereorient.cli import main
 from sphereorient.cli.app import progress_bar
 from sphereorient.experiment.recording import open_recording
 from sphereorient.movies import open_movie
@@ -25,14 +24,6 @@ from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.sphere.compare import compare_maps
 from sphereorient.sphere.texture import random_texture
 from sphereorient.trajectory import Trajectory
-
-
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["sphereorient", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    printed = capsys.readouterr()
-    return int(stop.value.code or 0), printed.out, printed.err
 
 
 def refused(monkeypatch, capsys, *arguments: object) -> str:

@@ -69,12 +69,6 @@ def test_the_order_of_the_pictures_does_not_matter():
 
 
 @pytest.mark.slow
-def test_the_same_photographs_give_the_same_bytes():
-    whole = pictures(random_attitudes(8, 4))
-    assert torch.equal(found_in(whole).R_lab_body, found_in(whole).R_lab_body)
-
-
-@pytest.mark.slow
 def test_two_cameras_see_more_than_one():
     R = random_attitudes(8, 5)
     chain = found_in(pictures(R, 2))

@@ -376,10 +376,6 @@ def test_unequal_numbers_of_frames_and_times_that_stand_still_are_refused(rng: t
         smoothed(replace(truth, time_s=torch.zeros(20, dtype=torch.float64)), position, R)
 
 
-def test_every_setting_is_described() -> None:
-    assert all(entry.description for entry in SmoothSettings.model_fields.values())
-
-
 def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_of_the_poses():
     # Of a variance c^2 s^2 the smoother estimates the fast part f; the slow one is f share / (1 - share).
     truth, share = planted(time_s=clock(60)), 0.25

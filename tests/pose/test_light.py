@@ -36,7 +36,6 @@ from sphereorient.pose.view import sphere_view
 from sphereorient.sphere.view import polynomials
 from sphereorient.synth.degrade import blurred
 
-KINDS = ("patches",)
 NOISE = torch.tensor([[4.0, 0.05, 0.001, 0.0]])  # grey levels^2 and so on
 
 

@@ -223,12 +223,6 @@ def test_every_nth_place_covers_the_disk_evenly(radius_px, every):
         assert np.mean(u * u + v * v) == pytest.approx(0.5, abs=0.02)
 
 
-def test_the_order_is_the_same_each_time():
-    one, other = disk_stencil(17.3), disk_stencil.__wrapped__(17.3)  # made anew
-    assert (one.right == other.right).all()
-    assert (one.down == other.down).all()
-
-
 @pytest.mark.parametrize(
     ("radius_px", "blur_px", "tile_px"), [(9.0, 0.0, 6), (22.3, 0.5, 6), (30.0, 0.9, 9), (30.0, 3.0, 10)]
 )

@@ -10,17 +10,12 @@ from pathlib import Path
 import cv2
 import pytest
 from conftest import REPO
-from preflight_examples import PAINTED, Example, checked, clean_example, write
+from preflight_examples import PAINTED, Example, checked, clean_example, write  # noqa: F401
 
 from sphereorient.preflight import Severity
 from sphereorient.report import preflight_figure
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
-    return clean_example(tmp_path_factory)
 
 
 def check(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import assert_close, slow
-from preflight_examples import PAINTED, Example, checked, clean_example, of
+from preflight_examples import PAINTED, Example, checked, clean_example, of  # noqa: F401
 
 from sphereorient import so3
 from sphereorient.errors import TextureError
@@ -27,11 +27,6 @@ from sphereorient.sphere.texture import fibonacci_directions, map_directions, ra
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 RADIUS_PX = 39.0
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
-    return clean_example(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

@@ -177,14 +177,6 @@ def test_netcdf_is_read_back(track, tmp_path):
         assert data["omega_lab"].attrs["units"] == "rad/s"
 
 
-@pytest.mark.parametrize(("to", "package"), [("nwb", "pynwb"), ("nc", "xarray")])
-def test_a_missing_package_is_named(monkeypatch, track, tmp_path, to, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(OutputError, match=f"the package {package}"):
-        export_track(track, tmp_path / f"t.{to}")
-    assert not list(tmp_path.iterdir())
-
-
 def test_csv_needs_no_extra(monkeypatch, track, tmp_path):
     for package in ("pyarrow", "pandas", "xarray"):
         monkeypatch.setitem(sys.modules, package, None)

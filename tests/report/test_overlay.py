@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, OutputError, TrackError
-from sphereorient.files.whole_file import writing
 from sphereorient.pose.lights.disk import light_basis
 from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, frame_warnings
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
@@ -292,20 +291,6 @@ def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
         np.testing.assert_array_equal(first["cam1"], same["cam1"])
     with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
         overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", FrameSelection(first=30))
-
-
-def test_a_movie_that_fails_leaves_the_old_one(tmp_path):
-    out = tmp_path / "overlay.mp4"
-    out.write_bytes(b"old")
-
-    def pictures():
-        yield np.zeros((64, 64, 3), np.uint8)
-        raise TrackError("in the middle")
-
-    with pytest.raises(TrackError, match="in the middle"), writing(force=True):
-        write_video(out, pictures(), 25)
-    assert out.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_pictures_are_taken_one_by_one(tmp_path):

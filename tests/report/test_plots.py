@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
@@ -803,9 +802,3 @@ def test_unknown_numbers_are_drawn_without_complaint(draw):
     for axes in figure.axes:
         for line in axes.lines:
             assert "nan" not in str(line.get_label())
-
-
-def test_writing_leaves_no_other_file(tmp_path: Path):
-    stem = tmp_path / "noise"
-    assert plots.write_figure(FIGURES["noise"](), stem) == (tmp_path / "noise.png", tmp_path / "noise.pdf")
-    assert len(list(tmp_path.iterdir())) == 2

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from sphereorient.errors import OutputError, ShapeError, TrackError
-from sphereorient.files.whole_file import writing
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 FRAMES = 7
@@ -163,24 +162,6 @@ def test_a_reason_of_a_later_version_is_kept(tmp_path: Path) -> None:
     camera = replace(CameraTrack.empty(2), reason=("ok", "swallowed_by_a_very_large_bubble"))
     replace(Trajectory.empty(np.zeros(2)), cameras={"cam1": camera}).save(tmp_path / "track.h5")
     assert Trajectory.load(tmp_path / "track.h5").cameras["cam1"].reason == camera.reason
-
-
-def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "track.h5"
-    path.write_bytes(b"the old one")
-
-    def disk_full(*_: object) -> None:
-        assert path.read_bytes() == b"the old one"
-        assert len(list(tmp_path.iterdir())) == 2
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("sphereorient.trajectory.trajectory.write_camera", disk_full)
-    with pytest.raises(OutputError, match="No space left"), writing(force=True):
-        full_trajectory().save(path)
-    assert path.read_bytes() == b"the old one"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_saving_makes_a_missing_folder_and_refuses_one_in_its_place(tmp_path: Path) -> None:
