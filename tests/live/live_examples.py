@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -9,8 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from conftest import REPO
+from overlay_examples import true_track
 
+from sphereorient import so3
 from sphereorient.live.feed import Arrival
 from sphereorient.live.live import Measured, measured
 from sphereorient.live.loop import LiveSetUp, open_live
@@ -38,6 +42,12 @@ def known(places: pytest.TempPathFactory) -> Path:
 def excerpt_opened(places: pytest.TempPathFactory) -> Iterator[LiveSetUp]:
     with open_live(EXCERPT / "experiment.yaml", Settings(), None, known(places)) as opened:
         yield opened
+
+
+def off_deg(now: Measured, k: int) -> float:
+    """The error of an orientation against that of the excerpt's frame k."""
+    R, truth = torch.from_numpy(now.R_lab_body), torch.from_numpy(true_track().orientation[k])
+    return math.degrees(float(so3.geodesic_distance(R, truth)))
 
 
 def followed(opened: LiveSetUp, frames: Iterable[Arrival]) -> list[Measured]:

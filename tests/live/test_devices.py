@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 import sys
 import time
@@ -18,13 +17,10 @@ import av
 import cv2
 import numpy as np
 import pytest
-import torch
 from fake_makers import GONE, MAKERS, TIMEOUT, Body, install
-from live_examples import EXCERPT, excerpt_opened, until
-from overlay_examples import true_track
+from live_examples import EXCERPT, excerpt_opened, off_deg, until
 from typer.testing import CliRunner
 
-from sphereorient import so3
 from sphereorient.cli import app
 from sphereorient.errors import MovieError, Reason, SettingsError
 from sphereorient.experiment.experiment import DeviceKeys
@@ -475,12 +471,9 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch, tmp_path_factory):
         )
         feed.close()
         source.close()
-    truth = torch.from_numpy(true_track().orientation)
     there = [now for now in found if now.valid]
     assert len(there) > len(found) - 4
-    for now in there:
-        R = torch.from_numpy(now.R_lab_body)
-        assert math.degrees(float(so3.geodesic_distance(R, truth[order[now.number]]))) < 0.5
+    assert all(off_deg(now, order[now.number]) < 0.5 for now in there)
     assert sum(now.reason == (Reason.OK, Reason.OK) for now in found) > 10, "pairs come also where the machine is busy"
     assert any("cam1 missing 1" in line or "cam1 doubled 1" in line or "cam2 doubled 1" in line for line in told)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO
-from live_examples import EXCERPT, LIMIT_S, excerpt_opened, followed, known
+from live_examples import EXCERPT, LIMIT_S, excerpt_opened, followed, known, off_deg
 from overlay_examples import true_track
 from typer.testing import CliRunner
 
@@ -34,14 +34,12 @@ def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told(tm
             for k, one in enumerate(movie_frames(opened.recording, paced=False))
         ]
         found = followed(opened, frames)
-    truth = torch.from_numpy(true_track().orientation)
     for k, now in enumerate(found):
         assert now.number == k
         assert now.valid == (k not in hidden)
         assert now.found == (k in (0, hidden.stop))
         if now.valid:
-            off = float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k]))
-            assert math.degrees(off) < 0.2
+            assert off_deg(now, k) < 0.2
             assert now.error_rad < math.radians(0.2)
 
 
@@ -57,7 +55,7 @@ def test_a_jump_is_found_and_told(tmp_path_factory):
         found = followed(opened, shown)
     assert [n for n, now in enumerate(found) if now.found] == [0, 12]
     for now, k in zip(found, order, strict=True):
-        assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+        assert off_deg(now, k) < 0.2
 
 
 def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch, tmp_path_factory):
@@ -65,7 +63,6 @@ def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch,
     asked: list[int] = []
     long_search = BallTracker.searched
     monkeypatch.setattr(BallTracker, "searched", lambda self, shots: asked.append(1) or long_search(self, shots))
-    truth = torch.from_numpy(true_track().orientation)
     order, hidden = [*range(8), *range(39, 30, -1)], range(12, 15)
     with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))
@@ -83,12 +80,11 @@ def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch,
     assert [n for n, now in enumerate(found) if now.found] == [0, 8, 15]
     for n, k in enumerate(order):
         if n not in hidden:
-            assert float(so3.geodesic_distance(torch.from_numpy(found[n].R_lab_body), truth[k])) < math.radians(0.2)
+            assert off_deg(found[n], k) < 0.2
     assert len(asked) == 1  # 0.8 s are hidden
 
 
 def test_times_that_stand_or_go_back_begin_anew(tmp_path_factory):
-    truth = torch.from_numpy(true_track().orientation)
     with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))[:12]
         times = [0.01 * k for k in (0, 1, 2, 3, 3, 4, 5, 6, 1, 2, 3, 4)]
@@ -96,7 +92,7 @@ def test_times_that_stand_or_go_back_begin_anew(tmp_path_factory):
         found = followed(opened, shown)
     assert [n for n, now in enumerate(found) if now.found] == [0, 4, 8]
     for k, now in enumerate(found):
-        assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+        assert off_deg(now, k) < 0.2
 
 
 def test_the_command_writes_and_sends_each_frame(tmp_path):

@@ -53,6 +53,15 @@ def turning(count: int, step_deg: float, axis: tuple[float, float, float] = (0.1
     return so3.exp(angle[:, None] * unit) @ start
 
 
+def turns_on_both_sides(R: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """The constant turns P and Q, (3, 3), with which P R Q is nearest to the truth, where neither frame is known."""
+    P = Q = torch.eye(3, dtype=torch.float64)
+    for _ in range(100):
+        Q = so3.nearest_rotation(((P @ R).mT @ truth).mean(0))
+        P = so3.nearest_rotation((truth @ (R @ Q).mT).mean(0))
+    return P, Q
+
+
 def error_deg(R: Tensor, truth: Tensor) -> Tensor:
     """Angles (N,), degrees, the body frame's own turn taken off."""
     Q = so3.nearest_rotation((R.mT @ truth).mean(0))

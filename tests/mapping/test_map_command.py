@@ -12,8 +12,9 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from map_examples import QUICK, rewrite, save_map, unpainted, warped
+from map_examples import QUICK, rewrite, save_map, true_attitudes, unpainted, warped
 from overlay_examples import command as run
+from renders import error_deg
 
 from sphereorient import so3
 from sphereorient.cli.app import progress_bar
@@ -48,15 +49,11 @@ def copy(rendered, tmp_path) -> Path:
     return tmp_path / "scene" / "experiment.yaml"
 
 
-def attitude_errors_deg(track: Path, truth: Path) -> np.ndarray:
+def attitude_errors_deg(track: Path, experiment: Path) -> np.ndarray:
     """Angles to the truth, the best rotation of the body frame taken off."""
     R = torch.from_numpy(Trajectory.load(track).orientation)
-    with h5py.File(truth) as file:
-        true = torch.from_numpy(file["orientation"][()])
-    good = torch.isfinite(R).flatten(1).all(1)
-    assert good.all()
-    Q = so3.nearest_rotation((R.mT @ true).mean(0))
-    return torch.rad2deg(so3.geodesic_distance(R @ Q, true)).numpy()
+    assert torch.isfinite(R).all()
+    return error_deg(R, true_attitudes(experiment)).numpy()
 
 
 @pytest.mark.slow
@@ -76,7 +73,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     with h5py.File(scene / "learnt_map.h5") as file:
         assert file["map/rounds"].shape[0] == 4
         assert np.isnan(file["map/texture"][()]).sum() == (file["map/seen"][()] == 0).sum()
-    assert np.percentile(attitude_errors_deg(scene / "learnt_map.h5", rendered.parent / "truth.h5"), 95) < 1.0
+    assert np.percentile(attitude_errors_deg(scene / "learnt_map.h5", rendered), 95) < 1.0
     assert cv2.imread(str(scene / "learnt_map.png")).shape[1] > 500
     # What `track` makes of it, the pictures anew, frame by frame.
     shutil.copytree(rendered.parent, scene / "scene")
@@ -84,7 +81,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     rewrite(scene / "scene" / "experiment.yaml", texture="learnt.png")
     code, _, err = run(monkeypatch, capsys, "track", scene / "scene/experiment.yaml", "--out", scene / "t.h5", "-q")
     assert code == 0, err
-    assert np.median(attitude_errors_deg(scene / "t.h5", rendered.parent / "truth.h5")) < 0.3
+    assert np.median(attitude_errors_deg(scene / "t.h5", rendered)) < 0.3
 
 
 @pytest.mark.slow

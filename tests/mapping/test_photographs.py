@@ -7,12 +7,11 @@ import shutil
 import sys
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 import torch
 from conftest import SHARED
-from map_examples import mapped, rewrite
+from map_examples import mapped, rewrite, true_attitudes
 from photographs import Stills, write_stills
 from renders import disks_of_pictures, error_deg, pictures, turning
 
@@ -159,11 +158,6 @@ def test_photographs_of_two_balls_are_refused():
 @pytest.mark.slow
 def test_photographs_of_a_ball_that_does_not_turn_are_refused():
     assert "a ball that turns" in refused(pictures(turning(4, 0.0)))
-
-
-def true_attitudes(path):
-    with h5py.File(path.parent / "truth.h5") as file:
-        return torch.from_numpy(file["orientation"][()])
 
 
 @pytest.mark.slow

@@ -151,14 +151,6 @@ def test_a_click_on_the_overview_goes_there_and_the_pointer_is_told_what_it_is_o
         assert chosen(section(page, "excerpt")) != 121  # the tracks of a page are by themselves
 
 
-def test_a_number_can_be_typed(open_page, page_path):
-    with open_page(page_path) as page:
-        part = section(page, "planted")
-        part.locator(".strip__number").fill("250")
-        part.locator(".strip__number").press("Enter")
-        assert readout(part).startswith("frame 250, ")
-
-
 @pytest.mark.parametrize("width", [400, 1280, 1920])
 def test_nothing_scrolls_sideways_and_the_canvas_follows_the_window(open_page, page_path, width):
     with open_page(page_path, width=width) as page:

@@ -194,7 +194,7 @@ def test_blurring_twice_is_blurring_once_by_the_root_of_the_sum_of_squares(kind)
     assert (value - looked(base_of(kind).blurred(0.085), at)[0]).square().mean().sqrt() > 0.02
 
 
-@pytest.mark.parametrize("blur_rad", [1.01 * BASE_RAD, 0.012, 0.05])
+@pytest.mark.parametrize("blur_rad", [slow(1.01 * BASE_RAD), 0.012, 0.05])
 def test_compiled_code_and_torch_blur_alike(blur_rad: float, monkeypatch: pytest.MonkeyPatch):
     if compiled(SOURCE, Widening) is None:
         pytest.skip("needs the compiled tables: `make setup` with a compiler")

@@ -12,10 +12,11 @@ import pydantic
 import pytest
 import torch
 from conftest import assert_close
+from synth_examples import frames_of
 
 from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import OutputError
-from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.experiment import load_experiment
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, make_scene, render_frame, write_synthetic_experiment
 from sphereorient.synth.scene import seeded
@@ -39,11 +40,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def truth_of(path: Path) -> dict[str, torch.Tensor]:
     with h5py.File(path.parent / "truth.h5") as file:
         return {name: torch.from_numpy(file[name][()]) for name in TRUTH}
-
-
-def frames_of(path: Path) -> dict[str, np.ndarray]:
-    movies = open_movies(load_experiment(path))
-    return {name: np.stack(list(movie.frames())) for name, movie in movies.items()}
 
 
 def test_it_is_an_experiment_that_loads(written):
