@@ -1,7 +1,5 @@
 """Frames and poses for the tests of `live`."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterable, Iterator

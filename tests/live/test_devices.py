@@ -1,7 +1,5 @@
 """Cameras of makers and of OpenCV: one behaviour, whatever their drivers do."""
 
-from __future__ import annotations
-
 import struct
 import sys
 import time

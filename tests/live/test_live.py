@@ -1,7 +1,5 @@
 """Frame by frame: the same poses as a whole run, and the whole command."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

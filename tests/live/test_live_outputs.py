@@ -1,7 +1,5 @@
 """Lines that no reader can hold up."""
 
-from __future__ import annotations
-
 import math
 import os
 import socket

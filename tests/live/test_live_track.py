@@ -1,7 +1,5 @@
 """track.h5 of `live`: a journal that a kill cannot spoil, and the whole track at the end."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The background: what the movie shows without the ball, how much it scatters, and pictures of it from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

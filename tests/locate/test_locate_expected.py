@@ -1,7 +1,5 @@
 """The expected size of the disk, and what is refused where there is none."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Repair of the track in the picture: wrong frames replaced, short gaps filled, each flagged; all else untouched."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The outline: planted disks come back to a fraction of a pixel, whatever is painted on them or stands beside them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """From outlines to the lab: exact centres give exact places, and the covariance is what noise really does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Small rendered movies of a turning ball, and maps that are spoilt in known ways."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures of a turning ball for the tests: exact rotations, any paint, a light that shades."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

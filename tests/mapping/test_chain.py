@@ -1,7 +1,5 @@
 """Chains, loops, and movies that are refused."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

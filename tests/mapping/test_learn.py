@@ -1,7 +1,5 @@
 """Maps learnt from movies: the bundled excerpt, and the shared ones."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """`sphereorient map` from movies to a map that `track` reads; an old map corrected; bad input in one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import time

@@ -1,7 +1,5 @@
 """What tells that a learnt map is not to be believed: held-out pictures, a fixed ball that wanders, rates that jump."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

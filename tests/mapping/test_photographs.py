@@ -1,7 +1,5 @@
 """Photographs in any order: attitudes from pairs, sets joined, what is left out, what is refused."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import sys

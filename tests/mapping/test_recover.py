@@ -1,7 +1,5 @@
 """Instants that lost their place are found again; a ball in one place, half hidden, of unknown size, is measured."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

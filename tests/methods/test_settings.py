@@ -1,7 +1,5 @@
 """Settings and provenance: defaults, files, overrides, and refusals of one line that name the nearest known key."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

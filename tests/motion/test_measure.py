@@ -1,7 +1,5 @@
 """The whole measurement: on the truth of the synthetic experiment with noise, with frames missing, in segments."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import h5py

@@ -1,7 +1,5 @@
 """The smoother on planted motion: figures, honest sigmas, gaps, ends, fast turns, wrong frames, laws."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 

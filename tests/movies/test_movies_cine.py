@@ -1,7 +1,5 @@
 """Phantom's .cine, written by the tests' own writer: pixels, row order, cropping, times, and what is refused."""
 
-from __future__ import annotations
-
 import av
 import numpy as np
 import pytest

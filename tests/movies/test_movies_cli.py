@@ -1,7 +1,5 @@
 """`sphereorient movie` tells what is in a file; `convert` writes it without loss."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Every bad input is one MovieError of one line that names the file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

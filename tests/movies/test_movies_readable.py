@@ -1,7 +1,5 @@
 """Reading on after damage: what is lost is None, what is left is as it was, and keeps its number."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import av

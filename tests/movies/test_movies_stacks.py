@@ -1,7 +1,5 @@
 """Single pictures, TIFF stacks and HDF5: numbers, gaps, times, and what is refused."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One movie in every format gives one track, to the last bit where the format is lossless."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

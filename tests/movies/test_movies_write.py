@@ -1,7 +1,5 @@
 """Writing: what is written comes back with its numbers and times, or nothing is left behind."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from movie_examples import FRAMES, pictures

@@ -1,7 +1,5 @@
 """The compiled fit against torch's, which defines it: same poses, covariances and scores, everywhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Poses that were planted are found again, with honest errors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

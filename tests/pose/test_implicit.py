@@ -1,7 +1,5 @@
 """The fit with derivatives: against finite differences of the fit run again, and against fits solved by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close

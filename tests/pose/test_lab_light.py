@@ -1,7 +1,5 @@
 """One light in the lab for all cameras: its functions, its look-up, and planted light, gloss and cover found again."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Light and noise that were planted are found again."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

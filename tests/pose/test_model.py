@@ -1,7 +1,5 @@
 """The sphere as its pixels see it, against renders by brute force; how that changes, against finite differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The pixels of a disk: where they look, which ones count, in what order."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

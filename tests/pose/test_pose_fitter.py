@@ -1,7 +1,5 @@
 """PoseFitter: poses from pictures without the pipeline, of any leading shape."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

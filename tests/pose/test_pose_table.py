@@ -1,7 +1,5 @@
 """The poses of all frames in a few arrays."""
 
-from __future__ import annotations
-
 import torch
 
 from sphereorient import so3

@@ -1,7 +1,5 @@
 """`--axes config.txt`: FicTrac's table in the axes in which FicTrac itself writes."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

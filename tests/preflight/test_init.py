@@ -1,7 +1,5 @@
 """`sphereorient init`: what it measures, what it writes, and that the files it writes are read."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Sequence

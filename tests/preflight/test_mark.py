@@ -1,7 +1,5 @@
 """`sphereorient mark`: what is drawn becomes the mask, in a browser as well; and who may ask."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`sphereorient mark calibration.yaml`: clicked fiducials tie a picture and are saved, in a browser as well."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

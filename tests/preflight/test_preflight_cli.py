@@ -1,7 +1,5 @@
 """`sphereorient check` as a user runs it: what it prints, what it writes, how it ends."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The measures of the check against oracles: outlines, blur, gaps, what start: must say."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Faults of pictures, light and files are told; whatever an experiment lacks, the check goes on."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

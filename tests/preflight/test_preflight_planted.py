@@ -1,7 +1,5 @@
 """A fault of the cameras is planted, and the check names it and what mends it; a clean experiment is left in peace."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

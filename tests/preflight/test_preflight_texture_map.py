@@ -1,7 +1,5 @@
 """How good the paint is, and whether the map is that of the ball."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

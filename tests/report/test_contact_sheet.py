@@ -1,7 +1,5 @@
 """The contact sheet shows the frames, upright, with numbers, times and faults."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The picture of a track: drawn from what is true, it shows what was filmed, whatever the track lacks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """What is exported is what the track holds, and says its units."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """A track for FicTrac's readers, evo, ParaView, NWB and netCDF; and how an animal walks on the ball."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The sheet of the worst frames finds planted trouble and says what it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from overlay_examples import camera_changed, changed, excerpt, true_track

@@ -1,7 +1,5 @@
 """The overlay shows what the track says, where the movie shows it."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The figures of section IV: what was planted is what is drawn, in the units that the labels name."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

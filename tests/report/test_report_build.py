@@ -1,7 +1,5 @@
 """`sphereorient report` as a user calls it: what it writes, and what it says to bad input."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Several balls in overlay, report, export and recording: each where it is, nearer before farther, under its name."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path

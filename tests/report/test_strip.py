@@ -1,7 +1,5 @@
 """Planted trouble comes out in the strip and the stretches, and the pictures show the ball."""
 
-from __future__ import annotations
-
 import html
 import io
 import json

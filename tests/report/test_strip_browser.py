@@ -1,7 +1,5 @@
 """The strip in a browser, from disk and without a network: the bad stretch is found and its frames are seen."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

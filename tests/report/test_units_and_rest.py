@@ -1,7 +1,5 @@
 """Lengths carry the track's unit in every output; nothing is said of the translation of a ball at a fixed place."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import replace

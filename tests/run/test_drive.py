@@ -1,7 +1,5 @@
 """Workers: same bytes as one process, failures stay with their experiment, the dead are replaced."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A disk that fills up at any moment: one line, earlier results intact, nothing half-written."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The parts of a run: whose folder it is, checksums, rotations, the lock."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run that was killed goes on where it was, and its track is that of a run that was not, to the last bit."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

@@ -1,7 +1,5 @@
 """The record of the room, Candidates, and the settings."""
 
-from __future__ import annotations
-
 import pydantic
 import pytest
 import torch

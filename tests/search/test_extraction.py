@@ -1,7 +1,5 @@
 """From grey disks to paint (paper section III B)."""
 
-from __future__ import annotations
-
 import cv2
 import kornia
 import numpy as np

@@ -1,7 +1,5 @@
 """The grey search on disks whose attitude is known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

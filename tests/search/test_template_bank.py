@@ -1,7 +1,5 @@
 """The template search on disks whose attitude is known (paper sections III B and C)."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close

@@ -1,7 +1,5 @@
 """The renderer: camera's pictures and disks, gradients, batches; the smooth pictures for derivatives of fits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The map: loading, reducing, looking up."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

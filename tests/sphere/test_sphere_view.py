@@ -1,7 +1,5 @@
 """The canonical view: which normal a pixel shows, and its pictures (docs/errata.md A4)."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The blurred paint and its slope, against blurring by brute force and against what a Gaussian does to harmonics."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Gain, drift and walk against a reference: planted ones come back, within their errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import accumulate
 from typing import Any

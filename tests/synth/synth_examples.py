@@ -1,7 +1,5 @@
 """Cameras and scenes that the tests of this room share."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Degradations of pictures: each has the size that its unit says, and nothing of it is nothing."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

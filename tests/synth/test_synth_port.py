@@ -1,7 +1,5 @@
 """A ball in liquid behind a wall: outline and paint of its pictures are where the camera shows points of the sphere."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

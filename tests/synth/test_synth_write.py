@@ -1,7 +1,5 @@
 """A whole experiment on disk: what was written is what is read, and it is true."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

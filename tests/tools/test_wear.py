@@ -1,7 +1,5 @@
 """Wear planted in the maps of a series is found, grows as it was planted, and keeps its place from map to map."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache

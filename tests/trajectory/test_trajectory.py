@@ -1,7 +1,5 @@
 """The trajectory: every dataset always there, written whole or not at all, read back bit by bit."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

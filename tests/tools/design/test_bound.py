@@ -1,7 +1,5 @@
 """The Cramér-Rao bound: what can be worked out by hand, its laws, and the scatter of an estimator that reaches it."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Dots: the map from a table, their size from pictures, and where the ball is in a photograph."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
