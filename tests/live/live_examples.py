@@ -1,5 +1,3 @@
-"""Frames and poses for the tests of `live`."""
-
 import math
 import time
 from collections.abc import Iterable, Iterator

@@ -1,5 +1,3 @@
-"""Frames as they come: of movies, bytes, memory, cameras."""
-
 import io
 import re
 import time

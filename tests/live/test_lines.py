@@ -1,5 +1,3 @@
-"""A pose as a line: FicTrac's, and JSON."""
-
 import json
 import math
 from collections.abc import Iterable

@@ -269,9 +269,6 @@ def test_a_serial_port_in_use_or_missing_and_a_file_are_told(line, tmp_path):
     assert (tmp_path / "file").read_text() == "mine"
 
 
-# --- OSC and LSL: all numbers of a frame ---
-
-
 UNITS = {"time_s": "s", "valid": "", "position_radii_x": "radii", "quaternion_w": "", "velocity_radii_s_z": "radii/s"}
 UNITS |= {"position_lab_mm_y": "mm", "sigma_omega_rad_s_x": "rad/s", "sigma_rad_x": "rad", "latency_ms": "ms"}
 

@@ -1,5 +1,3 @@
-"""Several balls, frame by frame."""
-
 import json
 import math
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""The expected size of the disk, and what is refused where there is none."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Disks of several cameras that may show one sphere."""
-
 from itertools import product
 
 import numpy as np

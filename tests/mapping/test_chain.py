@@ -1,5 +1,3 @@
-"""Chains, loops, and movies that are refused."""
-
 import math
 
 import pytest

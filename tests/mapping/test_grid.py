@@ -1,5 +1,3 @@
-"""The map as unknown of a least squares."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Maps learnt from movies: the bundled excerpt, and the shared ones."""
-
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,7 +18,7 @@ from sphereorient.experiment.timeline import timeline
 from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
-from sphereorient.mapping.learn import SHOWN_MIN, interpolated, times_seen
+from sphereorient.mapping.learn import SHOWN_MIN, times_seen
 from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.sphere.texture import fibonacci_directions
 
@@ -76,17 +74,6 @@ def test_footage_holds_the_ball_of_every_frame():
     rows, columns = window.grey.shape
     inside = np.s_[window.top : window.top + rows, window.left : window.left + columns]
     np.testing.assert_array_equal(crops.picture(0, 0)[inside], whole[inside])
-
-
-def test_frames_between_the_fitted_ones_turn_as_they_do():
-    off = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
-    chain = exp(torch.arange(9, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
-    rows = torch.tensor([0, 4, 8])
-    told = torch.stack([chain[0], exp(off) @ chain[4], exp(2 * off) @ chain[8]])
-    R = interpolated(chain, rows, told)
-    torch.testing.assert_close(R[rows], told)
-    torch.testing.assert_close(R[2], exp(0.5 * off) @ chain[2])
-    torch.testing.assert_close(R[6], exp(1.5 * off) @ chain[6])
 
 
 def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():

@@ -139,24 +139,18 @@ def test_a_ball_that_does_not_turn_is_refused(copy, tmp_path, monkeypatch, capsy
     assert "turns" in line
 
 
-def test_places_that_cannot_be_written_are_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
-    line = refused(monkeypatch, capsys, "map", copy, "--out", copy / "map.png")
-    assert "a folder to write in" in line
-    line = refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "map.jpg")
-    assert ".png" in line
-
-
-def test_an_old_map_that_is_none_is_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
+def test_bad_arguments_are_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
     cv2.imwrite(str(tmp_path / "square.png"), np.eye(64, dtype=np.uint8))
-    for init, words in ((tmp_path / "none.png", "no such file"), (tmp_path / "square.png", "twice as wide")):
-        line = refused(monkeypatch, capsys, "map", copy, "--init", init, "--out", tmp_path / "map.png")
-        assert words in line
-
-
-def test_unknown_cameras_and_settings_are_refused(copy, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "map.png"
-    assert "cam1 or cam2" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--cameras", "cam3")
-    assert "write 'rounds'" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
+    out = ("--out", tmp_path / "map.png")
+    for more, words in (
+        (("--out", copy / "map.png"), "a folder to write in"),
+        (("--out", tmp_path / "map.jpg"), ".png"),
+        ((*out, "--init", tmp_path / "none.png"), "no such file"),
+        ((*out, "--init", tmp_path / "square.png"), "twice as wide"),
+        ((*out, "--cameras", "cam3"), "cam1 or cam2"),
+        ((*out, "--set", "paint.round=3"), "write 'rounds'"),
+    ):
+        assert words in refused(monkeypatch, capsys, "map", copy, *more)
 
 
 def test_track_without_a_map_does_not_write_over_a_file_of_its_name(copy, tmp_path, monkeypatch, capsys):

@@ -1,5 +1,3 @@
-"""Relative rotations from pictures alone."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""A ball that turns in its place."""
-
 from types import SimpleNamespace
 
 import pytest

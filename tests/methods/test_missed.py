@@ -1,5 +1,3 @@
-"""Cameras that measure the sphere in no frame are told in one line."""
-
 from dataclasses import replace
 
 import numpy as np

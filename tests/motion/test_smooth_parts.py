@@ -1,5 +1,3 @@
-"""The smoother's parts against slow and independent forms."""
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

@@ -1,5 +1,3 @@
-"""Weighted sums over windows against plain loops."""
-
 import torch
 from conftest import assert_close
 

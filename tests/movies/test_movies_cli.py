@@ -1,5 +1,3 @@
-"""`sphereorient movie` tells what is in a file; `convert` writes it without loss."""
-
 import cv2
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""docs/movies.md names every form that is read."""
-
 from conftest import REPO
 
 from sphereorient.movies.hdf5 import TIMES

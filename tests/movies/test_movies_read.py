@@ -1,5 +1,3 @@
-"""Exact grey values from every format, in order and at random."""
-
 from pathlib import Path
 
 import av

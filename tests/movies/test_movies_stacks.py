@@ -1,5 +1,3 @@
-"""Single pictures, TIFF stacks and HDF5: numbers, gaps, times, and what is refused."""
-
 import tracemalloc
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Poses that were planted are found again, with honest errors."""
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -104,9 +102,6 @@ def rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())
 
 
-# --- planted poses
-
-
 @pytest.mark.parametrize("kind", ["patches", pytest.param("dots", marks=SLOW), pytest.param("blobs", marks=SLOW)])
 @pytest.mark.parametrize("cameras", RIGS)
 def test_the_planted_pose_is_found(cameras, kind):
@@ -187,9 +182,6 @@ def test_errors_of_rotation_and_centre_are_made_good_through_the_levels(cameras,
     assert left[0] < 0.5
     assert left[1] < 0.4
     assert apart_deg(fit, from_truth(cameras)) < 0.04
-
-
-# --- light
 
 
 def test_gain_and_offset_of_the_whole_picture_do_not_matter():
@@ -321,9 +313,6 @@ def test_masked_pixels_do_not_count():
     assert sigma / sigma_all == pytest.approx(math.sqrt(5 / 4), abs=0.08)
 
 
-# --- cameras by themselves
-
-
 def test_a_camera_alone_would_not_turn_what_it_has_fitted():
     fit = from_truth("one")
     assert_close(fit.own_turn, torch.zeros_like(fit.own_turn), atol=1e-9)
@@ -432,9 +421,6 @@ def test_a_pose_whose_start_is_not_a_number_leaves_the_others_alone():
     assert fit.covariance[others].equal(from_truth().covariance[others])
 
 
-# --- what is known of the place
-
-
 def prior_pull(precision: float) -> tuple[Tensor, FittedPoses]:
     """By what share of 0.2 mm along the line of sight a prior on the place moves one camera's fit, (B,)."""
     free = from_truth("one")
@@ -471,9 +457,6 @@ def test_a_prior_beyond_doubt_holds_the_place_and_one_of_nothing_does_nothing():
     along = fitted(rig("one"), "patches", disks("one"), start, R, SIGMA, iterations=8, place_precision=held)
     assert (along.position_lab_mm - start)[:, 1].abs().max() < 1e-3
     assert (along.position_lab_mm - fit.position_lab_mm)[:, [0, 2]].abs().max() < 0.02
-
-
-# --- right or wrong
 
 
 def test_score_and_likelihood_tell_wrong_poses():
@@ -515,9 +498,6 @@ def test_a_map_in_a_mirror_scores_worse():
     assert (fit.score < from_truth().score - 0.2).all()
 
 
-# --- batches
-
-
 @pytest.mark.parametrize("chosen", [[0], [2, 3], [9, 4, 0], list(range(9))])
 def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(chosen):
     X, R = moved(truth()[0], 0.1, 3), turned(truth()[1], 1.0, 4)
@@ -554,9 +534,6 @@ def test_a_fit_is_float64_with_rotations_that_are_rotations_and_covariances_that
         assert_close(fit.covariance, fit.covariance.mT, atol=1e-10)
         assert (torch.linalg.eigvalsh(fit.covariance) > 0).all()
         assert (torch.linalg.eigvalsh(fit.own_covariance) > 0).all()
-
-
-# --- honest errors: many noisy renders
 
 
 @pytest.mark.slow

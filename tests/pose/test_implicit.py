@@ -86,10 +86,6 @@ def test_neither_graph_nor_gradient_depends_on_the_number_of_iterations(points, 
         assert_close(*gradients, 1e-9)
 
 
-def test_nothing_carries_a_gradient_where_nothing_asks_for_one(points):
-    assert not fitted_points(points, points).R_lab_body.requires_grad
-
-
 def test_frames_without_anything_are_nan_and_their_gradients_0(points):
     body, seen = points.clone(), points.clone()
     seen[1] = 0.0  # what is there does not matter

@@ -106,9 +106,6 @@ def regions(view: SphereView) -> dict[str, Tensor]:
     return {"inner": inner & ~on, "near": ~inner & ~on & (coverage > 0.5), "on": on}
 
 
-# --- the picture
-
-
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("kind", ["patches", "blobs"])
 def test_pixels_see_what_a_render_by_force_shows(model, kind):
@@ -191,9 +188,6 @@ def test_a_nearer_ball_is_larger_as_the_cone_about_it_says():
 @cache
 def table(blur_rad: float = 2 * BLUR_PX / 40) -> TextureTable:
     return table_of("patches", blur_rad)
-
-
-# --- derivatives: smooth paint, so that differences are those of the view and not of the table's cells
 
 
 @cache
@@ -285,9 +279,6 @@ def changes_by_its_derivatives(pixels: Pixels, X: Tensor, R: Tensor, paint: Text
         assert float(((both[0] - both[1]) @ by_pose[i]) / (by_pose[i] @ by_pose[i])) == pytest.approx(size, rel=0.06)
 
 
-# --- while it moves
-
-
 MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # turn, rad, and move, mm
 
 
@@ -326,9 +317,6 @@ def test_paint_that_turns_in_the_exposure_is_smeared():
 def test_a_moving_sphere_changes_as_its_derivatives_say():
     one, (X, R) = rig("pinhole", 40.0), ball()
     changes_by_its_derivatives(replace(empty(one, X), moved=MOVED, instants=3), X, R, smooth_table())
-
-
-# --- in the middle, beyond, in batches
 
 
 def test_the_pixel_in_the_very_middle_is_as_any_other():

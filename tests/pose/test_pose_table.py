@@ -1,5 +1,3 @@
-"""The poses of all frames in a few arrays."""
-
 import torch
 
 from sphereorient import so3

@@ -1,5 +1,3 @@
-"""The contact sheet shows the frames, upright, with numbers, times and faults."""
-
 import h5py
 import numpy as np
 import pytest

@@ -120,12 +120,6 @@ def test_a_track_without_a_single_valid_frame_is_drawn(tmp_path, scored):
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_a_pdf_can_be_written(tmp_path):
-    demo_figure(true_track(("cam1",), 0, 4), excerpt(), tmp_path / "figure.pdf")
-    assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
-
-
 def test_an_experiment_without_a_map_is_refused(tmp_path):
     with pytest.raises(ExperimentError, match="texture"):
         demo_figure(true_track(("cam1",)), excerpt().with_sphere(texture_path=None), tmp_path / "figure.png")

@@ -1,5 +1,3 @@
-"""What is exported is what the track holds, and says its units."""
-
 import json
 import re
 import sys

@@ -7,10 +7,10 @@ import av
 import numpy as np
 import pytest
 import torch
+from locate_examples import looking_along_y
 from overlay_examples import EXCERPT, RADIUS_MM, camera_changed, changed, command, excerpt, true_track
 from scipy.spatial.transform import Rotation
 
-from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, TrackError
 from sphereorient.pose.lights.disk import light_basis
 from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, frame_warnings
@@ -52,20 +52,12 @@ def ready():
         yield page, pictures
 
 
-def looking_along_y(tmp_path):
-    """The check of signs of docs/conventions.md: a camera looks along lab +y, lab z up, 200 mm before the origin."""
-    text = """schema: sphereorient-cameras/1
-cameras:
-  cam: {model: pinhole, f_px: 1000.0, centre: [100, 100], image_size: [201, 201],
-        R: [[1, 0, 0], [0, 0, -1], [0, 1, 0]], T: [0, 0, 200]}
-"""
-    path = tmp_path / "cameras.yaml"
-    path.write_text(text)
-    return load_cameras(path)["cam"]
-
-
-def test_axes_are_drawn_where_designs_check_of_signs_has_them(tmp_path):
-    camera = looking_along_y(tmp_path)
+def test_axes_are_drawn_where_designs_check_of_signs_has_them():
+    """docs/conventions.md: a camera looks along lab +y, lab z up, 200 mm before the origin."""
+    lens = {"T_cam_lab_mm": (0.0, 0.0, 200.0), "centre_px": (100.0, 100.0), "f_px": 1000.0}
+    camera = looking_along_y(
+        image_size=(201, 201), **{name: torch.tensor(value, dtype=torch.float64) for name, value in lens.items()}
+    )
     track = true_track(("cam1",), 0, 1)
     Rz = Rotation.from_euler("z", -90, degrees=True).as_matrix()
     path = path_of(changed(track, 0, position=np.zeros(3), orientation=Rz), 1.0)

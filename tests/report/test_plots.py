@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.report import plots
 from sphereorient.report.plots import style
-from sphereorient.report.plots.style import interval_text, p_value_text, three_digits
+from sphereorient.report.plots.style import interval_text
 from sphereorient.report.plots.track import shown_part
 from sphereorient.statistics import Interval, Moments, Summary
 from sphereorient.statistics.cameras import CameraDistance, camera_distances
@@ -742,12 +742,6 @@ def test_an_interval_is_told_with_the_digits_it_deserves(value, low, high, words
     assert interval_text(of) == words
     if np.isfinite(low):
         assert interval_text(of, "ms", 1e3).startswith(words if np.isnan(value) else f"{1e3 * value:.0f}"[:2])
-
-
-def test_numbers_have_three_digits_and_p_values_no_false_ones():
-    assert [three_digits(x) for x in (3.2, 10.06, 14_000.0, np.nan)] == ["3.20", "10.1", "14000", "unknown"]
-    p_values = [p_value_text(p) for p in (0.731, 0.0456, 0.0001, np.nan)]
-    assert p_values == ["p = 0.73", "p = 0.046", "p < 0.001", "p unknown"]
 
 
 def unknown(of: Interval) -> Interval:

@@ -1,5 +1,3 @@
-"""`sphereorient report` as a user calls it: what it writes, and what it says to bad input."""
-
 import re
 from dataclasses import replace
 from functools import partial

@@ -70,11 +70,6 @@ def test_ten_good_frames_between_part_two_stretches_and_nine_do_not(second, coun
     assert len(bad_stretches(track)) == count
 
 
-def test_of_equally_long_stretches_the_one_that_is_not_valid_is_first():
-    track = changed(changed(good_track(60), 10, flags=Flag.SPIKE), 40, valid=False)
-    assert [one.first for one in bad_stretches(track)] == [40, 10]
-
-
 def test_frames_without_a_ball_are_neither_doubtful_nor_lost():
     track, away = good_track(60), slice(0, 20)
     for name in ("cam1", "cam2"):

@@ -1,5 +1,3 @@
-"""The excerpt as a run of several windows, and how two tracks are compared."""
-
 import subprocess
 import sys
 from pathlib import Path

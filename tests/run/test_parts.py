@@ -1,5 +1,3 @@
-"""The parts of a run: whose folder it is, checksums, rotations, the lock."""
-
 import json
 import multiprocessing
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Disks that the tests of this room share: rendered, clean, with the attitude known."""
-
 import math
 from functools import cache
 

@@ -1,5 +1,3 @@
-"""The record of the room, Candidates, and the settings."""
-
 import pydantic
 import pytest
 import torch

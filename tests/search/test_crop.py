@@ -1,5 +1,3 @@
-"""The disk, cut out of a frame at a common size."""
-
 import numpy as np
 import pytest
 

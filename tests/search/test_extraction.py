@@ -1,5 +1,3 @@
-"""From grey disks to paint (paper section III B)."""
-
 import cv2
 import kornia
 import numpy as np

@@ -1,5 +1,3 @@
-"""The grey search on disks whose attitude is known."""
-
 import math
 
 import pytest

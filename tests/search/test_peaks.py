@@ -1,5 +1,3 @@
-"""Groups of neighbours, the best of them, and which are tops."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""The climb from a rough orientation to the best fit nearby, and the pictures freed of light."""
-
 import math
 from functools import cache
 

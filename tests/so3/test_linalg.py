@@ -1,5 +1,3 @@
-"""Damped solutions and the cross product along axis 1, against numpy and torch."""
-
 import torch
 from torch.testing import assert_close
 

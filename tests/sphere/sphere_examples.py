@@ -1,5 +1,3 @@
-"""Maps, and an independent way to look them up, that the tests of this room share."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The map: loading, reducing, looking up."""
-
 import math
 
 import cv2

@@ -315,10 +315,6 @@ def test_each_direction_is_looked_up_as_if_it_were_alone(shape):
             assert one_slope[0, :, 0].equal(slope[k, :, p])
 
 
-def test_the_same_map_gives_the_same_table():
-    assert texture_table(map_of("dots"), 0.02, 128).rows.equal(texture_table(map_of("dots"), 0.02, 128).rows)
-
-
 # --- black and white, for banks
 
 

@@ -1,5 +1,3 @@
-"""Ensembles and tracks whose statistics are known."""
-
 from dataclasses import replace
 
 import numpy as np

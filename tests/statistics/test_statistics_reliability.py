@@ -1,5 +1,3 @@
-"""Reliability curves of sets whose calibration is planted."""
-
 import math
 
 import numpy as np

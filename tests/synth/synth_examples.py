@@ -1,5 +1,3 @@
-"""Cameras and scenes that the tests of this room share."""
-
 import math
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Random motion against finite differences of itself, and its seeds."""
-
 import math
 
 import pytest

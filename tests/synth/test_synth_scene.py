@@ -1,5 +1,3 @@
-"""Pictures of the scene: where the sphere is, how bright, how blurred, how noisy."""
-
 import math
 
 import cv2

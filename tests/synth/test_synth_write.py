@@ -12,7 +12,6 @@ import torch
 from conftest import assert_close
 from synth_examples import frames_of
 
-from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import OutputError
 from sphereorient.experiment import load_experiment
 from sphereorient.sphere import load_texture
@@ -56,23 +55,6 @@ def test_it_is_an_experiment_that_loads(written):
     }
     assert experiment.texture_path is not None
     assert load_texture(experiment.texture_path).shape == (512, 1024)
-
-
-def test_movies_have_their_size_and_number_of_frames(written):
-    for frames in frames_of(written).values():
-        assert frames.shape == (FRAMES, 140, 160)
-        assert frames.dtype == np.uint8
-        assert all(not np.array_equal(frames[k], frames[k + 1]) for k in range(FRAMES - 1))
-
-
-def test_the_cameras_file_holds_the_cameras_that_rendered(written):
-    read = load_experiment(written).cameras
-    for name, camera in default_cameras(SETTINGS).items():
-        other = read[name]
-        assert isinstance(camera, TsaiCamera)
-        assert isinstance(other, TsaiCamera)
-        for part in ("f_mm", "pixel_pitch_mm", "sx", "kappa1", "centre_px", "R_cam_lab", "T_cam_lab_mm"):
-            assert torch.equal(getattr(other, part), getattr(camera, part))
 
 
 def test_the_truth_has_every_dataset_in_its_shape(written):

@@ -1,5 +1,3 @@
-"""Orientations of tracks as arrays: angles and their errors."""
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

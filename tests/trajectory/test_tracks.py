@@ -1,5 +1,3 @@
-"""Tracks of several balls: the file, and which reader takes which file."""
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Dots: the map from a table, their size from pictures, and where the ball is in a photograph."""
-
 import math
 
 import numpy as np
