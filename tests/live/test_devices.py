@@ -198,14 +198,14 @@ def test_a_picture_that_is_not_whole_is_told(maker, alone, monkeypatch):
 
 def test_a_camera_that_fails_at_once_or_is_not_there_is_refused(maker, alone, monkeypatch):
     install(maker, [body([(grey(1, rows=HEIGHT - 1), 1.0, 1)])], monkeypatch)
-    with pytest.raises(MovieError, match="expected 650 x 650 px uint8, got 650 x 649 px"):
+    with pytest.raises(MovieError, match="got 650 x 649 px"):
         next(source_of(f"{maker}4711", print).frames(alone))
-    with pytest.raises(MovieError, match="expected a camera 9, got 4711; connect it"):
+    with pytest.raises(MovieError, match="a camera 9, got 4711"):
         next(source_of(f"{maker}9", print).frames(alone))
-    with pytest.raises(SettingsError, match=r"a device for each camera \(cam1\), got 2"):
+    with pytest.raises(SettingsError, match="a device for each camera"):
         next(source_of(f"{maker}4711,9", print).frames(alone))
     install(maker, [], monkeypatch)
-    with pytest.raises(MovieError, match="expected a camera 4711, got none"):
+    with pytest.raises(MovieError, match="4711, got none"):
         next(source_of(f"{maker}4711", print).frames(alone))
     for name in MAKERS[maker]([]):
         monkeypatch.setitem(sys.modules, name, None)

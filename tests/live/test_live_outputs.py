@@ -254,7 +254,7 @@ def test_a_serial_port_that_vanishes_is_told_once(line):
 
 @pytest.mark.parametrize("rate", ["", "@", "@fast", "@0", "@-9600", "@²", "@99999999999999999999"])
 def test_what_is_no_baud_rate_is_told(line, rate):
-    with pytest.raises(OutputError, match="a free port and its baud rate") as told:
+    with pytest.raises(OutputError, match="baud rate") as told:
         SerialOutput(f"{line[1]}{rate}", pytest.fail)
     assert "\n" not in str(told.value)
 
@@ -263,7 +263,7 @@ def test_a_serial_port_in_use_or_missing_and_a_file_are_told(line, tmp_path):
     (tmp_path / "file").write_text("mine")
     output = SerialOutput(f"{line[1]}@9600", pytest.fail)
     for port in (line[1], tmp_path / "none", tmp_path / "file"):
-        with pytest.raises(OutputError, match="a free port and its baud rate"):
+        with pytest.raises(OutputError, match="baud rate"):
             SerialOutput(f"{port}@9600", pytest.fail)
     output.close()
     assert (tmp_path / "file").read_text() == "mine"
@@ -377,5 +377,5 @@ def test_without_liblsl_it_is_told_in_a_line(monkeypatch):
         raise RuntimeError("LSL binary library file was not found.\nPlease make sure ...")
 
     monkeypatch.setattr("sphereorient.live.outputs.package", absent)
-    with pytest.raises(OutputError, match=r"expected liblsl, got .*not found.'; install liblsl"):
+    with pytest.raises(OutputError, match="install liblsl"):
         LslOutput("ball", pytest.fail)

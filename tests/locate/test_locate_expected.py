@@ -54,7 +54,7 @@ def test_a_camera_that_does_not_see_the_origin_is_refused(depth):
 
 @pytest.mark.parametrize("diameter_mm", [0.5, 200.0])
 def test_a_sphere_that_does_not_fit_the_picture_is_refused(diameter_mm):
-    with pytest.raises(SettingsError, match="a sphere that fits the picture"):
+    with pytest.raises(SettingsError, match="fits the picture"):
         expected_diameter_px("cam1", {"cam1": looking_along_y()}, diameter_mm)
 
 
@@ -69,7 +69,7 @@ SEEN = torch.tensor([[10.0, 20.0], [11.0, 20.0], [torch.nan, torch.nan]], dtype=
 
 
 def test_movies_without_any_ball_are_refused_with_the_frames_reasons():
-    with pytest.raises(ExperimentError, match=r"the sphere in some frame.*none \(not_found\)"):
+    with pytest.raises(ExperimentError, match="not_found"):
         check_seen({"cam1": sightings(LOST), "cam2": sightings(LOST)})
 
 

@@ -279,7 +279,7 @@ def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
         _, first = next(pictures_by_row(of_part, np.array([0])))
         _, same = next(pictures_by_row(streams, np.array([12])))
         np.testing.assert_array_equal(first["cam1"], same["cam1"])
-    with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
+    with pytest.raises(TrackError, match="within 12:30, got 30:"):
         overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", FrameSelection(first=30))
 
 
@@ -318,7 +318,7 @@ def test_refusals_are_one_line(tmp_path, arguments, error, words):
 
 def test_tracks_of_other_times_are_refused(tmp_path):
     late = true_track()
-    with pytest.raises(TrackError, match="the experiment that the track was measured from"):
+    with pytest.raises(TrackError, match="was measured from"):
         overlay_movie(replace(late, time=late.time + 100), excerpt(), tmp_path / "o.mp4")
 
 

@@ -150,7 +150,7 @@ def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="expected a folder that can be made"):
+    with pytest.raises(OutputError, match="can be made"):
         write_synthetic_experiment(tmp_path / "file" / "folder", SETTINGS)
 
 
@@ -163,7 +163,7 @@ def test_impossible_and_unknown_settings_are_refused(wrong):
 
 
 def test_an_exposure_longer_than_a_frame_is_refused_as_the_experiment_would_be():
-    with pytest.raises(pydantic.ValidationError, match="exposure: expected at most 1 / frame_rate"):
+    with pytest.raises(pydantic.ValidationError, match=r"exposure: .*frame_rate"):
         SynthSettings(exposure=0.01, frame_rate=200.0)
     assert SynthSettings(exposure=0.005, frame_rate=200.0).exposure == 0.005
 
