@@ -52,6 +52,12 @@ def init(*arguments: object) -> str:
     return run.output
 
 
+def no_ball(folder: Path, name: str = "empty.npy") -> Path:
+    """A movie that shows nothing: what is not of the look need not wait for one."""
+    np.save(folder / name, np.random.default_rng(0).integers(20, 24, (40, 48, 64)).astype(np.uint8))
+    return folder / name
+
+
 def two_movies(clean: Example, folder: Path) -> list[Path]:
     """Link two movies into an empty folder."""
     for name in ("cam1", "cam2"):
@@ -101,9 +107,7 @@ def test_the_look_knows_a_ball_that_stays(tmp_path):
 
 
 def test_a_movie_without_a_ball_says_so(tmp_path):
-    noise = np.random.default_rng(0).integers(20, 24, (40, 120, 160)).astype(np.uint8)
-    np.save(tmp_path / "empty.npy", noise)
-    (look,) = look_at([tmp_path / "empty.npy"])
+    (look,) = look_at([no_ball(tmp_path)])
     assert look.diameter_px is None
     assert "no ball was found" in init(tmp_path / "empty.npy", "--out", tmp_path / "experiment.yaml")
 
@@ -360,17 +364,17 @@ def test_fictracs_fisheye_has_one_angle_for_every_pixel(clean, tmp_path):
     assert camera.f_px.tolist() == pytest.approx([height_px / math.radians(190)] * 2)
 
 
-def test_init_replaces_its_own_file_until_somebody_changes_it(clean, tmp_path):
-    movies, out = two_movies(clean, tmp_path), tmp_path / "experiment.yaml"
-    init(*movies, "--out", out)
+def test_init_replaces_its_own_file_until_somebody_changes_it(tmp_path):
+    movie, out = no_ball(tmp_path), tmp_path / "experiment.yaml"
+    init(movie, "--out", out)
     first = out.read_text()
     assert has_mark(out)  # also for another process
-    init(*movies, "--out", out, *ROUND)
+    init(movie, "--out", out, *ROUND)
     second = out.read_text()
     assert second != first
     out.write_text(second.replace("diameter: 18", "diameter: 19"))
     with pytest.raises(SphereOrientError, match=r"changed since; .*--force"):
-        init(*movies, "--out", out)
+        init(movie, "--out", out)
     assert "diameter: 19" in out.read_text()
     assert not has_mark(out)
 
@@ -402,8 +406,8 @@ def one_uncommented(text: str) -> Iterator[tuple[str, str]]:
                 yield line, "\n".join([*lines[:k], line.replace(mark, "", 1), *lines[k + 1 :]])
 
 
-def test_each_commented_line_of_a_draft_can_be_uncommented_alone(clean, tmp_path):
-    two, one = two_movies(clean, tmp_path), tmp_path / "one" / "experiment.yaml"
+def test_each_commented_line_of_a_draft_can_be_uncommented_alone(tmp_path):
+    two, one = [no_ball(tmp_path, f"cam{k}.npy") for k in (1, 2)], tmp_path / "one" / "experiment.yaml"
     init(*two, "--out", tmp_path / "experiment.yaml")
     init(two[0], "--out", one)
     plate = tmp_path / "calibration.yaml"
@@ -439,13 +443,13 @@ def test_an_uncommented_wall_is_read_and_each_camera_has_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["\ufeff{}", "# mine\n{}", "first line"])
-def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(clean, tmp_path, change):
-    movies, out = two_movies(clean, tmp_path), tmp_path / "experiment.yaml"
-    init(*movies, "--out", out)
+def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(tmp_path, change):
+    movie, out = no_ball(tmp_path), tmp_path / "experiment.yaml"
+    init(movie, "--out", out)
     text = out.read_text()
     out.write_text(text.partition("\n")[2] if change == "first line" else change.format(text), newline="\r\n")
     with pytest.raises(SphereOrientError, match="changed since"):
-        init(*movies, "--out", out)
+        init(movie, "--out", out)
 
 
 def test_a_rate_that_fictrac_does_not_give_is_said(clean, tmp_path):
