@@ -452,12 +452,11 @@ def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(tmp_path, chang
         init(movie, "--out", out)
 
 
-def test_a_rate_that_fictrac_does_not_give_is_said(clean, tmp_path):
-    two_movies(clean, tmp_path)
-    config = tmp_path / "config.txt"
-    config.write_text(CONFIG)
+def test_a_rate_that_fictrac_does_not_give_is_said(tmp_path):
+    config, text = tmp_path / "config.txt", CONFIG.replace("cam1.mkv", no_ball(tmp_path).name)
+    config.write_text(text)
     more = ("--from-fictrac", config, "--out", tmp_path / "experiment.yaml")
     assert "src_fps gives no rate" in init(*more)
     assert "src_fps" not in init(*more, "--set", "frame_rate=99")
-    config.write_text(CONFIG.replace("src_fps          : -1", "src_fps          : 80"))
+    config.write_text(text.replace("src_fps          : -1", "src_fps          : 80"))
     assert "src_fps" not in init(*more)
