@@ -1,7 +1,5 @@
 """The docs say what is: examples run, tables are those of the code, tests named in them exist."""
 
-from __future__ import annotations
-
 import contextlib
 import doctest
 import io

@@ -1,7 +1,5 @@
 """The rooms are a line: each imports only from those before it (scripts/rooms.py)."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

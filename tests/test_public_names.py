@@ -1,7 +1,5 @@
 """What `import sphereorient` offers: every name is there, completes, and is what its page says."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys

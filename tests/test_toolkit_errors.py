@@ -1,7 +1,5 @@
 """Mistakes at the toolkit's edge: each is refused in one line that says what was expected, what came and what to do."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Each tutorial runs from its first line to its last; what it states is asserted in it."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,20 +1,53 @@
-"""Frames and poses for the tests of `live`."""
-
-from __future__ import annotations
-
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
+import pytest
+import torch
 from conftest import REPO
+from overlay_examples import true_track
 
+from sphereorient import so3
 from sphereorient.live.feed import Arrival
-from sphereorient.live.live import Measured
+from sphereorient.live.live import Measured, measured
+from sphereorient.live.loop import LiveSetUp, open_live
+from sphereorient.methods.method import Learnt, save_learnt
+from sphereorient.methods.settings import Settings
 from sphereorient.pose.poses import no_pose
 from sphereorient.trajectory import Reason, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"
 LIMIT_S = 20.0
+_KNOWN: list[Path] = []
+
+
+def known(places: pytest.TempPathFactory) -> Path:
+    """What `live` learns of the excerpt before its first frame, learnt once for all files of tests."""
+    if not _KNOWN:
+        path = places.mktemp("known") / "learnt.h5"
+        with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+            save_learnt({"": Learnt.of(opened.tracker.appearances[""])}, path)
+        _KNOWN.append(path)
+    return _KNOWN[0]
+
+
+@contextmanager
+def excerpt_opened(places: pytest.TempPathFactory) -> Iterator[LiveSetUp]:
+    with open_live(EXCERPT / "experiment.yaml", Settings(), None, known(places)) as opened:
+        yield opened
+
+
+def off_deg(now: Measured, k: int) -> float:
+    """The error of an orientation against that of the excerpt's frame k."""
+    R, truth = torch.from_numpy(now.R_lab_body), torch.from_numpy(true_track().orientation[k])
+    return math.degrees(float(so3.geodesic_distance(R, truth)))
+
+
+def followed(opened: LiveSetUp, frames: Iterable[Arrival]) -> list[Measured]:
+    return list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
 
 
 def arrivals(count: int) -> Iterator[Arrival]:

@@ -1,8 +1,5 @@
 """Cameras of makers and of OpenCV: one behaviour, whatever their drivers do."""
 
-from __future__ import annotations
-
-import math
 import struct
 import sys
 import time
@@ -18,22 +15,17 @@ import av
 import cv2
 import numpy as np
 import pytest
-import torch
 from fake_makers import GONE, MAKERS, TIMEOUT, Body, install
-from live_examples import EXCERPT, until
-from overlay_examples import true_track
+from live_examples import EXCERPT, excerpt_opened, off_deg, until
 from typer.testing import CliRunner
 
-from sphereorient import so3
 from sphereorient.cli import app
 from sphereorient.errors import MovieError, Reason, SettingsError
 from sphereorient.experiment.experiment import DeviceKeys
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.live.feed import Feed
 from sphereorient.live.live import measured
-from sphereorient.live.loop import open_live
 from sphereorient.live.sources import source_of
-from sphereorient.methods.settings import Settings
 from sphereorient.movies import open_movie
 
 HEIGHT = WIDTH = 650
@@ -206,14 +198,14 @@ def test_a_picture_that_is_not_whole_is_told(maker, alone, monkeypatch):
 
 def test_a_camera_that_fails_at_once_or_is_not_there_is_refused(maker, alone, monkeypatch):
     install(maker, [body([(grey(1, rows=HEIGHT - 1), 1.0, 1)])], monkeypatch)
-    with pytest.raises(MovieError, match="expected 650 x 650 px uint8, got 650 x 649 px"):
+    with pytest.raises(MovieError, match="got 650 x 649 px"):
         next(source_of(f"{maker}4711", print).frames(alone))
-    with pytest.raises(MovieError, match="expected a camera 9, got 4711; connect it"):
+    with pytest.raises(MovieError, match="a camera 9, got 4711"):
         next(source_of(f"{maker}9", print).frames(alone))
-    with pytest.raises(SettingsError, match=r"a device for each camera \(cam1\), got 2"):
+    with pytest.raises(SettingsError, match="a device for each camera"):
         next(source_of(f"{maker}4711,9", print).frames(alone))
     install(maker, [], monkeypatch)
-    with pytest.raises(MovieError, match="expected a camera 4711, got none"):
+    with pytest.raises(MovieError, match="4711, got none"):
         next(source_of(f"{maker}4711", print).frames(alone))
     for name in MAKERS[maker]([]):
         monkeypatch.setitem(sys.modules, name, None)
@@ -452,7 +444,7 @@ def test_a_movie_with_a_rotation_tag_comes_as_track_reads_it(angle, tmp_path):
 
 
 @pytest.mark.slow  # two seconds of a film, and its set-up
-def test_two_cameras_in_step_give_right_poses(monkeypatch):
+def test_two_cameras_in_step_give_right_poses(monkeypatch, tmp_path_factory):
     order, told = [*range(40), *range(38, -1, -1)], []
 
     def film(pictures: list[np.ndarray], seed: int, lost: int, twice: int) -> Iterator[Any]:
@@ -464,7 +456,7 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch):
             for _ in range((n != lost) + (n == twice)):
                 yield pictures[k], zero_s + (1 + 5e-5 * seed) * 0.025 * n, n + 1
 
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         movies = [[picture for picture, _ in stream.pictures()] for stream in opened.recording.streams]
         first, second = body(serial="a"), body(serial="b")
         begun_s = time.perf_counter() + 0.5
@@ -477,12 +469,9 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch):
         )
         feed.close()
         source.close()
-    truth = torch.from_numpy(true_track().orientation)
     there = [now for now in found if now.valid]
     assert len(there) > len(found) - 4
-    for now in there:
-        R = torch.from_numpy(now.R_lab_body)
-        assert math.degrees(float(so3.geodesic_distance(R, truth[order[now.number]]))) < 0.5
+    assert all(off_deg(now, order[now.number]) < 0.5 for now in there)
     assert sum(now.reason == (Reason.OK, Reason.OK) for now in found) > 10, "pairs come also where the machine is busy"
     assert any("cam1 missing 1" in line or "cam1 doubled 1" in line or "cam2 doubled 1" in line for line in told)
 

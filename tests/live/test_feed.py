@@ -1,7 +1,3 @@
-"""Frames as they come: of movies, bytes, memory, cameras."""
-
-from __future__ import annotations
-
 import io
 import re
 import time

@@ -1,7 +1,5 @@
 """Pictures of several cameras, put together by time stamps: nothing of another instant, and what lacks is told."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

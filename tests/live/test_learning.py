@@ -1,7 +1,5 @@
 """Without a map at the start: orientations from the first frame on, while place and map are adjusted."""
 
-from __future__ import annotations
-
 import math
 import time
 

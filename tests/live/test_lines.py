@@ -1,7 +1,3 @@
-"""A pose as a line: FicTrac's, and JSON."""
-
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Frame by frame: the same poses as a whole run, and the whole command."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO
-from live_examples import EXCERPT, LIMIT_S
+from live_examples import EXCERPT, LIMIT_S, excerpt_opened, followed, known, off_deg
 from overlay_examples import true_track
 from typer.testing import CliRunner
 
@@ -23,56 +21,49 @@ from sphereorient.cli import app
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.ball import BallTracker
-from sphereorient.live.live import measured
-from sphereorient.live.loop import open_live
 from sphereorient.live.sources import movie_frames
-from sphereorient.methods.settings import Settings
 
 
-def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told():
+def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told(tmp_path_factory):
     hidden = range(15, 19)
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         frames = [
             replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in hidden else one
             for k, one in enumerate(movie_frames(opened.recording, paced=False))
         ]
-        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
-    truth = torch.from_numpy(true_track().orientation)
+        found = followed(opened, frames)
     for k, now in enumerate(found):
         assert now.number == k
         assert now.valid == (k not in hidden)
         assert now.found == (k in (0, hidden.stop))
         if now.valid:
-            off = float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k]))
-            assert math.degrees(off) < 0.2
+            assert off_deg(now, k) < 0.2
             assert now.error_rad < math.radians(0.2)
 
 
-def test_a_jump_is_found_and_told(tmp_path):
+def test_a_jump_is_found_and_told(tmp_path_factory):
     """From one frame to the next the ball turns by some tens of degrees, forty times as fast as before."""
     order = [*range(12), *range(39, 29, -1)]
     truth = torch.from_numpy(true_track().orientation)
     assert float(so3.geodesic_distance(truth[11], truth[39])) > math.radians(20)
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))
         times = opened.recording.timeline.time_s
         shown = [replace(frames[k], number=n, time_s=float(times[n])) for n, k in enumerate(order)]
-        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, shown))
+        found = followed(opened, shown)
     assert [n for n, now in enumerate(found) if now.found] == [0, 12]
     for now, k in zip(found, order, strict=True):
-        assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+        assert off_deg(now, k) < 0.2
 
 
-def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch):
+def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch, tmp_path_factory):
     """The ball turns by some tens of degrees at once; later something grey without any paint is before it."""
     asked: list[int] = []
     long_search = BallTracker.searched
     monkeypatch.setattr(BallTracker, "searched", lambda self, shots: asked.append(1) or long_search(self, shots))
-    truth = torch.from_numpy(true_track().orientation)
     order, hidden = [*range(8), *range(39, 30, -1)], range(12, 15)
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))
-        views = opened.tracker.appearances[""].fitter.views
         flat = [[np.full_like(picture, 90) for picture in one.pictures] for one in frames]
         for n in hidden:  # noise: no picture is like the one before
             flat[n] = [
@@ -82,25 +73,24 @@ def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch)
             replace(frames[k], number=n, time_s=0.4 * n, pictures=flat[n] if n in hidden else frames[k].pictures)
             for n, k in enumerate(order)
         ]
-        found = list(measured(opened.tracker, views, shown))
+        found = followed(opened, shown)
     assert [now.valid for now in found] == [n not in hidden for n in range(len(order))]
     assert [n for n, now in enumerate(found) if now.found] == [0, 8, 15]
     for n, k in enumerate(order):
         if n not in hidden:
-            assert float(so3.geodesic_distance(torch.from_numpy(found[n].R_lab_body), truth[k])) < math.radians(0.2)
+            assert off_deg(found[n], k) < 0.2
     assert len(asked) == 1  # 0.8 s are hidden
 
 
-def test_times_that_stand_or_go_back_begin_anew():
-    truth = torch.from_numpy(true_track().orientation)
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+def test_times_that_stand_or_go_back_begin_anew(tmp_path_factory):
+    with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))[:12]
         times = [0.01 * k for k in (0, 1, 2, 3, 3, 4, 5, 6, 1, 2, 3, 4)]
         shown = [replace(frame, time_s=time_s) for frame, time_s in zip(frames, times, strict=True)]
-        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, shown))
+        found = followed(opened, shown)
     assert [n for n, now in enumerate(found) if now.found] == [0, 4, 8]
     for k, now in enumerate(found):
-        assert float(so3.geodesic_distance(torch.from_numpy(now.R_lab_body), truth[k])) < math.radians(0.2)
+        assert off_deg(now, k) < 0.2
 
 
 def test_the_command_writes_and_sends_each_frame(tmp_path):
@@ -117,16 +107,10 @@ def test_the_command_writes_and_sends_each_frame(tmp_path):
     assert len((tmp_path / "a.jsonl").read_text().splitlines()) == 40
 
 
-def test_what_is_recorded_beside_is_an_experiment_again(tmp_path):
-    command = [
-        "live",
-        str(EXCERPT / "experiment.yaml"),
-        "--source",
-        "movie-fast",
-        "--record",
-        str(tmp_path / "run.mkv"),
-    ]
-    run = CliRunner().invoke(app, command)
+def test_what_is_recorded_beside_is_an_experiment_again(tmp_path, tmp_path_factory):
+    command = ["live", str(EXCERPT / "experiment.yaml"), "--source", "movie-fast", "--learnt"]
+    more = [str(known(tmp_path_factory)), "--record", str(tmp_path / "run.mkv")]
+    run = CliRunner().invoke(app, [*command, *more])
     assert run.exit_code == 0, run.output
     assert "40 frames recorded, 0 lost" in run.output
     given = load_experiment(EXCERPT / "experiment.yaml")

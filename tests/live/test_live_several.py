@@ -1,7 +1,3 @@
-"""Several balls, frame by frame."""
-
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

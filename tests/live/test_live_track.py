@@ -1,7 +1,5 @@
 """track.h5 of `live`: a journal that a kill cannot spoil, and the whole track at the end."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import REPO
-from live_examples import EXCERPT, LIMIT_S, until
+from live_examples import EXCERPT, LIMIT_S, excerpt_opened, followed, until
 from overlay_examples import true_track
 from typer.testing import CliRunner
 
@@ -21,8 +19,7 @@ from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.experiment.recording import open_recording
 from sphereorient.live.lines import FicTracLines, Quantities, Told
-from sphereorient.live.live import REMARK, TrackBlocks, measured
-from sphereorient.live.loop import open_live
+from sphereorient.live.live import REMARK, TrackBlocks
 from sphereorient.live.outputs import TrackOutput
 from sphereorient.live.sources import movie_frames
 from sphereorient.methods.settings import Settings
@@ -37,26 +34,26 @@ OF_FIT = Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT | Flag.AMBIGUOUS
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Frames of the excerpt, three of them black, two dropped; with what makes tracks of them."""
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         frames = [
             replace(one, pictures=[np.zeros_like(picture) for picture in one.pictures]) if k in HIDDEN else one
             for k, one in enumerate(movie_frames(opened.recording, paced=False))
             if k not in DROPPED
         ]
-        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
+        found = followed(opened, frames)
         yield opened.recording, opened.tracker, found
 
 
-def test_a_frame_that_one_camera_measured_is_flagged_at_once_and_doubtful_if_the_other_should_see_the_ball():
+def test_a_frame_of_one_camera_is_flagged_at_once_and_doubtful_if_the_other_should_see_the_ball(tmp_path_factory):
     def seen(k, picture):
         return np.zeros_like(picture) if k == 5 else np.roll(picture, 200, 1) if k == 7 else picture
 
-    with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:
+    with excerpt_opened(tmp_path_factory) as opened:
         frames = [
             replace(one, pictures=[one.pictures[0], seen(k, one.pictures[1])])
             for k, one in zip(range(9), movie_frames(opened.recording, paced=False), strict=False)
         ]
-        found = list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
+        found = followed(opened, frames)
     expected = [0, 0, 0, 0, 0, Flag.ONE_CAMERA, 0, Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT, 0]
     assert [now.flags for now in found] == expected
     lines = [

@@ -1,7 +1,5 @@
 """A ball that is not found is told once, with the likely cause, and so is its return."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The page of `live`: what it shows is what was measured; who may ask; and that it holds nothing up."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

@@ -1,7 +1,5 @@
 """Which cameras are seen: drivers that answer, hang, fail, end their program; modules stand for them."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """A ring of poses in memory: read in order by another program, and who is slow sees what it lost."""
 
-from __future__ import annotations
-
 import os
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """Planted disks that the tests of this room share: known to a fraction of a pixel by supersampling."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import cv2

@@ -1,18 +1,16 @@
 """The background: what the movie shows without the ball, how much it scatters, and pictures of it from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from locate_examples import BACK, DIAMETER, SETTINGS, Paint, blobs, even_background, filmed, plant, white
+from locate_examples import BACK, SETTINGS, Paint, blobs, filmed, plant, white
 
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment.recording import load_background, spread_frames
-from sphereorient.locate import Background, learn_background
+from sphereorient.locate import learn_background
 from sphereorient.locate.background import measure_background, without_ball
 from sphereorient.locate.outline import find_blobs
 
@@ -178,17 +176,6 @@ def test_covered_pixels_are_measured_from_the_other_frames():
     np.testing.assert_array_equal(again.noise[elsewhere], first.noise[elsewhere])
 
 
-def test_the_difference_counts_darker_as_much_as_brighter():
-    background = even_background((2, 2), back=100.0)
-    frame = np.array([[90, 110], [100, 0]], np.uint8)
-    np.testing.assert_array_equal(background.difference(frame), [[10, 10], [0, 100]])
-
-
-def test_typical_noise_is_the_median():
-    noise = np.array([[1, 1, 1], [2, 9, 90]], np.float32)
-    assert Background(mean=np.zeros((2, 3), np.float32), noise=noise, full_scale=255.0).typical_noise == 1.5
-
-
 @pytest.mark.parametrize(
     ("frames", "count", "expected"),
     [
@@ -221,26 +208,14 @@ def test_a_coloured_background_is_read_as_grey(tmp_path):
     np.testing.assert_array_equal(load_background(picture_file(tmp_path / "empty.png", picture), (12, 17)), 90.0)
 
 
-def write_nothing(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def write_text(path: Path) -> None:
-    path.write_text("no picture")
-
-
-def write_small(path: Path) -> None:
-    picture_file(path, np.zeros((10, 20), np.uint8))
-
-
 @pytest.mark.parametrize(
     ("write", "words"),
     [
         (lambda path: None, ["no such file"]),
         (Path.mkdir, ["a folder"]),
-        (write_nothing, ["a file that cannot be decoded"]),
-        (write_text, ["a file that cannot be decoded"]),
-        (write_small, ["17 x 12 px as the movie", "20 x 10 px"]),
+        (lambda path: path.write_bytes(b""), ["a file that cannot be decoded"]),
+        (lambda path: path.write_text("no picture"), ["a file that cannot be decoded"]),
+        (lambda path: picture_file(path, np.zeros((10, 20), np.uint8)), ["17 x 12 px as the movie", "20 x 10 px"]),
     ],
     ids=["missing", "folder", "empty", "text", "size"],
 )
@@ -253,15 +228,6 @@ def test_a_bad_background_is_refused_in_one_line(tmp_path, write, words):
     assert "\n" not in text
     for word in ["empty.png", *words]:
         assert word in text
-
-
-def test_the_expected_diameter_is_only_needed_to_find_the_ball():
-    """Without a ball to find, what is learnt is what was measured."""
-    frames = np.stack([filmed(np.full(SHAPE, BACK, np.float32), seed=k) for k in range(6)])
-    learnt = learn_background(frames, DIAMETER, SETTINGS)
-    measured = measure_background(frames)
-    np.testing.assert_array_equal(learnt.mean, measured.mean)
-    np.testing.assert_array_equal(learnt.noise, measured.noise)
 
 
 def staying(paint: Paint, blur_px: float, count: int = 24) -> np.ndarray:

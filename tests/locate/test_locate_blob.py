@@ -1,7 +1,5 @@
 """Blobs: the ball before brighter things of another shape, nothing in an empty picture, flicker hidden by the noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from locate_examples import BACK, DIAMETER, NOISE, SETTINGS, blobs, even_background, filmed, plant, white

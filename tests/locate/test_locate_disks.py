@@ -1,7 +1,3 @@
-"""Several disks in a picture, and the background behind all of them."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from locate_examples import BACK, NOISE, SETTINGS, blobs, checker, even_background, filmed, plant, white

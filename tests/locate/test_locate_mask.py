@@ -1,7 +1,5 @@
 """Masks: what hides the ball and does not move counts nowhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """From outlines to the lab: exact centres give exact places, and the covariance is what noise really does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -162,20 +160,15 @@ def test_where_one_of_two_cameras_is_blind_the_other_stands_in(blind):
     assert (depth[1:3] > 20 * depth[[0, 3]]).all()  # far less sure along the ray
 
 
-def test_where_no_camera_sees_there_is_nothing():
+@pytest.mark.parametrize("count", [0, 3])
+def test_where_no_camera_sees_there_is_nothing(count):
     cameras = {"cam1": looking_along_y(), "cam2": looking_down()}
-    found = find_positions({name: sightings(lost(3)) for name in cameras}, cameras, DIAMETER_MM)
+    found = find_positions({name: sightings(lost(count)) for name in cameras}, cameras, DIAMETER_MM)
+    assert found.position_lab_mm.shape == (count, 3)
     assert found.position_lab_mm.isnan().all()
     assert found.covariance_mm2.isnan().all()
     assert not found.measured.any()
     assert (found.flags == 0).all()
-
-
-def test_no_frames_are_no_positions():
-    cameras = {"cam1": looking_along_y(), "cam2": looking_down()}
-    found = find_positions({name: sightings(lost(0)) for name in cameras}, cameras, DIAMETER_MM)
-    assert found.position_lab_mm.shape == (0, 3)
-    assert found.measured.shape == (0,)
 
 
 @pytest.mark.parametrize("flag", [Flag.POSITION_INTERPOLATED, Flag.POSITION_OUTLIER_REPLACED])

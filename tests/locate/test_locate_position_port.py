@@ -1,7 +1,5 @@
 """Behind a flat wall: the ball's place from one outline, whose rays do not begin in one point."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close

@@ -1,7 +1,3 @@
-"""Disks of several cameras that may show one sphere."""
-
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,11 +1,10 @@
 """Small rendered movies of a turning ball, and maps that are spoilt in known ways."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
 import cv2
+import h5py
 import torch
 import yaml
 from torch import Tensor
@@ -52,6 +51,12 @@ def rewrite(path: Path, texture: str | None = None, **changed: object) -> None:
         if value is not None:
             document[key] = value
     path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def true_attitudes(experiment: Path) -> Tensor:
+    """Attitudes (N, 3, 3) of truth.h5 beside an experiment."""
+    with h5py.File(experiment.parent / "truth.h5") as file:
+        return torch.from_numpy(file["orientation"][()])
 
 
 def shift_field(direction: Tensor, rms_deg: float) -> Tensor:

@@ -1,7 +1,5 @@
 """Pictures of a turning ball for the tests: exact rotations, any paint, a light that shades."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -51,6 +49,15 @@ def turning(count: int, step_deg: float, axis: tuple[float, float, float] = (0.1
     angle = torch.deg2rad(torch.arange(count, dtype=torch.float64) * step_deg)
     start = so3.exp(torch.tensor([0.3, -0.7, 1.1], dtype=torch.float64))
     return so3.exp(angle[:, None] * unit) @ start
+
+
+def turns_on_both_sides(R: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """The constant turns P and Q, (3, 3), with which P R Q is nearest to the truth, where neither frame is known."""
+    P = Q = torch.eye(3, dtype=torch.float64)
+    for _ in range(100):
+        Q = so3.nearest_rotation(((P @ R).mT @ truth).mean(0))
+        P = so3.nearest_rotation((truth @ (R @ Q).mT).mean(0))
+    return P, Q
 
 
 def error_deg(R: Tensor, truth: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """Maps of balls that wear one paint are joined; those of other balls are left."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

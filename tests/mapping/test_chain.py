@@ -1,7 +1,3 @@
-"""Chains, loops, and movies that are refused."""
-
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -108,12 +104,6 @@ def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
     disks = disks_of_pictures(pictures(R, 2, "dots"))
     taken = (without_static(disks, R).layers - disks.layers)[0, :, 0].square().mean()
     assert float(taken) < 0.01 * float(disks.layers[:, :, 0].square().mean())
-
-
-def test_the_same_pictures_give_the_same_bytes():
-    disks = disks_of_pictures(pictures(turning(6, 8.0)))
-    one, two = (find_chain(disks, MapSettings()).R_lab_body for _ in range(2))
-    assert torch.equal(one, two)
 
 
 def refused(whole):

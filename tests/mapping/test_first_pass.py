@@ -1,7 +1,5 @@
 """A map that grows with every picture, and the first pass that follows a ball by it."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,3 @@
-"""The map as unknown of a least squares."""
-
-from __future__ import annotations
-
 import math
 
 import numpy as np

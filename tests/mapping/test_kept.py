@@ -1,7 +1,5 @@
 """An interrupted run of `map` goes on where it was, to the same bytes."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import pytest

@@ -1,19 +1,14 @@
-"""Maps learnt from movies: the bundled excerpt, and the shared ones."""
-
-from __future__ import annotations
-
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
-import h5py
 import numpy as np
 import pytest
 import torch
 from conftest import REPO, SHARED
-from map_examples import mapped
-from renders import error_deg
+from map_examples import mapped, true_attitudes
+from renders import error_deg, turns_on_both_sides
 
 from sphereorient.cameras import PinholeCamera
 from sphereorient.errors import PaintError
@@ -23,8 +18,8 @@ from sphereorient.experiment.timeline import timeline
 from sphereorient.files.threads import silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
-from sphereorient.mapping.learn import SHOWN_MIN, interpolated, times_seen
-from sphereorient.so3 import exp
+from sphereorient.mapping.learn import SHOWN_MIN, times_seen
+from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.sphere.texture import fibonacci_directions
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
@@ -47,17 +42,12 @@ def opened(path, cameras=None, frames=None):
     yield Recording(experiment=experiment, streams=streams, timeline=lines, maps=maps, remarks=())
 
 
-def truth(path):
-    with h5py.File(path) as file:
-        return torch.from_numpy(file["orientation"][()])
-
-
 @pytest.mark.slow
 def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty():
     with opened(EXCERPT, ["cam1"]) as recording:
         learnt = mapped(recording, QUICK)
     assert bool(learnt.valid.all())
-    error = error_deg(learnt.R_lab_body, truth(EXCERPT.parent / "truth.h5")[: len(learnt.valid)])
+    error = error_deg(learnt.R_lab_body, true_attitudes(EXCERPT)[: len(learnt.valid)])
     assert error.median() < 0.5
     assert learnt.rounds[-1].moved_rad < learnt.rounds[1].moved_rad
     torch.testing.assert_close(learnt.R_lab_body[0], torch.eye(3, dtype=torch.float64))
@@ -84,17 +74,6 @@ def test_footage_holds_the_ball_of_every_frame():
     rows, columns = window.grey.shape
     inside = np.s_[window.top : window.top + rows, window.left : window.left + columns]
     np.testing.assert_array_equal(crops.picture(0, 0)[inside], whole[inside])
-
-
-def test_frames_between_the_fitted_ones_turn_as_they_do():
-    off = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
-    chain = exp(torch.arange(9, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
-    rows = torch.tensor([0, 4, 8])
-    told = torch.stack([chain[0], exp(off) @ chain[4], exp(2 * off) @ chain[8]])
-    R = interpolated(chain, rows, told)
-    torch.testing.assert_close(R[rows], told)
-    torch.testing.assert_close(R[2], exp(0.5 * off) @ chain[2])
-    torch.testing.assert_close(R[6], exp(1.5 * off) @ chain[6])
 
 
 def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
@@ -136,13 +115,11 @@ def test_a_ball_fixed_in_its_place_is_learnt_from_one_camera():
     path = SHARED / "fixed_ball" / "experiment.yaml"
     with opened(path) as recording:
         learnt = mapped(recording, MapSettings())
-    true = truth(path.parent / "truth.h5")
-    R, P = learnt.R_lab_body, torch.eye(3, dtype=torch.float64)
-    for _ in range(100):  # the best constant turns on both sides
-        Q = _nearest(((P @ R).mT @ true).mean(0))
-        P = _nearest((true @ (R @ Q).mT).mean(0))
+    true = true_attitudes(path)
+    R = learnt.R_lab_body
+    P, _ = turns_on_both_sides(R, true)
     assert error_deg(P @ R, true).median() < 0.05
-    step = torch.rad2deg(_angle(R[1:] @ R[:-1].mT, P.mT @ true[1:] @ true[:-1].mT @ P))
+    step = torch.rad2deg(geodesic_distance(R[1:] @ R[:-1].mT, P.mT @ true[1:] @ true[:-1].mT @ P))
     assert step.median() < 0.05
     assert learnt.position_lab_mm.std(0).max() < 1e-9
     assert learnt.blur_px == pytest.approx(12**-0.5, rel=0.15)  # of a pixel alone
@@ -154,18 +131,9 @@ def test_the_shared_experiment_is_learnt_without_its_texture(tmp_path):
     path = SHARED / "experiment" / "experiment.yaml"
     with opened(path) as recording:
         learnt = mapped(recording, MapSettings())
-    error = error_deg(learnt.R_lab_body, truth(path.parent / "truth.h5"))
+    error = error_deg(learnt.R_lab_body, true_attitudes(path))
     assert error.median() < 0.13
     assert error.quantile(0.95) < 0.25
     assert learnt.seen_share > 0.95
     grey = (torch.nan_to_num(learnt.texture, nan=0.5) * 255).round().byte().numpy()
     assert cv2.imwrite(str(tmp_path / "learnt.png"), grey)
-
-
-def _nearest(matrix):
-    U, _, Vt = torch.linalg.svd(matrix)
-    return U @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vt))], dtype=matrix.dtype)) @ Vt
-
-
-def _angle(A, B):
-    return 2 * torch.asin(((A - B).flatten(1).norm(dim=1) / 8**0.5).clamp(max=1))

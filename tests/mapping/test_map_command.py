@@ -1,10 +1,7 @@
 """`sphereorient map` from movies to a map that `track` reads; an old map corrected; bad input in one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
-import sys
 import time
 from pathlib import Path
 
@@ -13,10 +10,11 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from map_examples import QUICK, rewrite, save_map, unpainted, warped
+from map_examples import QUICK, rewrite, save_map, true_attitudes, unpainted, warped
+from overlay_examples import command as run
+from renders import error_deg
 
 from sphereorient import so3
-from sphereorient.cli import main
 from sphereorient.cli.app import progress_bar
 from sphereorient.experiment.recording import open_recording
 from sphereorient.movies import open_movie
@@ -25,14 +23,6 @@ from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.sphere.compare import compare_maps
 from sphereorient.sphere.texture import random_texture
 from sphereorient.trajectory import Trajectory
-
-
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["sphereorient", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    printed = capsys.readouterr()
-    return int(stop.value.code or 0), printed.out, printed.err
 
 
 def refused(monkeypatch, capsys, *arguments: object) -> str:
@@ -57,15 +47,11 @@ def copy(rendered, tmp_path) -> Path:
     return tmp_path / "scene" / "experiment.yaml"
 
 
-def attitude_errors_deg(track: Path, truth: Path) -> np.ndarray:
+def attitude_errors_deg(track: Path, experiment: Path) -> np.ndarray:
     """Angles to the truth, the best rotation of the body frame taken off."""
     R = torch.from_numpy(Trajectory.load(track).orientation)
-    with h5py.File(truth) as file:
-        true = torch.from_numpy(file["orientation"][()])
-    good = torch.isfinite(R).flatten(1).all(1)
-    assert good.all()
-    Q = so3.nearest_rotation((R.mT @ true).mean(0))
-    return torch.rad2deg(so3.geodesic_distance(R @ Q, true)).numpy()
+    assert torch.isfinite(R).all()
+    return error_deg(R, true_attitudes(experiment)).numpy()
 
 
 @pytest.mark.slow
@@ -85,7 +71,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     with h5py.File(scene / "learnt_map.h5") as file:
         assert file["map/rounds"].shape[0] == 4
         assert np.isnan(file["map/texture"][()]).sum() == (file["map/seen"][()] == 0).sum()
-    assert np.percentile(attitude_errors_deg(scene / "learnt_map.h5", rendered.parent / "truth.h5"), 95) < 1.0
+    assert np.percentile(attitude_errors_deg(scene / "learnt_map.h5", rendered), 95) < 1.0
     assert cv2.imread(str(scene / "learnt_map.png")).shape[1] > 500
     # What `track` makes of it, the pictures anew, frame by frame.
     shutil.copytree(rendered.parent, scene / "scene")
@@ -93,7 +79,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     rewrite(scene / "scene" / "experiment.yaml", texture="learnt.png")
     code, _, err = run(monkeypatch, capsys, "track", scene / "scene/experiment.yaml", "--out", scene / "t.h5", "-q")
     assert code == 0, err
-    assert np.median(attitude_errors_deg(scene / "t.h5", rendered.parent / "truth.h5")) < 0.3
+    assert np.median(attitude_errors_deg(scene / "t.h5", rendered)) < 0.3
 
 
 @pytest.mark.slow
@@ -153,24 +139,18 @@ def test_a_ball_that_does_not_turn_is_refused(copy, tmp_path, monkeypatch, capsy
     assert "turns" in line
 
 
-def test_places_that_cannot_be_written_are_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
-    line = refused(monkeypatch, capsys, "map", copy, "--out", copy / "map.png")
-    assert "a folder to write in" in line
-    line = refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "map.jpg")
-    assert ".png" in line
-
-
-def test_an_old_map_that_is_none_is_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
+def test_bad_arguments_are_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
     cv2.imwrite(str(tmp_path / "square.png"), np.eye(64, dtype=np.uint8))
-    for init, words in ((tmp_path / "none.png", "no such file"), (tmp_path / "square.png", "twice as wide")):
-        line = refused(monkeypatch, capsys, "map", copy, "--init", init, "--out", tmp_path / "map.png")
-        assert words in line
-
-
-def test_unknown_cameras_and_settings_are_refused(copy, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "map.png"
-    assert "cam1 or cam2" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--cameras", "cam3")
-    assert "write 'rounds'" in refused(monkeypatch, capsys, "map", copy, "--out", out, "--set", "paint.round=3")
+    out = ("--out", tmp_path / "map.png")
+    for more, words in (
+        (("--out", copy / "map.png"), "a folder to write in"),
+        (("--out", tmp_path / "map.jpg"), ".png"),
+        ((*out, "--init", tmp_path / "none.png"), "no such file"),
+        ((*out, "--init", tmp_path / "square.png"), "twice as wide"),
+        ((*out, "--cameras", "cam3"), "cam1 or cam2"),
+        ((*out, "--set", "paint.round=3"), "write 'rounds'"),
+    ):
+        assert words in refused(monkeypatch, capsys, "map", copy, *more)
 
 
 def test_track_without_a_map_does_not_write_over_a_file_of_its_name(copy, tmp_path, monkeypatch, capsys):

@@ -1,7 +1,3 @@
-"""Relative rotations from pictures alone."""
-
-from __future__ import annotations
-
 import math
 
 import pytest

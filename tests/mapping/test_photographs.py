@@ -1,18 +1,15 @@
 """Photographs in any order: attitudes from pairs, sets joined, what is left out, what is refused."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import sys
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 import torch
 from conftest import SHARED
-from map_examples import mapped, rewrite
+from map_examples import mapped, rewrite, true_attitudes
 from photographs import Stills, write_stills
 from renders import disks_of_pictures, error_deg, pictures, turning
 
@@ -66,12 +63,6 @@ def test_the_order_of_the_pictures_does_not_matter():
     place = {k: n for n, k in enumerate(order[other.rows].tolist())}
     again = other.R_lab_body[[place[k] for k in one.rows.tolist()]]
     assert error_deg(again, one.R_lab_body).max() < 0.5
-
-
-@pytest.mark.slow
-def test_the_same_photographs_give_the_same_bytes():
-    whole = pictures(random_attitudes(8, 4))
-    assert torch.equal(found_in(whole).R_lab_body, found_in(whole).R_lab_body)
 
 
 @pytest.mark.slow
@@ -165,11 +156,6 @@ def test_photographs_of_two_balls_are_refused():
 @pytest.mark.slow
 def test_photographs_of_a_ball_that_does_not_turn_are_refused():
     assert "a ball that turns" in refused(pictures(turning(4, 0.0)))
-
-
-def true_attitudes(path):
-    with h5py.File(path.parent / "truth.h5") as file:
-        return torch.from_numpy(file["orientation"][()])
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """A ball that turns in its holder, and sways or sinks there: nothing is known before, and no scene is empty."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

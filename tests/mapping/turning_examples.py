@@ -1,7 +1,3 @@
-"""A ball that turns in its place."""
-
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

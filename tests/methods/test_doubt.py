@@ -1,7 +1,5 @@
 """What a track says of frames that no other frame confirms, or that the others contradict."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import h5py

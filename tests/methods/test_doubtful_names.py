@@ -1,7 +1,5 @@
 """Frames in which a ball may be another one are marked."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sphereorient.methods.results import with_identity

@@ -1,7 +1,3 @@
-"""Cameras that measure the sphere in no frame are told in one line."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The bank of a search shows what the nearest camera sees."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

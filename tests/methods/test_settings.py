@@ -1,7 +1,5 @@
 """Settings and provenance: defaults, files, overrides, and refusals of one line that name the nearest known key."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -18,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from sphereorient.bench import BenchSettings
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import input_files, load_experiment
-from sphereorient.files.provenance import provenance, sha256, versions
+from sphereorient.files.provenance import provenance, versions
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate import LocateSettings
 from sphereorient.methods.settings import (
@@ -374,11 +372,6 @@ def test_only_the_cameras_that_were_used_have_fingerprints_and_inputs_elsewhere_
     kept = provenance(input_files(there, ["cam1"]), there.folder, "")
     assert "../left/movie.mkv" in kept["sha256"]
     assert "experiment.yaml" in kept["sha256"]
-
-
-def test_a_fingerprint_is_the_usual_one(tmp_path):
-    path = write(tmp_path, "abc")
-    assert sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
 def test_versions_name_what_enters_the_numbers():

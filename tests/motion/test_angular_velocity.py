@@ -1,7 +1,5 @@
 """Angular velocity: lab and body kept apart, the paper's printed frames beside the corrected ones."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

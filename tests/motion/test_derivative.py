@@ -1,7 +1,5 @@
 """Gaussian derivatives: exact on polynomials, of known response to sines and noise, NaN where not measured."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Rates forward in time on planted motion: honest sigmas, nothing from later, gaps, jumps, laws."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

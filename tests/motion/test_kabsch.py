@@ -1,7 +1,5 @@
 """Turns between sets of points, against scipy; what markers can and cannot tell (docs/errata.md E8)."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close

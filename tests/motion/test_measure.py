@@ -1,7 +1,5 @@
 """The whole measurement: on the truth of the synthetic experiment with noise, with frames missing, in segments."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import h5py
@@ -237,7 +235,3 @@ def test_unequal_numbers_of_frames_are_refused() -> None:
 def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         MotionSettings(**wrong)  # type: ignore[arg-type]
-
-
-def test_every_setting_is_described() -> None:
-    assert all(entry.description for entry in MotionSettings.model_fields.values())

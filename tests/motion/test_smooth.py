@@ -1,7 +1,5 @@
 """The smoother on planted motion: figures, honest sigmas, gaps, ends, fast turns, wrong frames, laws."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 
@@ -374,10 +372,6 @@ def test_unequal_numbers_of_frames_and_times_that_stand_still_are_refused(rng: t
         smoothed(truth, position[:-1], R)
     with pytest.raises(ShapeError, match="increase"):
         smoothed(replace(truth, time_s=torch.zeros(20, dtype=torch.float64)), position, R)
-
-
-def test_every_setting_is_described() -> None:
-    assert all(entry.description for entry in SmoothSettings.model_fields.values())
 
 
 def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_of_the_poses():

@@ -1,7 +1,3 @@
-"""The smoother's parts against slow and independent forms."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

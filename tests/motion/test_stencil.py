@@ -1,7 +1,3 @@
-"""Weighted sums over windows against plain loops."""
-
-from __future__ import annotations
-
 import torch
 from conftest import assert_close
 

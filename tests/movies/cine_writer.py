@@ -1,7 +1,5 @@
 """A writer of .cine files for tests, from the format's description alone (it shares nothing with the reader)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,3 @@
-"""Movies that the tests of this room write: known grey values in every format."""
-
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any

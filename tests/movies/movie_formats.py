@@ -1,7 +1,3 @@
-"""The same frames written in every format that the readers take."""
-
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Files that people asked about in public: containers and units (../shared/cases, each with its README)."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

@@ -1,7 +1,5 @@
 """What containers say beside the pictures: time stamps, edit lists, fields, axes, parts; files of other programs."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Phantom's .cine, written by the tests' own writer: pixels, row order, cropping, times, and what is refused."""
 
-from __future__ import annotations
-
 import av
 import numpy as np
 import pytest
@@ -114,7 +112,7 @@ def test_an_image_size_that_is_no_whole_number_of_rows_is_refused(tmp_path):
     content = bytearray(path.read_bytes())
     content[44 + 8 : 44 + 12] = (36).to_bytes(4, "little")  # biHeight
     path.write_bytes(content)
-    with pytest.raises(MovieError, match="36 rows of at least 51 bytes"):
+    with pytest.raises(MovieError, match="at least 51 bytes"):
         open_movie(path)
 
 

@@ -1,27 +1,13 @@
-"""`sphereorient movie` tells what is in a file; `convert` writes it without loss."""
-
-from __future__ import annotations
-
-import sys
-
 import cv2
 import numpy as np
 import pytest
 from cine_writer import Cine, write_cine
 from movie_examples import FRAMES, pictures
 from movie_formats import LOSSLESS
+from overlay_examples import command as run
 
-from sphereorient.cli import main
 from sphereorient.movies import open_movie
 from sphereorient.movies.survey import survey
-
-
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["sphereorient", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    printed = capsys.readouterr()
-    return int(stop.value.code or 0), printed.out, printed.err
 
 
 def faulty(tmp_path):

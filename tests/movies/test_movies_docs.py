@@ -1,7 +1,3 @@
-"""docs/movies.md names every form that is read."""
-
-from __future__ import annotations
-
 from conftest import REPO
 
 from sphereorient.movies.hdf5 import TIMES

@@ -1,7 +1,5 @@
 """Every reader: the same frames bit for bit, in order and at random, upright and not mirrored."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """From a decoded frame to grey values, where files are hard to come by."""
 
-from __future__ import annotations
-
 import av
 import numpy as np
 import pytest

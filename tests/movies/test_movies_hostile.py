@@ -1,7 +1,5 @@
 """What headers claim; `tests/hostile` has movies cut off or with bytes changed anywhere."""
 
-from __future__ import annotations
-
 import tracemalloc
 from itertools import islice
 from pathlib import Path

@@ -1,7 +1,3 @@
-"""Exact grey values from every format, in order and at random."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

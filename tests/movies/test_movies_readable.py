@@ -1,7 +1,5 @@
 """Reading on after damage: what is lost is None, what is left is as it was, and keeps its number."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import av
@@ -50,7 +48,7 @@ def test_a_damaged_frame_of_ffv1_is_the_only_one_lost(tmp_path, frame_rate_hz):
     assert all(frame is None or np.array_equal(frame, pictures()[number]) for number, frame in enumerate(read))
     assert [frame is None for frame in movie.readable(6, 10)] == [False, True, True, False]
     assert np.array_equal(movie.sample([28, 9, 1]), pictures()[[28, 9, 1]])
-    with pytest.raises(MovieError, match=r"movie.mkv, frame 7: expected a decodable picture"):
+    with pytest.raises(MovieError, match=r"movie.mkv, frame 7"):
         list(movie.frames(1))
 
 

@@ -1,7 +1,3 @@
-"""Single pictures, TIFF stacks and HDF5: numbers, gaps, times, and what is refused."""
-
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 
@@ -32,7 +28,7 @@ def test_pictures_are_in_natural_order_and_a_missing_number_is_an_unreadable_fra
     read = list(movie.readable())
     assert [number for number, frame in enumerate(read) if frame is None] == [2, 3, 13]
     assert all(frame is None or np.array_equal(frame, pictures()[number]) for number, frame in enumerate(read))
-    with pytest.raises(MovieError, match=r"frame 13: .* no file of its number"):
+    with pytest.raises(MovieError, match="frame 13: "):
         movie.sample([13])
 
 

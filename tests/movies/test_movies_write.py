@@ -1,7 +1,5 @@
 """Writing: what is written comes back with its numbers and times, or nothing is left behind."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from movie_examples import FRAMES, pictures
@@ -67,7 +65,7 @@ def test_what_cannot_be_written_leaves_the_old_movie_alone(tmp_path, suffix):
         assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(OutputError, match="Not a directory"):
         write_movie(path / path.name, pictures())
-    with pytest.raises(MovieError, match=r"expected \.mkv \.h5 \.hdf5, got '\.mp4'"):
+    with pytest.raises(MovieError, match=r"got '\.mp4'"):
         write_movie(tmp_path / "movie.mp4", pictures())
 
 

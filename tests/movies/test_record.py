@@ -1,7 +1,5 @@
 """Raw recording in a process of its own: no frame is held up, none is lost without a word, no file is half."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Balls seen by one or two cameras, in grey levels that are not rounded, for the tests of the precise refinement."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

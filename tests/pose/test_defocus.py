@@ -1,7 +1,5 @@
 """Soft pictures: their blur is seen before anything else is known, and templates that are as soft find the attitude."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,3 @@
-"""Poses that were planted are found again, with honest errors."""
-
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -106,9 +102,6 @@ def rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())
 
 
-# --- planted poses
-
-
 @pytest.mark.parametrize("kind", ["patches", pytest.param("dots", marks=SLOW), pytest.param("blobs", marks=SLOW)])
 @pytest.mark.parametrize("cameras", RIGS)
 def test_the_planted_pose_is_found(cameras, kind):
@@ -123,11 +116,11 @@ def test_the_planted_pose_is_found(cameras, kind):
     assert fit.step.abs().max() < 0.01
 
 
-@pytest.mark.parametrize("off_px", [0.1, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize(("off_px", "off_deg"), [(0.5, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 5.0)])
 @pytest.mark.parametrize("cameras", RIGS)
-def test_an_error_of_the_centre_is_made_good(cameras, off_px):
-    start = moved(truth()[0], off_px * rig(cameras).px_mm, 3)
-    fit = fitted(rig(cameras), "patches", disks(cameras), start, truth()[1], SIGMA)
+def test_errors_of_the_centre_and_of_the_rotation_are_made_good(cameras, off_px, off_deg):
+    X, R = moved(truth()[0], off_px * rig(cameras).px_mm, 3), turned(truth()[1], off_deg, 3)
+    fit = fitted(rig(cameras), "patches", disks(cameras), X, R, SIGMA)
     assert apart_deg(fit, from_truth(cameras)) < 0.01
     assert apart_mm(fit, from_truth(cameras)) < (0.002 if cameras == "two" else 0.01)
 
@@ -150,14 +143,6 @@ def test_one_camera_takes_a_wrong_radius_for_another_distance_and_turns_nothing(
     expected = centre + larger * (from_truth("one").position_lab_mm - centre)
     assert apart_deg(fit, from_truth("one")) < 0.02
     assert (fit.position_lab_mm - expected).norm(dim=1).max() < 0.03
-
-
-@pytest.mark.parametrize("angle_deg", [1.0, 2.0, 5.0])
-@pytest.mark.parametrize("cameras", RIGS)
-def test_an_error_of_the_rotation_is_made_good_on_fine_detail(cameras, angle_deg):
-    start = turned(truth()[1], angle_deg, 3)
-    fit = fitted(rig(cameras), "patches", disks(cameras), truth()[0], start, SIGMA)
-    assert apart_deg(fit, from_truth(cameras)) < 0.01
 
 
 def cut_at(level: PyramidLevel, cameras: str, frames: Tensor, X: Tensor) -> Pixels:
@@ -197,9 +182,6 @@ def test_errors_of_rotation_and_centre_are_made_good_through_the_levels(cameras,
     assert left[0] < 0.5
     assert left[1] < 0.4
     assert apart_deg(fit, from_truth(cameras)) < 0.04
-
-
-# --- light
 
 
 def test_gain_and_offset_of_the_whole_picture_do_not_matter():
@@ -331,9 +313,6 @@ def test_masked_pixels_do_not_count():
     assert sigma / sigma_all == pytest.approx(math.sqrt(5 / 4), abs=0.08)
 
 
-# --- cameras by themselves
-
-
 def test_a_camera_alone_would_not_turn_what_it_has_fitted():
     fit = from_truth("one")
     assert_close(fit.own_turn, torch.zeros_like(fit.own_turn), atol=1e-9)
@@ -416,12 +395,6 @@ def test_a_camera_not_in_use_does_not_count(camera):
         assert_close(one.R_lab_body, alone.R_lab_body, atol=1e-12)
 
 
-def test_two_cameras_know_more_than_either():
-    two, one = (from_truth(name).covariance.diagonal(dim1=1, dim2=2).mean(0) for name in ("two", "one"))
-    assert (two < one).all()
-    assert two[4] < 0.01 * one[4]
-
-
 @pytest.mark.parametrize("start_mm", [0.0, 0.3])
 def test_a_pose_that_no_camera_sees_stays_where_it_is_and_the_others_do_not(start_mm):
     X, R = moved(truth()[0], start_mm, 3), turned(truth()[1], 1.0, 4)
@@ -442,12 +415,10 @@ def test_a_pose_whose_start_is_not_a_number_leaves_the_others_alone():
     lost = X.clone()
     lost[3] = torch.nan
     fit = fitted(rig(), "patches", disks(), lost, R, SIGMA)
+    assert fit.position_lab_mm[3].isnan().all()
     others = torch.arange(COUNT) != 3
     assert fit.R_lab_body[others].equal(from_truth().R_lab_body[others])
     assert fit.covariance[others].equal(from_truth().covariance[others])
-
-
-# --- what is known of the place
 
 
 def prior_pull(precision: float) -> tuple[Tensor, FittedPoses]:
@@ -486,9 +457,6 @@ def test_a_prior_beyond_doubt_holds_the_place_and_one_of_nothing_does_nothing():
     along = fitted(rig("one"), "patches", disks("one"), start, R, SIGMA, iterations=8, place_precision=held)
     assert (along.position_lab_mm - start)[:, 1].abs().max() < 1e-3
     assert (along.position_lab_mm - fit.position_lab_mm)[:, [0, 2]].abs().max() < 0.02
-
-
-# --- right or wrong
 
 
 def test_score_and_likelihood_tell_wrong_poses():
@@ -530,9 +498,6 @@ def test_a_map_in_a_mirror_scores_worse():
     assert (fit.score < from_truth().score - 0.2).all()
 
 
-# --- batches
-
-
 @pytest.mark.parametrize("chosen", [[0], [2, 3], [9, 4, 0], list(range(9))])
 def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(chosen):
     X, R = moved(truth()[0], 0.1, 3), turned(truth()[1], 1.0, 4)
@@ -542,12 +507,6 @@ def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(chosen):
     some = fitted(rig(), "patches", pixels, X[index], R[index], SIGMA)
     for name in POSE_PARTS:
         assert getattr(some, name).equal(getattr(whole, name)[index]), name
-
-
-def test_the_same_pictures_give_the_same_bytes():
-    one, other = (fitted(rig(), "patches", disks(), *truth(), SIGMA) for _ in range(2))
-    for name in POSE_PARTS:
-        assert getattr(one, name).equal(getattr(other, name)), name
 
 
 def test_no_pose_gives_no_fit():
@@ -575,9 +534,6 @@ def test_a_fit_is_float64_with_rotations_that_are_rotations_and_covariances_that
         assert_close(fit.covariance, fit.covariance.mT, atol=1e-10)
         assert (torch.linalg.eigvalsh(fit.covariance) > 0).all()
         assert (torch.linalg.eigvalsh(fit.own_covariance) > 0).all()
-
-
-# --- honest errors: many noisy renders
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """The fit with derivatives: against finite differences of the fit run again, and against fits solved by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close
@@ -86,10 +84,6 @@ def test_neither_graph_nor_gradient_depends_on_the_number_of_iterations(points, 
         weight = torch.randn(one.shape, generator=rng, dtype=torch.float64)
         gradients = [torch.autograd.grad((pose * weight).sum(), seen, retain_graph=True)[0] for pose in (one, other)]
         assert_close(*gradients, 1e-9)
-
-
-def test_nothing_carries_a_gradient_where_nothing_asks_for_one(points):
-    assert not fitted_points(points, points).R_lab_body.requires_grad
 
 
 def test_frames_without_anything_are_nan_and_their_gradients_0(points):

@@ -1,7 +1,5 @@
 """One light in the lab for all cameras: its functions, its look-up, and planted light, gloss and cover found again."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -47,9 +45,6 @@ SIGMA = 2.0  # grey levels
 LAMP, WINDOW = torch.tensor([0.3, -0.8, 0.52]), torch.tensor([-0.2, 0.1, 0.97])  # directions, lab
 
 
-# --- functions
-
-
 def test_harmonics_are_orthonormal_over_the_sphere():
     directions = octahedral_directions(128)
     side = 128
@@ -83,9 +78,6 @@ def test_knots_make_functions_that_are_linear_between_them():
     assert_close(shares.sum(-1), torch.ones(101), atol=1e-6)
     assert (shares >= 0).all()
     assert_close(shares @ torch.tensor(KNOTS), depth, atol=1e-6)
-
-
-# --- a planted light
 
 
 def planted(cameras: int) -> LabLight:
@@ -299,9 +291,6 @@ def test_normals_look_at_the_camera_and_mirrored_rays_leave_the_sphere():
     assert_close(
         mirror - (mirror * normal).sum(1, keepdim=True) * normal, pixels.direction + depth[:, None] * normal, 1e-3
     )
-
-
-# --- which light
 
 
 def of_maps(rig: Rig, pixels: Pixels, X: Tensor, R: Tensor) -> tuple[Fitter, FittedPoses, Tensor]:

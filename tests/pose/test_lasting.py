@@ -1,7 +1,5 @@
 """Errors that all frames share: small where there is noise alone, and as large as they are where light stays wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

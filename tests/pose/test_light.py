@@ -1,7 +1,3 @@
-"""Light and noise that were planted are found again."""
-
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -36,7 +32,6 @@ from sphereorient.pose.view import sphere_view
 from sphereorient.sphere.view import polynomials
 from sphereorient.synth.degrade import blurred
 
-KINDS = ("patches",)
 NOISE = torch.tensor([[4.0, 0.05, 0.001, 0.0]])  # grey levels^2 and so on
 
 
@@ -61,9 +56,6 @@ def lamp(across: Tensor, camera: int) -> tuple[Tensor, Tensor]:
     return 90 + 60 * depth + 50 * side * x - 20 * y, 12 + 18 * depth - 10 * side * y + 6 * x * y
 
 
-# --- the functions that maps are sums of
-
-
 def test_polynomials_are_all_monomials_up_to_their_order():
     x, y = 2.0, 3.0
     values = polynomials(torch.tensor([[[x], [y]]]), 3)[0, :, 0].tolist()
@@ -86,9 +78,6 @@ def test_functions_at_any_leading_shape(shape):
 def test_beyond_the_limb_and_on_it_the_functions_are_finite_and_so_are_their_slopes():
     across = torch.tensor([[[0.0, 0.6, 1.0, 1.2], [0.0, 0.8, 0.0, -0.4]]])
     assert light_basis(across).isfinite().all()
-
-
-# --- looking up
 
 
 def test_maps_that_are_looked_up_are_the_sums_of_functions():
@@ -141,9 +130,6 @@ def test_unknown_light_is_one_and_nothing_everywhere():
     assert (difference == 1).all()
     assert (black == 0).all()
     assert difference.shape == (6, 500)
-
-
-# --- learning maps
 
 
 @cache
@@ -203,9 +189,6 @@ def test_a_disk_that_shows_white_paint_only_leaves_small_maps():
     assert error.abs().max() < 1.0
 
 
-# --- noise
-
-
 @pytest.mark.parametrize(
     "planted", [(9.0, 0.0, 0.0, 0.0), (4.0, 0.3, 0.0, 0.0), (2.0, 0.05, 0.002, 0.0), (3.0, 0.0, 0.0, 2e-5)]
 )
@@ -249,9 +232,6 @@ def test_few_pixels_tell_one_variance_only(count, expected):
     residual = 5 * torch.tensor([1.0, -1.0]).repeat(count // 2)
     found = noise_curve(torch.linspace(10, 200, count), residual, torch.ones(count, dtype=torch.bool))
     assert found.tolist() == [expected, 0, 0, 0]
-
-
-# --- all of it, from pictures
 
 
 def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():

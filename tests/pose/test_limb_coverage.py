@@ -1,7 +1,5 @@
 """How much of the limb gives the position: what is left of it, by geometry, for compiled code and torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

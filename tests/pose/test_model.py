@@ -1,7 +1,5 @@
 """The sphere as its pixels see it, against renders by brute force; how that changes, against finite differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -108,9 +106,6 @@ def regions(view: SphereView) -> dict[str, Tensor]:
     return {"inner": inner & ~on, "near": ~inner & ~on & (coverage > 0.5), "on": on}
 
 
-# --- the picture
-
-
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("kind", ["patches", "blobs"])
 def test_pixels_see_what_a_render_by_force_shows(model, kind):
@@ -195,9 +190,6 @@ def table(blur_rad: float = 2 * BLUR_PX / 40) -> TextureTable:
     return table_of("patches", blur_rad)
 
 
-# --- derivatives: smooth paint, so that differences are those of the view and not of the table's cells
-
-
 @cache
 def smooth_table() -> TextureTable:
     row, column = torch.meshgrid(torch.arange(128.0), torch.arange(256.0), indexing="ij")
@@ -267,26 +259,24 @@ def test_sharp_paint_changes_as_its_derivatives_say_on_the_whole(model):
     # What Gauss-Newton needs: the projection of a finite change on the derivatives gives the change's size back.
     one, (X, R) = rig(model, 40.0), ball()
     pixels = empty(one, X)
-    view = sphere_view(pixels, X, R, model_of(table()))
-    seen = view.coverage[0] * view.paint[0]
+    assert exposed(sphere_view(pixels, X, R, model_of(table()))).max() > 0.9
+    changes_by_its_derivatives(pixels, X, R, table())
+
+
+def changes_by_its_derivatives(pixels: Pixels, X: Tensor, R: Tensor, paint: TextureTable) -> None:
+    view = sphere_view(pixels, X, R, model_of(paint))
     by_place = view.coverage * view.paint_by_position[0] + view.paint * view.coverage_by_position[0]
     by_pose = torch.cat([view.coverage * view.paint_by_rotation[0], by_place])
-    sizes = [0.3 * PITCH_MM / RADIUS_MM] * 3 + [0.3 * PITCH_MM] * 3
-    for i, size in enumerate(sizes):
+    for i, size in enumerate([0.3 * PITCH_MM / RADIUS_MM] * 3 + [0.3 * PITCH_MM] * 3):
         if i == 4:  # along the line of sight
             continue
         step = torch.zeros(6, dtype=torch.float64)
         step[i] = 0.5 * size
         both = [
-            sphere_view(pixels, X + s * step[3:], so3.exp(s * step[:3])[None] @ R, model_of(table())) for s in (1, -1)
+            exposed(sphere_view(pixels, X + s * step[3:], so3.exp(s * step[:3])[None] @ R, model_of(paint)))
+            for s in (1, -1)
         ]
-        change = (both[0].coverage * both[0].paint - both[1].coverage * both[1].paint)[0]
-        got = float((change @ by_pose[i]) / (by_pose[i] @ by_pose[i]))
-        assert got == pytest.approx(size, rel=0.06)
-    assert seen.max() > 0.9
-
-
-# --- while it moves
+        assert float(((both[0] - both[1]) @ by_pose[i]) / (by_pose[i] @ by_pose[i])) == pytest.approx(size, rel=0.06)
 
 
 MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # turn, rad, and move, mm
@@ -326,21 +316,7 @@ def test_paint_that_turns_in_the_exposure_is_smeared():
 
 def test_a_moving_sphere_changes_as_its_derivatives_say():
     one, (X, R) = rig("pinhole", 40.0), ball()
-    pixels = replace(empty(one, X), moved=MOVED, instants=3)
-    view = looked(pixels, X, R)
-    by_place = view.coverage * view.paint_by_position[0] + view.paint * view.coverage_by_position[0]
-    by_pose = torch.cat([view.coverage * view.paint_by_rotation[0], by_place])
-    for i, size in enumerate([0.3 * PITCH_MM / RADIUS_MM] * 3 + [0.3 * PITCH_MM] * 3):
-        if i == 4:  # along the line of sight
-            continue
-        step = torch.zeros(6, dtype=torch.float64)
-        step[i] = 0.5 * size
-        both = [looked(pixels, X + s * step[3:], so3.exp(s * step[:3])[None] @ R) for s in (1, -1)]
-        change = exposed(both[0]) - exposed(both[1])
-        assert float((change @ by_pose[i]) / (by_pose[i] @ by_pose[i])) == pytest.approx(size, rel=0.06)
-
-
-# --- in the middle, beyond, in batches
+    changes_by_its_derivatives(replace(empty(one, X), moved=MOVED, instants=3), X, R, smooth_table())
 
 
 def test_the_pixel_in_the_very_middle_is_as_any_other():

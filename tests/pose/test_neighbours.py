@@ -1,7 +1,5 @@
 """Other spheres in the picture: which places of a disk do not count, and fits that look past them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

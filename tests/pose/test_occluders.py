@@ -1,7 +1,5 @@
 """What covers the sphere is found as connected residuals; noise and single outliers are not."""
 
-from __future__ import annotations
-
 import torch
 from refine_examples import balls, cut, noisy, pictures_of, rig_of
 

@@ -1,7 +1,3 @@
-"""The pixels of a disk: where they look, which ones count, in what order."""
-
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -41,9 +37,6 @@ def places() -> np.ndarray:
 def disk(model: str = "pinhole", middle=(30.2, 20.7), radius_px: float = 9.0, step_px: int = 1, **more) -> Pixels:
     stencil = disk_stencil(radius_px, step_px)
     return cut_pixels(places(), scene_of(BACKGROUND), LinesOfSight(camera(model)), middle, stencil, **more)
-
-
-# --- lines of sight
 
 
 @pytest.mark.parametrize("model", ["pinhole", "tsai", "telecentric"])
@@ -120,9 +113,6 @@ def test_a_camera_of_one_centre_has_no_pitch_in_mm_and_a_telecentric_one_no_othe
     assert parallel.pitch_rad.item() == pytest.approx(0, abs=1e-6)
 
 
-# --- what is cut
-
-
 def test_the_disk_is_cut_about_the_nearest_whole_pixel():
     pixels = disk(middle=(30.6, 20.4))
     assert pixels.grey[0, 0].item() == 31 + 100 * 20
@@ -176,9 +166,6 @@ def test_the_frame_is_not_written_to():
     assert (behind == BACKGROUND).all()
 
 
-# --- the stencil
-
-
 @pytest.mark.parametrize(("radius_px", "step_px"), [(9.0, 1), (20.5, 1), (20.5, 2), (31.0, 3)])
 def test_a_stencil_is_all_places_within_its_radius_but_the_outermost_few(radius_px, step_px):
     stencil = disk_stencil(radius_px, step_px)
@@ -223,12 +210,6 @@ def test_every_nth_place_covers_the_disk_evenly(radius_px, every):
         assert np.mean(u * u + v * v) == pytest.approx(0.5, abs=0.02)
 
 
-def test_the_order_is_the_same_each_time():
-    one, other = disk_stencil(17.3), disk_stencil.__wrapped__(17.3)  # made anew
-    assert (one.right == other.right).all()
-    assert (one.down == other.down).all()
-
-
 @pytest.mark.parametrize(
     ("radius_px", "blur_px", "tile_px"), [(9.0, 0.0, 6), (22.3, 0.5, 6), (30.0, 0.9, 9), (30.0, 3.0, 10)]
 )
@@ -244,9 +225,6 @@ def test_tiles_are_squares_of_neighbours(radius_px, blur_px, tile_px):
         assert one.sum() <= tile_px**2
     assert tile.max() + 1 <= (2 * math.ceil(radius_px) // tile_px + 1) ** 2
     assert (np.bincount(tile) == tile_px**2).any()
-
-
-# --- parts of records
 
 
 def test_some_of_the_disks_by_mask_and_by_index():

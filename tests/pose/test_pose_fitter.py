@@ -1,7 +1,5 @@
 """PoseFitter: poses from pictures without the pipeline, of any leading shape."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -104,7 +102,7 @@ def test_a_picture_of_another_ball_is_no_success(seen):
 
 def test_pictures_of_another_size_are_refused(seen):
     fitter, X, R, pictures = seen
-    with pytest.raises(ShapeError, match=r"expected \(\.\.\., 2, 160, 160\) with 4 poses, got \(4, 2, 160, 159\)"):
+    with pytest.raises(ShapeError, match=r"got \(4, 2, 160, 159\)"):
         fitter(pictures[..., 1:], R, X)
 
 

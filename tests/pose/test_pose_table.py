@@ -1,7 +1,3 @@
-"""The poses of all frames in a few arrays."""
-
-from __future__ import annotations
-
 import torch
 
 from sphereorient import so3
@@ -73,13 +69,6 @@ def test_frames_that_all_lack_a_pose_make_a_table_with_one_free_place():
     assert table.mask.shape == (3, 1)
     assert not table.mask.any()
     assert table.R_lab_body.shape == (3, 1, 3, 3)
-
-
-def test_a_single_camera_has_its_own_axis():
-    frame = no_pose(1, (Reason.NOT_FOUND,))
-    table = pose_table([frame], 1)
-    assert table.own_turn.shape == (1, 1, 1, 3)
-    assert table.use.shape == (1, 1)
 
 
 def test_rows_are_the_chosen_places_and_nan_where_none_is_chosen():

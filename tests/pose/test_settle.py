@@ -1,7 +1,5 @@
 """The fit of nearly right poses out of whole frames: compiled code against torch's, which defines it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Paint that no picture showed weighs nothing, whatever the map holds there."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

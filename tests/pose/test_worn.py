@@ -1,7 +1,5 @@
 """Paint that differs from the map is found, and weighs nothing."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

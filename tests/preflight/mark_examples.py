@@ -1,7 +1,5 @@
 """A server of `sphereorient mark`, asked without and with a browser."""
 
-from __future__ import annotations
-
 import json
 import threading
 import urllib.error

@@ -61,10 +61,11 @@ def render(folder: Path) -> Example:
 _RENDERED: list[Example] = []
 
 
-def clean_example(places: pytest.TempPathFactory) -> Example:
+@pytest.fixture(name="clean", scope="module")
+def clean_example(tmp_path_factory: pytest.TempPathFactory) -> Example:
     """Return the clean experiment, rendered once for all files of tests."""
     if not _RENDERED:
-        _RENDERED.append(render(places.mktemp("clean")))
+        _RENDERED.append(render(tmp_path_factory.mktemp("clean")))
     return _RENDERED[0]
 
 

@@ -1,7 +1,5 @@
 """`--axes config.txt`: FicTrac's table in the axes in which FicTrac itself writes."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -103,7 +101,7 @@ def test_a_ball_on_the_axis_changes_nothing(tmp_path):
 
 
 def test_a_config_without_a_limb_is_refused(tmp_path):
-    with pytest.raises(ExperimentError, match=r"roi_circ: expected three points .* got 2"):
+    with pytest.raises(ExperimentError, match=r"roi_circ: .* got 2"):
         fictrac_axes(camera(np.eye(3)), config(tmp_path, replace(SET_UP, limb_px=LIMB[:2])))
 
 

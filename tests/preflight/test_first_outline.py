@@ -1,7 +1,5 @@
 """How sure `init` is of the outline of a ball that stays in its place, partly hidden, in a holder."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

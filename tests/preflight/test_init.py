@@ -1,7 +1,5 @@
 """`sphereorient init`: what it measures, what it writes, and that the files it writes are read."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -15,7 +13,7 @@ import pytest
 import torch
 import yaml
 from plate_drawing import Scene
-from preflight_examples import Example, clean_example
+from preflight_examples import Example, clean_example  # noqa: F401
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
@@ -45,11 +43,6 @@ vfov             : 45
 """
 
 
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
-    return clean_example(tmp_path_factory)
-
-
 def init(*arguments: object) -> str:
     """Run the command as a user does, without a terminal; return what it prints."""
     run = CliRunner().invoke(app, ["init", *map(str, arguments)])
@@ -57,6 +50,12 @@ def init(*arguments: object) -> str:
         raise run.exception
     assert run.exit_code == 0, run.output
     return run.output
+
+
+def no_ball(folder: Path, name: str = "empty.npy") -> Path:
+    """A movie that shows nothing: what is not of the look need not wait for one."""
+    np.save(folder / name, np.random.default_rng(0).integers(20, 24, (40, 48, 64)).astype(np.uint8))
+    return folder / name
 
 
 def two_movies(clean: Example, folder: Path) -> list[Path]:
@@ -83,16 +82,8 @@ def test_what_nobody_knows_is_asked_for_by_name_and_refused_at_once(clean, tmp_p
     said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
     assert re.findall(r"write in experiment.yaml: ([\w.]+),", said) == ["frame_rate", "sphere.diameter"]
     assert "moves, found in" in said
-    with pytest.raises(ExperimentError, match=r"got no frame_rate or times, sphere\.diameter; add them"):
+    with pytest.raises(ExperimentError, match=r"frame_rate or times, sphere\.diameter"):
         load_experiment(tmp_path / "experiment.yaml")
-
-
-def test_a_file_of_the_user_is_not_replaced(clean, tmp_path):
-    own = tmp_path / "experiment.yaml"
-    own.write_text("mine")
-    with pytest.raises(SphereOrientError, match="--force"):
-        init(*two_movies(clean, tmp_path), "--out", own)
-    assert own.read_text() == "mine"
 
 
 @pytest.mark.slow
@@ -116,9 +107,7 @@ def test_the_look_knows_a_ball_that_stays(tmp_path):
 
 
 def test_a_movie_without_a_ball_says_so(tmp_path):
-    noise = np.random.default_rng(0).integers(20, 24, (40, 120, 160)).astype(np.uint8)
-    np.save(tmp_path / "empty.npy", noise)
-    (look,) = look_at([tmp_path / "empty.npy"])
+    (look,) = look_at([no_ball(tmp_path)])
     assert look.diameter_px is None
     assert "no ball was found" in init(tmp_path / "empty.npy", "--out", tmp_path / "experiment.yaml")
 
@@ -194,7 +183,7 @@ def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
     known = [f"plate.pitch={plate.pitch_mm}", "pixel_pitch=[0.02, 0.02]", "surveyed.T_lab_plate=[0, 0, 0]"]
     said = init("--plate", folder, "--out", out, *(word for text in known for word in ("--set", text)))
     assert re.findall(r"write in calibration.yaml: ([\w.]+),", said) == ["surveyed.R_lab_plate"]
-    with pytest.raises(CameraError, match=r"surveyed.R_lab_plate: expected a value, got none"):
+    with pytest.raises(CameraError, match=r"surveyed\.R_lab_plate"):
         load_calibration(out)
     known.append("surveyed.R_lab_plate=[[1,0,0],[0,1,0],[0,0,1]]")
     init("--plate", folder, "--out", out, "--force", *(word for text in known for word in ("--set", text)))
@@ -259,9 +248,7 @@ def test_a_camera_of_fictrac_wants_a_movie_of_the_set_up_and_is_the_source_of_li
     movie, _ = two_movies(clean, tmp_path)
     config, out = tmp_path / "config.txt", tmp_path / "experiment.yaml"
     config.write_text(CONFIG.replace("src_fn           : cam1.mkv", "src_fn           : 2"))
-    with pytest.raises(
-        SettingsError, match=r"expected one movie, got camera 2 \(src_fn\); film .*init MOVIE --from-fic"
-    ):
+    with pytest.raises(SettingsError, match="got camera 2"):
         init("--from-fictrac", config, "--out", out)
     with pytest.raises(SettingsError, match="expected one movie, got 2"):
         init(movie, movie, "--from-fictrac", config, "--out", out)
@@ -377,35 +364,26 @@ def test_fictracs_fisheye_has_one_angle_for_every_pixel(clean, tmp_path):
     assert camera.f_px.tolist() == pytest.approx([height_px / math.radians(190)] * 2)
 
 
-def test_init_replaces_its_own_file_until_somebody_changes_it(clean, tmp_path):
-    movies, out = two_movies(clean, tmp_path), tmp_path / "experiment.yaml"
-    init(*movies, "--out", out)
+def test_init_replaces_its_own_file_until_somebody_changes_it(tmp_path):
+    movie, out = no_ball(tmp_path), tmp_path / "experiment.yaml"
+    init(movie, "--out", out)
     first = out.read_text()
     assert has_mark(out)  # also for another process
-    init(*movies, "--out", out, *ROUND)
+    init(movie, "--out", out, *ROUND)
     second = out.read_text()
     assert second != first
     out.write_text(second.replace("diameter: 18", "diameter: 19"))
-    with pytest.raises(SphereOrientError, match=r"of `sphereorient init` that was changed since; .*--force"):
-        init(*movies, "--out", out)
+    with pytest.raises(SphereOrientError, match=r"changed since; .*--force"):
+        init(movie, "--out", out)
     assert "diameter: 19" in out.read_text()
     assert not has_mark(out)
 
 
-def test_one_camera_needs_no_pose_and_two_do(tmp_path):
-    entry = "{model: pinhole, image_size: [64, 48], vfov_deg: 30}"
-    path = tmp_path / "cameras.yaml"
-    path.write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {entry}\n")
-    camera = load_cameras(path)["cam1"]
-    assert torch.equal(camera.R_cam_lab, torch.eye(3, dtype=torch.float64))
-    assert not camera.T_cam_lab_mm.any()
-    path.write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {entry}\n  cam2: {entry}\n")
-    with pytest.raises(CameraError, match="cam1, R and T: expected the camera's pose"):
-        load_cameras(path)
-    half = entry.replace("}", ", T: [0, 0, 0]}")
-    path.write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {half}\n")
-    with pytest.raises(CameraError, match="cam1, R: expected the camera's pose"):
-        load_cameras(path)
+def test_half_a_pose_is_refused(tmp_path):
+    camera = "{model: pinhole, image_size: [64, 48], vfov_deg: 30, T: [0, 0, 0]}"
+    (tmp_path / "cameras.yaml").write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {camera}\n")
+    with pytest.raises(CameraError, match="cam1, R: expected"):
+        load_cameras(tmp_path / "cameras.yaml")
 
 
 def test_a_movie_in_place_of_an_experiment_is_told(clean):
@@ -428,8 +406,8 @@ def one_uncommented(text: str) -> Iterator[tuple[str, str]]:
                 yield line, "\n".join([*lines[:k], line.replace(mark, "", 1), *lines[k + 1 :]])
 
 
-def test_each_commented_line_of_a_draft_can_be_uncommented_alone(clean, tmp_path):
-    two, one = two_movies(clean, tmp_path), tmp_path / "one" / "experiment.yaml"
+def test_each_commented_line_of_a_draft_can_be_uncommented_alone(tmp_path):
+    two, one = [no_ball(tmp_path, f"cam{k}.npy") for k in (1, 2)], tmp_path / "one" / "experiment.yaml"
     init(*two, "--out", tmp_path / "experiment.yaml")
     init(two[0], "--out", one)
     plate = tmp_path / "calibration.yaml"
@@ -465,21 +443,20 @@ def test_an_uncommented_wall_is_read_and_each_camera_has_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["\ufeff{}", "# mine\n{}", "first line"])
-def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(clean, tmp_path, change):
-    movies, out = two_movies(clean, tmp_path), tmp_path / "experiment.yaml"
-    init(*movies, "--out", out)
+def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(tmp_path, change):
+    movie, out = no_ball(tmp_path), tmp_path / "experiment.yaml"
+    init(movie, "--out", out)
     text = out.read_text()
     out.write_text(text.partition("\n")[2] if change == "first line" else change.format(text), newline="\r\n")
-    with pytest.raises(SphereOrientError, match=r"of `sphereorient init` that was changed since"):
-        init(*movies, "--out", out)
+    with pytest.raises(SphereOrientError, match="changed since"):
+        init(movie, "--out", out)
 
 
-def test_a_rate_that_fictrac_does_not_give_is_said(clean, tmp_path):
-    two_movies(clean, tmp_path)
-    config = tmp_path / "config.txt"
-    config.write_text(CONFIG)
+def test_a_rate_that_fictrac_does_not_give_is_said(tmp_path):
+    config, text = tmp_path / "config.txt", CONFIG.replace("cam1.mkv", no_ball(tmp_path).name)
+    config.write_text(text)
     more = ("--from-fictrac", config, "--out", tmp_path / "experiment.yaml")
     assert "src_fps gives no rate" in init(*more)
     assert "src_fps" not in init(*more, "--set", "frame_rate=99")
-    config.write_text(CONFIG.replace("src_fps          : -1", "src_fps          : 80"))
+    config.write_text(text.replace("src_fps          : -1", "src_fps          : 80"))
     assert "src_fps" not in init(*more)

@@ -1,7 +1,5 @@
 """`sphereorient mark`: what is drawn becomes the mask, in a browser as well; and who may ask."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterator
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from mark_examples import ask, opened, place, served
-from preflight_examples import PAINTED, Example, clean_example, write
+from preflight_examples import PAINTED, Example, clean_example, write  # noqa: F401
 
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment
@@ -23,11 +21,6 @@ from sphereorient.preflight.mark_masks import MaskMarking, drawn_mask
 pytest_plugins = ["browser_examples"]
 TRIANGLE = {"kind": "hide", "points": [[10, 10], [60, 10], [10, 60]]}
 DISK = {"kind": "show", "u": 100.0, "v": 70.0, "radius": 40.0}
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
-    return clean_example(tmp_path_factory)
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """`sphereorient mark calibration.yaml`: clicked fiducials tie a picture and are saved, in a browser as well."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -132,7 +130,7 @@ def test_a_file_that_cannot_be_changed_safely_stays_and_what_to_write_is_told(ma
     with pytest.raises(CameraError, match=r"write clicked: \{cam1: \[\[.*\]\]\} into the entry of pose 1"):
         marking.save(marking.document.pictures[1], points)
     marking.path.write_text(FILE.replace("pose: 1", "pose: 2"))  # since the page was opened
-    with pytest.raises(CameraError, match="expected one entry with pose 1 and cam1, got 0"):
+    with pytest.raises(CameraError, match="one entry with pose 1"):
         marking.save(marking.document.pictures[1], points)
 
 

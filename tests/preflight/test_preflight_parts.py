@@ -1,7 +1,5 @@
 """The measures of the check against oracles: outlines, blur, gaps, what start: must say."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,9 +11,10 @@ import torch
 from conftest import assert_close
 from hypothesis import given
 from hypothesis import strategies as st
+from locate_examples import looking_along_y, looking_down
 
 from sphereorient.calibration.comparison import LATEST, gaps_between
-from sphereorient.cameras import PinholeCamera, Port, PortCamera, holds_disk, triangulate
+from sphereorient.cameras import Port, PortCamera, holds_disk, triangulate
 from sphereorient.cameras.model import TelecentricCamera
 from sphereorient.experiment.recording import pictures_of
 from sphereorient.locate import Background, sightings_of
@@ -34,18 +33,8 @@ def f64(value: object) -> torch.Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def pinhole(R: list[list[float]]) -> PinholeCamera:
-    return PinholeCamera(
-        image_size=(300, 300),
-        f_px=f64(1400.0),
-        centre_px=f64((149.5, 149.5)),
-        R_cam_lab=f64(R),
-        T_cam_lab_mm=f64((0.0, 0.0, 400.0)),
-    )
-
-
-ALONG_Y = pinhole([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-DOWN_Z = pinhole([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+LENS = {"f_px": f64(1400.0), "centre_px": f64((149.5, 149.5)), "T_cam_lab_mm": f64((0.0, 0.0, 400.0))}
+ALONG_Y, DOWN_Z = (look(image_size=(300, 300), **LENS) for look in (looking_along_y, looking_down))
 WALL = Port(
     normal=f64((0.0, -1.0, 0.0)),
     offset_mm=f64(120.0),

@@ -1,7 +1,5 @@
 """Faults of pictures, light and files are told; whatever an experiment lacks, the check goes on."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -13,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import REPO, SHARED
-from preflight_examples import PAINTED, Example, checked, clean_example, complaints, of, write
+from preflight_examples import PAINTED, Example, checked, clean_example, complaints, of, write  # noqa: F401
 
 from sphereorient.errors import MovieError
 from sphereorient.experiment.recording import open_recording
@@ -24,11 +22,6 @@ from sphereorient.preflight.sample import sample_movie
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
-    return clean_example(tmp_path_factory)
 
 
 @pytest.mark.slow

@@ -1,7 +1,3 @@
-"""How good the paint is, and whether the map is that of the ball."""
-
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -9,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import assert_close, slow
-from preflight_examples import PAINTED, Example, checked, clean_example, of
+from preflight_examples import PAINTED, Example, checked, clean_example, of  # noqa: F401
 
 from sphereorient import so3
 from sphereorient.errors import TextureError
@@ -27,11 +23,6 @@ from sphereorient.sphere.texture import fibonacci_directions, map_directions, ra
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 RADIUS_PX = 39.0
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
-    return clean_example(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
@@ -123,14 +114,6 @@ def test_a_view_towards_a_direction_has_it_in_the_middle_facing_the_viewer():
     assert_close((R_view_body @ directions[..., None])[..., 0], torch.tensor([0.0, 0, -1]).double().expand(50, 3))
     assert_close(torch.linalg.det(R_view_body), torch.ones(50).double())
     assert_close(R_view_body @ R_view_body.mT, torch.eye(3).double().expand(50, 3, 3))
-
-
-def test_spread_directions_leave_no_gap():
-    """300 even ones are about 12 degrees apart, so that none of the sphere is further than that from one."""
-    directions = fibonacci_directions(300)
-    anywhere = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-    nearest = (anywhere.double() @ directions.T).amax(1)
-    assert float(torch.rad2deg(nearest.clamp(-1, 1).acos()).max()) < 12
 
 
 def test_a_map_of_one_colour_is_refused(clean, tmp_path):

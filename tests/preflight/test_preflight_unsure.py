@@ -1,7 +1,5 @@
 """What a short movie's own background may have made is no fault between cameras."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

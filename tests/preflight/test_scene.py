@@ -1,7 +1,5 @@
 """The check of several balls: too many or too few named, balls that are not found, sizes, and what is exchanged."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

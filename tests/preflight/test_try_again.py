@@ -1,7 +1,5 @@
 """A clip is tracked again on the page while circle, mask, light and field of view are changed, and these are saved."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Not in a conftest.py of this folder: that would hide tests/conftest.py from all that import from it.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager

@@ -1,7 +1,5 @@
 """The track that a perfect tracker would write of the excerpt, for what is drawn from tracks."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,3 @@
-"""What is exported is what the track holds, and says its units."""
-
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -165,13 +161,11 @@ def test_names_of_cameras_that_no_table_takes_are_made_plain():
     assert len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize("package", ["pyarrow", "xarray"])
-def test_a_missing_package_is_named_with_its_remedy(monkeypatch, track, tmp_path, package):
+@pytest.mark.parametrize(("to", "package"), [("parquet", "pyarrow"), ("nc", "xarray"), ("nwb", "pynwb")])
+def test_a_missing_package_is_named_with_its_remedy(monkeypatch, track, tmp_path, to, package):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(
-        OutputError, match=rf"package {package}, got none; .*pip install 'sphereorient\[table\]'"
-    ) as told:
-        to_xarray(track) if package == "xarray" else export_track(track, tmp_path / "t.parquet")
+    with pytest.raises(OutputError, match=f"package {package}, got none; .*pip install") as told:
+        export_track(track, tmp_path / f"t.{to}")
     assert "\n" not in str(told.value)
     assert not list(tmp_path.iterdir())
 

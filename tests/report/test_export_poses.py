@@ -1,7 +1,5 @@
 """A track for FicTrac's readers, evo, ParaView, NWB and netCDF; and how an animal walks on the ball."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import replace
@@ -175,14 +173,6 @@ def test_netcdf_is_read_back(track, tmp_path):
         np.testing.assert_array_equal(data["position"], track.position)
         np.testing.assert_array_equal(data["valid"], track.valid)
         assert data["omega_lab"].attrs["units"] == "rad/s"
-
-
-@pytest.mark.parametrize(("to", "package"), [("nwb", "pynwb"), ("nc", "xarray")])
-def test_a_missing_package_is_named(monkeypatch, track, tmp_path, to, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(OutputError, match=f"the package {package}"):
-        export_track(track, tmp_path / f"t.{to}")
-    assert not list(tmp_path.iterdir())
 
 
 def test_csv_needs_no_extra(monkeypatch, track, tmp_path):

@@ -1,7 +1,5 @@
 """Figures of a proposer's training: what is right is marked so, curves are those of the rows."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from matplotlib.colors import to_hex

@@ -1,7 +1,5 @@
 """The overlay shows what the track says, where the movie shows it."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -9,12 +7,11 @@ import av
 import numpy as np
 import pytest
 import torch
+from locate_examples import looking_along_y
 from overlay_examples import EXCERPT, RADIUS_MM, camera_changed, changed, command, excerpt, true_track
 from scipy.spatial.transform import Rotation
 
-from sphereorient.cameras import load_cameras
-from sphereorient.errors import ExperimentError, OutputError, TrackError
-from sphereorient.files.whole_file import writing
+from sphereorient.errors import ExperimentError, TrackError
 from sphereorient.pose.lights.disk import light_basis
 from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, frame_warnings
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
@@ -55,20 +52,12 @@ def ready():
         yield page, pictures
 
 
-def looking_along_y(tmp_path):
-    """The check of signs of docs/conventions.md: a camera looks along lab +y, lab z up, 200 mm before the origin."""
-    text = """schema: sphereorient-cameras/1
-cameras:
-  cam: {model: pinhole, f_px: 1000.0, centre: [100, 100], image_size: [201, 201],
-        R: [[1, 0, 0], [0, 0, -1], [0, 1, 0]], T: [0, 0, 200]}
-"""
-    path = tmp_path / "cameras.yaml"
-    path.write_text(text)
-    return load_cameras(path)["cam"]
-
-
-def test_axes_are_drawn_where_designs_check_of_signs_has_them(tmp_path):
-    camera = looking_along_y(tmp_path)
+def test_axes_are_drawn_where_designs_check_of_signs_has_them():
+    """docs/conventions.md: a camera looks along lab +y, lab z up, 200 mm before the origin."""
+    lens = {"T_cam_lab_mm": (0.0, 0.0, 200.0), "centre_px": (100.0, 100.0), "f_px": 1000.0}
+    camera = looking_along_y(
+        image_size=(201, 201), **{name: torch.tensor(value, dtype=torch.float64) for name, value in lens.items()}
+    )
     track = true_track(("cam1",), 0, 1)
     Rz = Rotation.from_euler("z", -90, degrees=True).as_matrix()
     path = path_of(changed(track, 0, position=np.zeros(3), orientation=Rz), 1.0)
@@ -290,22 +279,8 @@ def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
         _, first = next(pictures_by_row(of_part, np.array([0])))
         _, same = next(pictures_by_row(streams, np.array([12])))
         np.testing.assert_array_equal(first["cam1"], same["cam1"])
-    with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
+    with pytest.raises(TrackError, match="within 12:30, got 30:"):
         overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", FrameSelection(first=30))
-
-
-def test_a_movie_that_fails_leaves_the_old_one(tmp_path):
-    out = tmp_path / "overlay.mp4"
-    out.write_bytes(b"old")
-
-    def pictures():
-        yield np.zeros((64, 64, 3), np.uint8)
-        raise TrackError("in the middle")
-
-    with pytest.raises(TrackError, match="in the middle"), writing(force=True):
-        write_video(out, pictures(), 25)
-    assert out.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_pictures_are_taken_one_by_one(tmp_path):
@@ -331,21 +306,19 @@ def test_pictures_are_taken_one_by_one(tmp_path):
     [
         ({"cameras": ["cam3"]}, ExperimentError, "cam3"),
         ({"cameras": []}, ExperimentError, "--cameras"),
-        ({"path": "overlay.gif"}, OutputError, "expected .mp4"),
         ({"first": 90, "last": 99}, TrackError, "within 0:40, got 90:99"),
     ],
 )
 def test_refusals_are_one_line(tmp_path, arguments, error, words):
-    path = tmp_path / arguments.pop("path", "overlay.mp4")
     with pytest.raises(error, match=words) as caught:
-        overlay_movie(true_track(), excerpt(), path, FrameSelection(**arguments))
+        overlay_movie(true_track(), excerpt(), tmp_path / "overlay.mp4", FrameSelection(**arguments))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
 def test_tracks_of_other_times_are_refused(tmp_path):
     late = true_track()
-    with pytest.raises(TrackError, match="the experiment that the track was measured from"):
+    with pytest.raises(TrackError, match="was measured from"):
         overlay_movie(replace(late, time=late.time + 100), excerpt(), tmp_path / "o.mp4")
 
 

@@ -1,12 +1,9 @@
 """The figures of section IV: what was planted is what is drawn, in the units that the labels name."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
@@ -24,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.report import plots
 from sphereorient.report.plots import style
-from sphereorient.report.plots.style import interval_text, p_value_text, three_digits
+from sphereorient.report.plots.style import interval_text
 from sphereorient.report.plots.track import shown_part
 from sphereorient.statistics import Interval, Moments, Summary
 from sphereorient.statistics.cameras import CameraDistance, camera_distances
@@ -747,12 +744,6 @@ def test_an_interval_is_told_with_the_digits_it_deserves(value, low, high, words
         assert interval_text(of, "ms", 1e3).startswith(words if np.isnan(value) else f"{1e3 * value:.0f}"[:2])
 
 
-def test_numbers_have_three_digits_and_p_values_no_false_ones():
-    assert [three_digits(x) for x in (3.2, 10.06, 14_000.0, np.nan)] == ["3.20", "10.1", "14000", "unknown"]
-    p_values = [p_value_text(p) for p in (0.731, 0.0456, 0.0001, np.nan)]
-    assert p_values == ["p = 0.73", "p = 0.046", "p < 0.001", "p unknown"]
-
-
 def unknown(of: Interval) -> Interval:
     nothing = np.full_like(of.value, np.nan)
     return Interval(value=nothing, low=nothing, high=nothing, error=nothing)
@@ -803,9 +794,3 @@ def test_unknown_numbers_are_drawn_without_complaint(draw):
     for axes in figure.axes:
         for line in axes.lines:
             assert "nan" not in str(line.get_label())
-
-
-def test_writing_leaves_no_other_file(tmp_path: Path):
-    stem = tmp_path / "noise"
-    assert plots.write_figure(FIGURES["noise"](), stem) == (tmp_path / "noise.png", tmp_path / "noise.pdf")
-    assert len(list(tmp_path.iterdir())) == 2

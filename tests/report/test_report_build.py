@@ -1,10 +1,6 @@
-"""`sphereorient report` as a user calls it: what it writes, and what it says to bad input."""
-
-from __future__ import annotations
-
 import re
-import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -12,8 +8,8 @@ import numpy as np
 import PIL.Image
 import pytest
 from ensembles import EnsembleSpec, draw_ensemble, filtered_track
+from overlay_examples import command
 
-from sphereorient.cli import main
 from sphereorient.errors import OutputError
 from sphereorient.pose.worn import CELLS, UNUSED_PAINT, worn_text
 from sphereorient.report.build import check_report_folder
@@ -49,16 +45,7 @@ def place(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def report(capsys, monkeypatch):
-    """Run the command in this process; exit code, stdout, stderr."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["sphereorient", "report", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        said = capsys.readouterr()
-        return int(stopped.value.code or 0), said.out, said.err
-
-    return run
+    return partial(command, monkeypatch, capsys, "report")
 
 
 BAD = {

@@ -1,7 +1,5 @@
 """Planted trouble comes out in the strip and the stretches, and the pictures show the ball."""
 
-from __future__ import annotations
-
 import html
 import io
 import json
@@ -70,11 +68,6 @@ def test_stretches_are_the_planted_ones_longest_first_with_their_reasons_counted
 def test_ten_good_frames_between_part_two_stretches_and_nine_do_not(second, count):
     track = changed(changed(good_track(40), 10, flags=Flag.SPIKE), second, flags=Flag.SPIKE)
     assert len(bad_stretches(track)) == count
-
-
-def test_of_equally_long_stretches_the_one_that_is_not_valid_is_first():
-    track = changed(changed(good_track(60), 10, flags=Flag.SPIKE), 40, valid=False)
-    assert [one.first for one in bad_stretches(track)] == [40, 10]
 
 
 def test_frames_without_a_ball_are_neither_doubtful_nor_lost():

@@ -1,7 +1,5 @@
 """The strip in a browser, from disk and without a network: the bad stretch is found and its frames are seen."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -149,14 +147,6 @@ def test_a_click_on_the_overview_goes_there_and_the_pointer_is_told_what_it_is_o
         assert "the orientation jumps" in tip.inner_text()
         assert chosen(part) == 121
         assert chosen(section(page, "excerpt")) != 121  # the tracks of a page are by themselves
-
-
-def test_a_number_can_be_typed(open_page, page_path):
-    with open_page(page_path) as page:
-        part = section(page, "planted")
-        part.locator(".strip__number").fill("250")
-        part.locator(".strip__number").press("Enter")
-        assert readout(part).startswith("frame 250, ")
 
 
 @pytest.mark.parametrize("width", [400, 1280, 1920])

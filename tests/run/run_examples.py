@@ -1,7 +1,3 @@
-"""The excerpt as a run of several windows, and how two tracks are compared."""
-
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

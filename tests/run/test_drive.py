@@ -1,7 +1,5 @@
 """Workers: same bytes as one process, failures stay with their experiment, the dead are replaced."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -49,7 +47,7 @@ def test_tracks_of_several_experiments_have_the_names_of_their_folders(tmp_path)
 
 def test_one_track_for_two_experiments_is_refused(tmp_path, settings):
     request = Request(experiment=EXCERPT, out=tmp_path / "track.h5", settings=settings)
-    with pytest.raises(SettingsError, match="expected a track for each experiment"):
+    with pytest.raises(SettingsError, match="track for each"):
         run_many([request, request], ProcessExecutor(1))
 
 
@@ -163,6 +161,6 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(tmp_path
 
 def test_a_cluster_that_is_not_there_is_one_line():
     pytest.importorskip("distributed")
-    with pytest.raises(SettingsError, match=r"expected a Dask scheduler, got .*docs/long-runs\.md") as refused:
+    with pytest.raises(SettingsError, match=r"Dask scheduler.*docs/long-runs\.md") as refused:
         dask_executor("nonsense://nowhere")
     assert "\n" not in str(refused.value)

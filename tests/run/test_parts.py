@@ -1,7 +1,4 @@
-"""The parts of a run: whose folder it is, checksums, rotations, the lock."""
-
-from __future__ import annotations
-
+import json
 import multiprocessing
 from pathlib import Path
 
@@ -23,8 +20,8 @@ from sphereorient.trajectory import Reason
 BATCH = Batch(first=0, last=3, lengths=(3,))
 
 
-def request_to(out: Path) -> Request:
-    return Request(experiment=EXCERPT / "experiment.yaml", out=out, settings=load_settings(None, []))
+def request_to(out: Path, **changed: object) -> Request:
+    return Request(experiment=EXCERPT / "experiment.yaml", out=out, settings=load_settings(None, []), **changed)
 
 
 @pytest.fixture
@@ -110,6 +107,28 @@ def test_a_damaged_part_is_measured_again(store, name, values, sealed):
     with pytest.raises(TrackError, match="a damaged file"):
         store.read(BATCH)
     assert store.missing([BATCH]) == [BATCH]
+
+
+def test_parts_of_another_run_are_refused_with_what_differs(store, tmp_path):
+    of_one = request_to(tmp_path / "track.h5", cameras=("cam1",))
+    with (
+        pytest.raises(TrackError, match=r"another cam2\.mkv, cameras, empty_cam2\.png;"),
+        store.held(of_one, resume=True),
+    ):
+        pass
+    told = json.loads((store.folder / "run.json").read_text())
+    (store.folder / "run.json").write_text(json.dumps(told | {"cam1.mkv": "12 34"}))
+    request = request_to(tmp_path / "track.h5")
+    with pytest.raises(TrackError, match=r"with another cam1\.mkv;"), store.held(request, resume=True):
+        pass
+
+
+def test_two_runs_do_not_write_one_track(store, tmp_path):
+    request = request_to(tmp_path / "track.h5")
+    with store.held(request, resume=True):
+        with pytest.raises(OutputError, match="another run"), FolderStore(store.folder).held(request, resume=True):
+            pass
+        assert store.missing([BATCH]) == []
 
 
 def _hold(out: Path, held: object, done: object) -> None:

@@ -1,8 +1,5 @@
 """A run that was killed goes on where it was, and its track is that of a run that was not, to the last bit."""
 
-from __future__ import annotations
-
-import json
 import os
 import random
 import shutil
@@ -16,7 +13,7 @@ import pytest
 from excerpt_examples import shortened
 from run_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
-from sphereorient.errors import OutputError, TrackError
+from sphereorient.errors import TrackError
 from sphereorient.files.hdf5 import digest
 from sphereorient.methods.settings import load_settings
 from sphereorient.run import FolderStore, Request
@@ -107,26 +104,6 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
     assert datasets(request.out) == datasets(whole / "track.h5")
 
 
-def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, request_of):
-    request = request_of(tmp_path, cameras=("cam1",))
-    parts = halfway(whole, request)
-    with pytest.raises(TrackError, match=r"another cam2\.mkv, cameras, empty_cam2\.png;"):
-        tracked(request, resume=True)
-    told = json.loads((parts.folder / "run.json").read_text())
-    told["cam1.mkv"] = "12 34"
-    (parts.folder / "run.json").write_text(json.dumps(told))
-    with pytest.raises(TrackError, match=r"with another cam1\.mkv;"):
-        tracked(request_of(tmp_path), resume=True)
-
-
-def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
-    request = request_of(tmp_path)
-    parts = halfway(whole, request)
-    with parts.held(request, resume=True), pytest.raises(OutputError, match="another run"):
-        tracked(request, resume=True)
-    assert list(parts.folder.glob("poses-*"))
-
-
 @pytest.mark.slow
 def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
     again = request_of(tmp_path, learnt=whole / "learnt.h5")
@@ -134,6 +111,7 @@ def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
     assert datasets(again.out) == datasets(whole / "track.h5")
 
 
+@pytest.mark.slow  # the run whose knowledge it is
 def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
     other = tmp_path / "other.h5"
     shutil.copy(whole / "learnt.h5", other)
@@ -141,7 +119,7 @@ def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
         file.move("cameras/cam2", "cameras/left")
         file.attrs["cameras"] = ["cam1", "left"]
         file.attrs["sha256"] = digest(file)
-    with pytest.raises(TrackError, match="expected what was learnt of cam2"):
+    with pytest.raises(TrackError, match="learnt of cam2"):
         tracked(request_of(tmp_path, learnt=other))
 
 

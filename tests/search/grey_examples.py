@@ -1,7 +1,5 @@
 """Disks for the tests of the grey search: as a camera would give them, with the errors of a real outline."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,3 @@
-"""Disks that the tests of this room share: rendered, clean, with the attitude known."""
-
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,3 @@
-"""The record of the room, Candidates, and the settings."""
-
-from __future__ import annotations
-
 import pydantic
 import pytest
 import torch
@@ -69,9 +65,9 @@ def test_candidates_whose_lengths_disagree_are_refused(rng):
         {"offset": torch.tensor([0, 2, 2, 4])},
         {"reason": good.reason[:2]},
     ):
-        with pytest.raises(ShapeError, match=r"Candidates: expected .* orientations and scores"):
+        with pytest.raises(ShapeError, match="orientations and scores"):
             Candidates(**(parts | wrong))
-    with pytest.raises(ShapeError, match=r"Candidates.R_view_body: expected shape \(\.\.\., 3, 3\)"):
+    with pytest.raises(ShapeError, match=r"Candidates\.R_view_body"):
         Candidates(**(parts | {"R_view_body": torch.zeros(3, 4)}))
 
 

@@ -1,7 +1,3 @@
-"""The disk, cut out of a frame at a common size."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Two proposers: who is asked when, and in which order their answers come."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,3 @@
-"""The grey search on disks whose attitude is known."""
-
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -159,7 +155,7 @@ def test_no_proposal_scores_below_score_min_and_those_above_stay():
 
 
 def test_disks_of_another_size_are_refused():
-    with pytest.raises(ShapeError, match=r"disks: expected \(F, 40, 40\), got \(2, 42, 42\)"):
+    with pytest.raises(ShapeError, match=r"got \(2, 42, 42\)"):
         grey_search_of("blobs").propose(torch.zeros(2, 42, 42))
 
 

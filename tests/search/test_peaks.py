@@ -1,7 +1,3 @@
-"""Groups of neighbours, the best of them, and which are tops."""
-
-from __future__ import annotations
-
 import math
 
 import pytest

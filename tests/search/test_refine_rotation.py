@@ -1,7 +1,3 @@
-"""The climb from a rough orientation to the best fit nearby, and the pictures freed of light."""
-
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,3 @@
-"""The template search on disks whose attitude is known (paper sections III B and C)."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close
@@ -139,18 +135,6 @@ def test_T_of_each_candidate_is_the_renderers():
     found = bank.propose(disks)
     frame = torch.repeat_interleave(torch.arange(4), found.counts)
     assert_close(found.score, bank.quality(bank.paint(disks)[frame], found.R_view_body.float()).double(), atol=1e-6)
-
-
-def test_the_renderer_makes_the_coarse_bank_and_T_of_all_candidates_at_once(monkeypatch):
-    asked = []
-    forward = SphereRenderer.forward
-    monkeypatch.setattr(SphereRenderer, "forward", lambda self, R: (asked.append(len(R)), forward(self, R))[1])
-    bank = TemplateBank(texture_of("dots"), SIZE, OrientSettings(coarse_step_deg=18))
-    assert sum(asked) == len(bank.grid)
-    asked.clear()
-    found = bank.propose(clean_disks("dots", attitudes(40)))
-    assert len(asked) == 2  # batches of 32 disks
-    assert sum(asked) >= len(found.score)
 
 
 def test_gradients_of_T_by_orientation_paint_and_texture_agree_with_differences(rng):

@@ -1,7 +1,5 @@
 """How well a grid of rotations covers: the oracle of both grids' tests."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,3 @@
-"""Damped solutions and the cross product along axis 1, against numpy and torch."""
-
-from __future__ import annotations
-
 import torch
 from torch.testing import assert_close
 

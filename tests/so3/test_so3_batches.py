@@ -1,7 +1,5 @@
 """The batch law, one driver over all functions: a batch is the stack of its singles, in the dtype that came."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close

@@ -1,7 +1,5 @@
 """In whose components an increment's axis is: docs/errata.md E4."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Lattman's angles and grid; corrected and printed steps side by side: docs/errata.md E5."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Corrected and printed forms side by side: docs/errata.md E1, E2, E3, E9."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,3 @@
-"""Maps, and an independent way to look them up, that the tests of this room share."""
-
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Maps compared: planted rotations, shifts and wear are found with their signs, and what is unknown stays so."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

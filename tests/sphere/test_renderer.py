@@ -1,7 +1,5 @@
 """The renderer: camera's pictures and disks, gradients, batches; the smooth pictures for derivatives of fits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -144,11 +142,11 @@ def test_a_sphere_beyond_the_edge_is_cut_off_there(texture):
 
 
 def test_what_cannot_be_rendered_is_refused(texture, R):
-    with pytest.raises(SettingsError, match="expected camera or size_px, got neither"):
+    with pytest.raises(SettingsError, match="got neither"):
         SphereRenderer(texture)
-    with pytest.raises(SettingsError, match="expected camera or size_px, got both"):
+    with pytest.raises(SettingsError, match="got both"):
         SphereRenderer(texture, camera=near_camera(), size_px=8)
-    with pytest.raises(SettingsError, match="radius_mm: expected a number above 0"):
+    with pytest.raises(SettingsError, match="radius_mm"):
         SphereRenderer(texture, radius_mm=0.0, size_px=8)
     with pytest.raises(ShapeError, match="texture"):
         SphereRenderer(texture[:, :8], size_px=8)
@@ -156,7 +154,7 @@ def test_what_cannot_be_rendered_is_refused(texture, R):
         SphereRenderer(texture, size_px=8)(R[..., :2])
     with pytest.raises(ShapeError, match="position_mm"):
         SphereRenderer(texture, size_px=8)(R, torch.zeros(2))
-    with pytest.raises(CameraError, match="a ball that is seen whole"):
+    with pytest.raises(CameraError, match="seen whole"):
         SphereRenderer(texture, radius_mm=9.0, camera=near_camera())(R, f64([0, -260.0, 0]))
 
 

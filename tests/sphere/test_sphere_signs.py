@@ -1,7 +1,5 @@
 """All signs between map and picture: docs/conventions.md, handedness, sense of the perspective (docs/errata.md A1)."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

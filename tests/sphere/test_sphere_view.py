@@ -1,7 +1,5 @@
 """The canonical view: which normal a pixel shows, and its pictures (docs/errata.md A4)."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 
@@ -262,5 +260,5 @@ def test_a_batch_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
 
 
 def test_what_is_no_rotation_matrix_is_refused(rng):
-    with pytest.raises(ShapeError, match=r"R_view_body: expected shape \(\.\.\., 3, 3\)"):
+    with pytest.raises(ShapeError, match="R_view_body"):
         orthographic_view(8).render(random_map(rng), torch.zeros(3, 4))

@@ -1,7 +1,3 @@
-"""Ensembles and tracks whose statistics are known."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

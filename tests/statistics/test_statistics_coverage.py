@@ -1,7 +1,5 @@
 """A reduced version of scripts/ensemble_coverage.py."""
 
-from __future__ import annotations
-
 import ensemble_coverage as coverage
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ensembles import EnsembleSpec, draw_ensemble

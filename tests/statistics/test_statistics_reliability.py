@@ -1,7 +1,3 @@
-"""Reliability curves of sets whose calibration is planted."""
-
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,5 @@
-"""Cameras and scenes that the tests of this room share."""
-
-from __future__ import annotations
-
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,6 +8,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
+from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.synth import RenderedScene, SynthSettings, make_scene
 
 NOISELESS = {"read_noise": 0.0, "shot_noise": 0.0, "blur_px": 0.0}
@@ -30,6 +28,11 @@ def camera(size: tuple[int, int] = (200, 160), f_px: float = 800.0) -> PinholeCa
         centre_px=f64([(size[0] - 1) / 2, (size[1] - 1) / 2]),
         f_px=f64(f_px),
     )
+
+
+def frames_of(path: Path) -> dict[str, np.ndarray]:
+    """All frames (N, H, W) of each movie of an experiment."""
+    return {name: np.stack(list(movie.frames())) for name, movie in open_movies(load_experiment(path)).items()}
 
 
 def seen_at(lens: PinholeCamera, right_deg: float, down_deg: float, depth_mm: float = 400.0) -> Tensor:

@@ -1,7 +1,5 @@
 """Degraded experiments: the truth stays true, and the files are wrong by as much as the unit says."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

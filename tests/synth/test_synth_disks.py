@@ -1,7 +1,5 @@
 """Single balls as a proposer wants them: where paint appears, what degradations do, the same for the same seed."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Random motion against finite differences of itself, and its seeds."""
-
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,3 @@
-"""Pictures of the scene: where the sphere is, how bright, how blurred, how noisy."""
-
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Several balls in one movie: who is who in the files, no two overlap, nearer ones hide farther ones, one stays one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

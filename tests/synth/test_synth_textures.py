@@ -1,7 +1,5 @@
 """Random maps: seamless on the sphere, in the layout of docs/conventions.md."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from conftest import assert_close

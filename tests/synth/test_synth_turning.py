@@ -1,7 +1,5 @@
 """A sphere that turns about a known lab axis, through rendered pictures and the template search: all signs at once."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

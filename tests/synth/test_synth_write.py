@@ -1,7 +1,5 @@
 """A whole experiment on disk: what was written is what is read, and it is true."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -12,10 +10,10 @@ import pydantic
 import pytest
 import torch
 from conftest import assert_close
+from synth_examples import frames_of
 
-from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import OutputError
-from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.experiment import load_experiment
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, make_scene, render_frame, write_synthetic_experiment
 from sphereorient.synth.scene import seeded
@@ -41,11 +39,6 @@ def truth_of(path: Path) -> dict[str, torch.Tensor]:
         return {name: torch.from_numpy(file[name][()]) for name in TRUTH}
 
 
-def frames_of(path: Path) -> dict[str, np.ndarray]:
-    movies = open_movies(load_experiment(path))
-    return {name: np.stack(list(movie.frames())) for name, movie in movies.items()}
-
-
 def test_it_is_an_experiment_that_loads(written):
     experiment = load_experiment(written)
     assert experiment.name == "tiny"
@@ -62,23 +55,6 @@ def test_it_is_an_experiment_that_loads(written):
     }
     assert experiment.texture_path is not None
     assert load_texture(experiment.texture_path).shape == (512, 1024)
-
-
-def test_movies_have_their_size_and_number_of_frames(written):
-    for frames in frames_of(written).values():
-        assert frames.shape == (FRAMES, 140, 160)
-        assert frames.dtype == np.uint8
-        assert all(not np.array_equal(frames[k], frames[k + 1]) for k in range(FRAMES - 1))
-
-
-def test_the_cameras_file_holds_the_cameras_that_rendered(written):
-    read = load_experiment(written).cameras
-    for name, camera in default_cameras(SETTINGS).items():
-        other = read[name]
-        assert isinstance(camera, TsaiCamera)
-        assert isinstance(other, TsaiCamera)
-        for part in ("f_mm", "pixel_pitch_mm", "sx", "kappa1", "centre_px", "R_cam_lab", "T_cam_lab_mm"):
-            assert torch.equal(getattr(other, part), getattr(camera, part))
 
 
 def test_the_truth_has_every_dataset_in_its_shape(written):
@@ -174,7 +150,7 @@ def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="expected a folder that can be made"):
+    with pytest.raises(OutputError, match="can be made"):
         write_synthetic_experiment(tmp_path / "file" / "folder", SETTINGS)
 
 
@@ -187,7 +163,7 @@ def test_impossible_and_unknown_settings_are_refused(wrong):
 
 
 def test_an_exposure_longer_than_a_frame_is_refused_as_the_experiment_would_be():
-    with pytest.raises(pydantic.ValidationError, match="exposure: expected at most 1 / frame_rate"):
+    with pytest.raises(pydantic.ValidationError, match=r"exposure: .*frame_rate"):
         SynthSettings(exposure=0.01, frame_rate=200.0)
     assert SynthSettings(exposure=0.005, frame_rate=200.0).exposure == 0.005
 

@@ -1,10 +1,7 @@
 """Wear planted in the maps of a series is found, grows as it was planted, and keeps its place from map to map."""
 
-from __future__ import annotations
-
 import json
 import math
-import sys
 from functools import cache
 
 import cv2
@@ -12,10 +9,10 @@ import pytest
 import torch
 from conftest import assert_close
 from map_examples import save_map, warped
+from overlay_examples import command as run
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cli import main
 from sphereorient.errors import PaintError
 from sphereorient.report.texture_map import write_seen
 from sphereorient.sphere.compare import turned_map
@@ -151,24 +148,16 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
     assert int(number.max()) == 2
 
 
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["sphereorient", "compare-maps", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    printed = capsys.readouterr()
-    return int(stop.value.code or 0), printed.out, printed.err
-
-
 @pytest.mark.slow
 def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
     paths = [save_map(learnt(k), tmp_path / f"movie{k}.png") for k in range(3)]
     write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0.png")
-    code, said, err = run(monkeypatch, capsys, "--series", *paths, "--out", tmp_path / "wear.png")
+    code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths, "--out", tmp_path / "wear.png")
     assert code == 0, err
     assert "place 1 at longitude 20°, latitude 15°" in said
     assert "place 2 at longitude -120°, latitude -25°" in said
     assert cv2.imread(str(tmp_path / "wear.png")).shape[1] > 500
-    code, said, err = run(monkeypatch, capsys, "--series", *paths[:2], "--json")
+    code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths[:2], "--json")
     assert code == 0, err
     told = json.loads(said)
     assert [row["map"] for row in told["maps"]] == [str(paths[1])]
@@ -183,7 +172,7 @@ def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
 def test_maps_that_make_no_pair_and_no_series_are_refused_in_one_line(tmp_path, monkeypatch, capsys):
     paths = [save_map(paint(), tmp_path / f"{k}.png") for k in range(3)]
     for arguments, expected in ((paths, "--series"), (paths[:1], "two"), (["--series", paths[0]], "two or more")):
-        code, _, err = run(monkeypatch, capsys, *arguments)
+        code, _, err = run(monkeypatch, capsys, "compare-maps", *arguments)
         assert code == 2
         assert len(err.strip().splitlines()) == 1
         assert expected in err

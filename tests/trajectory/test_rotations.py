@@ -1,7 +1,3 @@
-"""Orientations of tracks as arrays: angles and their errors."""
-
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

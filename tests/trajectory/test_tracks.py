@@ -1,7 +1,3 @@
-"""Tracks of several balls: the file, and which reader takes which file."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,10 +1,6 @@
 """The trajectory: every dataset always there, written whole or not at all, read back bit by bit."""
 
-from __future__ import annotations
-
 import json
-import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -16,7 +12,6 @@ import numpy as np
 import pytest
 
 from sphereorient.errors import OutputError, ShapeError, TrackError
-from sphereorient.files.whole_file import writing
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 FRAMES = 7
@@ -151,46 +146,10 @@ def test_a_trajectory_of_no_frame_or_one_is_a_trajectory(tmp_path: Path, frames:
     assert read.summary()["frames"] == frames
 
 
-def test_the_same_arrays_give_the_same_bytes(tmp_path: Path) -> None:
-    track = full_trajectory()
-    track.save(tmp_path / "a.h5")
-    turned = replace(track, cameras=dict(reversed(list(track.cameras.items()))))
-    turned.save(tmp_path / "b.h5")
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-
-
 def test_a_reason_of_a_later_version_is_kept(tmp_path: Path) -> None:
     camera = replace(CameraTrack.empty(2), reason=("ok", "swallowed_by_a_very_large_bubble"))
     replace(Trajectory.empty(np.zeros(2)), cameras={"cam1": camera}).save(tmp_path / "track.h5")
     assert Trajectory.load(tmp_path / "track.h5").cameras["cam1"].reason == camera.reason
-
-
-def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "track.h5"
-    path.write_bytes(b"the old one")
-
-    def disk_full(*_: object) -> None:
-        assert path.read_bytes() == b"the old one"
-        assert len(list(tmp_path.iterdir())) == 2
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("sphereorient.trajectory.trajectory.write_camera", disk_full)
-    with pytest.raises(OutputError, match="No space left"), writing(force=True):
-        full_trajectory().save(path)
-    assert path.read_bytes() == b"the old one"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_saving_makes_a_missing_folder_and_refuses_one_in_its_place(tmp_path: Path) -> None:
-    full_trajectory().save(tmp_path / "new" / "track.h5")
-    assert len(Trajectory.load(tmp_path / "new" / "track.h5")) == len(full_trajectory())
-    shutil.rmtree(tmp_path / "new")
-    (tmp_path / "track.h5").mkdir()
-    with pytest.raises(OutputError, match=r"track\.h5"):
-        full_trajectory().save(tmp_path / "track.h5")
-    assert [p.name for p in tmp_path.iterdir()] == ["track.h5"]
 
 
 def test_what_is_no_track_is_refused_by_name(tmp_path: Path) -> None:
@@ -260,11 +219,6 @@ def test_the_summary_counts_lost_frames_by_reason() -> None:
     assert summary["valid"] == int(full_trajectory().valid.sum())
     assert list(summary["lost"]["cam1"].items()) == [("dark", 2)]
     assert json.loads(json.dumps(summary)) == summary
-
-
-def test_the_trajectory_does_not_import_torch() -> None:
-    look = "import sys, sphereorient.trajectory; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", look], check=False).returncode == 0
 
 
 def test_a_track_of_before_the_systematic_errors_is_read_without_them(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The Cramér-Rao bound: what can be worked out by hand, its laws, and the scatter of an estimator that reaches it."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -195,7 +193,7 @@ def test_covariance_is_the_inverse_of_information_in_any_units():
 
 
 def test_what_is_no_picture_is_refused(patches):
-    with pytest.raises(SettingsError, match="noise_share: expected a number above 0, got 0"):
+    with pytest.raises(SettingsError, match="noise_share"):
         cramer_rao_bound(patches, face(), diameter_px=24, noise_share=0.0)
     with pytest.raises(ShapeError, match="R_view_body"):
         cramer_rao_bound(patches, torch.zeros(3), diameter_px=24)

@@ -1,7 +1,5 @@
 """Paint before it is on the ball: how coarse it is, what its views can say, and strips of true size."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Photographs of a ball with dots, drawn from the definitions: none of the package's renderers is asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

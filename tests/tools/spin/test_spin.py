@@ -1,7 +1,5 @@
 """Even spins: planted ones come back, also above half a turn per picture; aliases are told; handedness is certain."""
 
-from __future__ import annotations
-
 import csv
 import math
 from itertools import pairwise
