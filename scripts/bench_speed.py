@@ -138,8 +138,8 @@ def in_turn(work: Callable[[], float]) -> tuple[list[float], list[float]]:
     for _ in range(TURNS):
         fast = work()
         with (
-            mock.patch.object(compiled, "library", return_value=None),
-            mock.patch.object(kalman, "library", return_value=None),
+            mock.patch.object(compiled, "refine_library", return_value=None),
+            mock.patch.object(kalman, "kalman_library", return_value=None),
         ):
             pairs.append((fast, work()))
     return [fast for fast, _ in pairs], [slow for _, slow in pairs]

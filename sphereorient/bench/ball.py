@@ -59,7 +59,7 @@ GREY_BODY, GREY_LEG = 28.0, 22.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Paint:
+class Caps:
     """Dark caps on a bright ball."""
 
     caps: int = 150
@@ -74,7 +74,7 @@ class BallScene:
     """One scene; what peers print of theirs: median and 95 % of the steps, degrees, and drift, degrees a minute."""
 
     motion: str = "walk"  # or saccades: a third of the way, the same turns
-    paint: Paint = field(default_factory=Paint)
+    paint: Caps = field(default_factory=Caps)
     size: tuple[int, int] = (640, 480)  # px
     field_deg: float = 30.0  # vertical field of view
     azimuth_deg: float = 3.0  # of the ball, to the right
@@ -114,10 +114,10 @@ SCENES: Mapping[str, BallScene] = {
         exposure=0.8, blur_px=1.5, fictrac=(0.304, 0.845, -1.351), spintrack=(0.098, 0.459, -0.705)
     ),
     "sparse": BallScene(
-        paint=Paint(caps=40, radius_deg=(8.0, 16.0)), fictrac=(0.341, 0.835, -0.837), spintrack=(0.062, 0.159, -0.491)
+        paint=Caps(caps=40, radius_deg=(8.0, 16.0)), fictrac=(0.341, 0.835, -0.837), spintrack=(0.062, 0.159, -0.491)
     ),
     "speckle": BallScene(
-        paint=Paint(caps=1500, radius_deg=(1.0, 2.5), soft_deg=0.4),
+        paint=Caps(caps=1500, radius_deg=(1.0, 2.5), soft_deg=0.4),
         fictrac=(90.266, 175.677, 160.536),
         spintrack=(0.037, 0.091, -0.068),
     ),
@@ -134,7 +134,7 @@ SCENES: Mapping[str, BallScene] = {
         spintrack=(0.049, 0.099, 0.104),
     ),
     "low_contrast": BallScene(
-        paint=Paint(dark=(0.25, 0.35), base=0.7), fictrac=(0.346, 0.902, -1.030), spintrack=(0.046, 0.110, -0.008)
+        paint=Caps(dark=(0.25, 0.35), base=0.7), fictrac=(0.346, 0.902, -1.030), spintrack=(0.046, 0.110, -0.008)
     ),
     "lighting": BallScene(
         flicker=0.15,
@@ -150,7 +150,7 @@ SCENES: Mapping[str, BallScene] = {
 }
 
 
-def painted(paint: Paint, rng: np.random.Generator) -> Floats:
+def painted(paint: Caps, rng: np.random.Generator) -> Floats:
     """Return a map (H, 2 H) of caps that do not touch, over a ball with twelve large faint ones."""
     directions = map_directions(ROWS).float().numpy()
     grey = np.full(directions.shape[:2], paint.base, np.float32)
@@ -443,7 +443,7 @@ class BallRow:
         return {"radius_px": self.radius_px, "cpu_ms": self.cpu_ms, **rows}
 
 
-def measured(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
+def measure_scene(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
     """Track a scene from nothing; `refine`: by the precise method as well, with the map of the first pass."""
     with h5py.File(path.with_name("truth.h5")) as file:
         R_true = file["orientation"][()]

@@ -13,7 +13,7 @@ from sphereorient.cli.options import (
     Align,
     CommonOptions,
     ExperimentPath,
-    FicTracConfig,
+    FicTracConfigPath,
     Quiet,
     SphereName,
     TrackPath,
@@ -150,7 +150,7 @@ class _ExportOptions:
         ),
     ] = None
     experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None
-    axes: FicTracConfig = None
+    axes: FicTracConfigPath = None
     sphere: SphereName = None
     quiet: Quiet = False
 

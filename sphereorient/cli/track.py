@@ -11,7 +11,7 @@ from rich.table import Column, Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfig, NoCache, Resume, ball_words
+from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfigPath, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 from sphereorient.files.whole_file import check_ending
 
@@ -186,7 +186,7 @@ class _LiveOptions(CameraOptions):
     ] = None
     record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
-    axes: FicTracConfig = None
+    axes: FicTracConfigPath = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
 
 

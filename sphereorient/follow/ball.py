@@ -23,7 +23,7 @@ from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
 from sphereorient.pose.fit import HOPELESS
 from sphereorient.pose.fitter import DisksPx, Fitter, Steps
-from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.neighbours import Neighbours, joined_neighbours
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 
 Floats = NDArray[np.float64]
@@ -224,7 +224,7 @@ class BallTracker:
 
     def _predicted(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> _Predicted:
         """Return where the ball is expected, and the pictures that may show it."""
-        known, among = torch.stack([one.use for one in expected]), joined([one.among for one in expected])
+        known, among = torch.stack([one.use for one in expected]), joined_neighbours([one.among for one in expected])
         frames = [[shot.shown for shot in row] for row in shots]
         readable = torch.tensor([[shot.readable for shot in row] for row in shots])
         X, R, precision, moved = self._begun(expected, frames, known & readable, among)

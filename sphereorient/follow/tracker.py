@@ -15,7 +15,7 @@ from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirror
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
-from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.neighbours import Neighbours, joined_neighbours
 from sphereorient.pose.poses import Poses, supported
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
@@ -203,7 +203,7 @@ def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[
         places = {other: _found_place(poses, None) for other, poses in there.items() if len(poses)}
         radii = {other: one.fitter.radius_mm for other, one in balls.items() if other != name}
         each.append(_neighbours(radii, places))
-    found = joined(each)
+    found = joined_neighbours(each)
     assert found is not None
     return found
 

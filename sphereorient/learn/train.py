@@ -120,7 +120,8 @@ class ProposerModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Compute the metrics."""
-        self.metrics = metrics.metrics_of(metrics.joined(self._predictions), self.network.grid, self.spread_rad)
+        predictions = metrics.joined_predictions(self._predictions)
+        self.metrics = metrics.metrics_of(predictions, self.network.grid, self.spread_rad)
         self._predictions = []
         self.log("validation_nll", self.metrics.nll, logger=False)
 
@@ -220,7 +221,7 @@ def train_proposer(
     network.load_state_dict(kept.best)
     network.cpu().eval()
     with torch.no_grad():
-        predictions = metrics.joined([metrics.predict(network, batch) for batch in data.validation])
+        predictions = metrics.joined_predictions([metrics.predict(network, batch) for batch in data.validation])
     temperature = metrics.fitted_temperature(predictions, network.grid)
     measured = metrics.metrics_of(predictions, network.grid, math.radians(settings.training.spread_deg), temperature)
     own = settings.pictures.texture

@@ -263,7 +263,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Camera:
+class LiveCamera:
     """A camera of an experiment, and how its device is opened."""
 
     name: str  # in messages
@@ -343,7 +343,7 @@ def worded(name: str) -> Iterator[None]:
         raise MovieError(refusal(name, expected="a camera that works", got=error_words(error), do=do)) from None
 
 
-def device_frames(cameras: Sequence[Camera], tell: Tell, stopped: Event) -> Iterator[Arrival]:
+def device_frames(cameras: Sequence[LiveCamera], tell: Tell, stopped: Event) -> Iterator[Arrival]:
     """Yield the instants of cameras until `stopped`, or the only one ends; errors: `Camera.shots`, `Instants`."""
     instants, waiting = Instants([one.stream.name for one in cameras], tell), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
@@ -361,7 +361,7 @@ def device_frames(cameras: Sequence[Camera], tell: Tell, stopped: Event) -> Iter
         yield from instants.ready(time.perf_counter())
 
 
-def _side_by_side(cameras: Sequence[Camera], stopped: Event, due_s: Callable[[], float]) -> Iterator[Came]:
+def _side_by_side(cameras: Sequence[LiveCamera], stopped: Event, due_s: Callable[[], float]) -> Iterator[Came]:
     """Yield the pictures of cameras, each read in a thread, as they come; None: none came until one was due."""
     waiting: SimpleQueue[Came | Exception] = SimpleQueue()
 

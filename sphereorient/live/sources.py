@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 from sphereorient.errors import MovieError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording
-from sphereorient.live.devices import MAKERS, RELEASE_S, Camera, device_frames, worded
+from sphereorient.live.devices import MAKERS, RELEASE_S, LiveCamera, device_frames, worded
 from sphereorient.live.feed import Arrival, FrameBytes, Tell
 from sphereorient.live.shared import shared_frames
 from sphereorient.movies import flipped_picture
@@ -82,7 +82,7 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
                 with worded(f"{kind}{where}"):
                     open_device = drivers.enter_context(MAKERS[kind](producer))
                 cameras = [
-                    Camera(
+                    LiveCamera(
                         name=f"{kind}{serial or producer}",
                         open=partial(open_device, serial),
                         stream=stream,

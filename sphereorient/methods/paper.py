@@ -27,11 +27,11 @@ from sphereorient.search import Candidates, Proposer, crop_disk
 CHUNK = 64  # frames held at once; a result does not depend on it
 
 
-def learn(job: Job, progress: Progress) -> None:
+def _learn(job: Job, progress: Progress) -> None:
     """Learn nothing: the stages look at the whole movie."""
 
 
-def track(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
+def _track(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
     """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are not used."""
     settings = job.settings
     grid, place = job.recording.gridded()
@@ -122,4 +122,4 @@ def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Cand
     return replace(proposals, R_lab_view=camera.R_cam_lab.mT @ R_cam_view(direction_cam))
 
 
-PAPER = Method(learn=learn, resume=None, join=track)
+PAPER = Method(learn=_learn, resume=None, join=_track)

@@ -84,7 +84,7 @@ def preflight(
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
         matches = tuple(texture_map.match_texture(search.result(), samples) if search else ())
-        doubted = [match.name for match in matches if texture_map.doubts(match)]
+        doubted = [match.name for match in matches if texture_map.shows_no_map(match)]
         studies = {name: pool.submit(cameras.study, experiment, planned, (name,)) for name in doubted}
         tracked = cameras.NOT_TRACKED
         if learning is not None and closer and any(sample.balls for sample in samples):
@@ -144,7 +144,7 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
     least_px = min((r for r in radii if not math.isnan(r)), default=seen.samples[0].diameter_px / 2)
-    yield (paint := texture_map.contrast(seen.measures, least_px))
+    yield (paint := texture_map.judge_contrast(seen.measures, least_px))
     if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
     yield texture_map.look_alikes(seen.similar)

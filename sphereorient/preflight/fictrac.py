@@ -16,7 +16,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.cameras.model import focal_of_field
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.experiment import refused
+from sphereorient.experiment.experiment import input_error
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
 from sphereorient.sphere.view import fitted_circle
 from sphereorient.trajectory.rotations import rotations
@@ -90,22 +90,22 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     needed = {"src_fn": "the movie", "vfov": "the camera's field of view, degrees"}
     for name, what in needed.items():
         if not values.get(name):
-            raise refused(f"{path}, {name}", what, "none", DO)
+            raise input_error(f"{path}, {name}", what, "none", DO)
     for name, (usual, what, do) in CHOICES.items():
         if values.get(name, "").lower() not in usual:
-            raise refused(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
+            raise input_error(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
     vfov = _numbers(values["vfov"])
     fisheye = values.get("fisheye", "").lower() in ("y", "1")
     widest = 360 if fisheye else 180
     if len(vfov) != 1 or not 0 < vfov[0] < widest:
-        raise refused(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
+        raise input_error(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
     used, turn, plane = USED, np.array(_numbers(values.get("c2a_r", ""))), None
     if len(turn) != 3:  # FicTrac then takes the corners
         corners = values.get("c2a_src", "")
         turn, plane = np.array(_numbers(values.get(corners, ""))), corners[-2:]
         if len(turn) != 8 or plane not in SQUARES:
             got, do = f"'{values.get('c2a_r', '')[:40]}'", "run FicTrac's configGui; { 0, 0, 0 } is the camera's frame"
-            raise refused(f"{path}, c2a_r", "three numbers, rad, or four corners by c2a_src", got, do)
+            raise input_error(f"{path}, c2a_r", "three numbers, rad, or four corners by c2a_src", got, do)
         turn, used = turn.reshape(4, 2), USED | {"c2a_src", corners}
     rate, limb = _numbers(values.get("src_fps", "")), _points(values.get("roi_circ", ""))
     ahead = np.array(_numbers(values.get("roi_c", "")))
@@ -140,12 +140,12 @@ def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
         starts = (np.concatenate(pose).ravel() for pose in zip(turns, places, strict=True))
         best, other = sorted((least_squares(off, start) for start in starts), key=lambda fit: float(fit.cost))
     except (cv2.error, ValueError):
-        raise refused("config.txt, c2a_src", "the corners of a square", "others", do) from None
+        raise input_error("config.txt, c2a_src", "the corners of a square", "others", do) from None
     R, mirrored = so3.exp(torch.from_numpy(np.stack([best.x[:3], other.x[:3]]))).mT.unbind()
     apart_deg = math.degrees(float(so3.log(R.mT @ mirrored).norm()))
     if apart_deg > 1 and other.cost - best.cost < SURE * pixel_rad**2:
         got = f"corners that fit two rotations {apart_deg:.0f} degrees apart"
-        raise refused("config.txt, c2a_src", "a square whose perspective shows", got, do)
+        raise input_error("config.txt, c2a_src", "a square whose perspective shows", got, do)
     return R
 
 
@@ -163,7 +163,7 @@ def fictrac_axes(camera: Camera, config: Path | None) -> FicTracAxes:
     if ahead is None:
         if len(said.limb_px) < 3:
             got, do = f"{len(said.limb_px)}", "run FicTrac's configGui"
-            raise refused(f"{config}, roi_circ", "three points of the ball's limb or more", got, do)
+            raise input_error(f"{config}, roi_circ", "three points of the ball's limb or more", got, do)
         rays = said.rays_cam(said.limb_px, camera.image_size)
         normal = np.linalg.svd(rays - rays.mean(0))[2][2]  # of the plane through their ends
         ahead = normal * np.sign(normal @ rays.sum(0))

@@ -78,7 +78,7 @@ def look_at_scene(
         if shot.usable
     )
     contrasts = {
-        path.name: texture_map.contrast(texture_map.measure_texture(one.grey), _least_px(balls))
+        path.name: texture_map.judge_contrast(texture_map.measure_texture(one.grey), _least_px(balls))
         for path, one in loaded.items()
     }
     if len(loaded) > 1:

@@ -21,7 +21,7 @@ from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_page as ink
 from sphereorient.report.overlay import pictures_by_row, prepared
-from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes, draw_outline, draw_pictures
+from sphereorient.report.overlay_page import Canvas, OverlayPage, crop_panel, draw_axes, draw_outline, draw_pictures
 from sphereorient.trajectory import Trajectory
 
 BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
@@ -169,12 +169,12 @@ def worst_frames(
     return bad
 
 
-def _pairs_size(page: Page) -> tuple[int, int]:
+def _pairs_size(page: OverlayPage) -> tuple[int, int]:
     return 2 * len(page.cameras) * (TILE + GAP) - GAP, TILE
 
 
 def _draw_pairs(
-    canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Shown | None], corner: tuple[int, int]
+    canvas: Canvas, page: OverlayPage, k: int, pictures: Mapping[str, Shown | None], corner: tuple[int, int]
 ) -> None:
     """Draw crop and re-rendered sphere of each camera; the whole frame if the centre is unknown."""
     (ball,) = page.balls

@@ -20,7 +20,7 @@ from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Movie
 from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
-from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
+from sphereorient.report.overlay_page import Ball, OverlayPage, OverlayView, crop_side
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.datasets import nearest_rows
@@ -84,7 +84,7 @@ def prepared(
     experiment: Experiment,
     cameras: Sequence[str] | None,
     opened: ExitStack,
-) -> tuple[Page, dict[str, CameraStream]]:
+) -> tuple[OverlayPage, dict[str, CameraStream]]:
     """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them.
     Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another one.
     """
@@ -105,7 +105,7 @@ def prepared(
         models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
         views = [_view(track, *each) for each in zip(models, streams.values(), strict=True)]
         balls.append(Ball(track=track, views=views))
-    return Page(numbers=numbers, balls=balls), streams
+    return OverlayPage(numbers=numbers, balls=balls), streams
 
 
 def streams_of(

@@ -190,7 +190,7 @@ class Ball:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Page:
+class OverlayPage:
     """Draws each camera's frame of a recording, with crop, re-rendered picture and residual of every sphere."""
 
     numbers: NDArray[np.int64]  # (N,), the experiment's numbers of the frames

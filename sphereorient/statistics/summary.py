@@ -13,7 +13,7 @@ import numpy as np
 from sphereorient.errors import TrackError
 from sphereorient.statistics import density, isotropy, lags, noise
 from sphereorient.statistics.bootstrap import FEWEST
-from sphereorient.statistics.flow import Comparison, Lift, Surroundings, comparisons, lift
+from sphereorient.statistics.flow import DimensionlessNumber, Lift, Surroundings, dimensionless_numbers, lift
 from sphereorient.statistics.moments import Moments, table_of_moments
 from sphereorient.statistics.segments import UNITS, Durations, Ensemble, durations, ensemble_of
 from sphereorient.statistics.settings import StatisticsSettings
@@ -54,7 +54,7 @@ class Summary:
     ensemble: Ensemble
     table: Mapping[str, Moments]  # Table I; without intervals for one segment
     warnings: Sequence[str]  # of noise, a sentence each
-    comparisons: Sequence[Comparison]
+    dimensionless_numbers: Sequence[DimensionlessNumber]
     distributions: Distributions | None  # None with fewer than two segments
 
     @property
@@ -101,7 +101,7 @@ def summarise(
         ensemble=ensemble,
         table=table,
         warnings=noise.noise_warnings(table, ensemble.error),
-        comparisons=comparisons(table, around) if ensemble.segments else [],
+        dimensionless_numbers=dimensionless_numbers(table, around) if ensemble.segments else [],
         distributions=more,
     )
 

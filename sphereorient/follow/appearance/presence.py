@@ -81,7 +81,7 @@ def _times_better(found: Sequence[Poses], clear: Sequence[int]) -> float:
     return float((left[:, 1] / left[:, 0]).median())
 
 
-def nothing(found: Sequence[Poses]) -> ExperimentError:
+def no_sphere_error(found: Sequence[Poses]) -> ExperimentError:
     """Return the error of a movie without the sphere, or without a pose that fits."""
     reasons = {str(why) for poses in found for why in poses.reason} - {Reason.OK}
     why = f" ({', '.join(sorted(reasons))})" if reasons else ""

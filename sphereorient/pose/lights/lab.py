@@ -11,7 +11,7 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
-from sphereorient.pose.compiled import residuals
+from sphereorient.pose.compiled import residuals_compiled
 from sphereorient.pose.model import (
     LATER,
     Light,
@@ -190,14 +190,14 @@ def lab_light(
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
     used = use.reshape(-1, 1)
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
+    at = residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
     bases = _bases(at.view, pixels)
     light, rounds = (_flat(model.light, at.view, pixels, use), ROUNDS) if first is None else (first, AGAIN)
     light = replace(light, stray=learn_stray(at, pixels, use, light.stray))
     for _ in range(rounds):
         light = _better(light, at, pixels, used, bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
-        at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
+        at = residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
     counted = at.inside & ~pixels.clipped & used
     light = replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
     return light.with_lean(at.view, pixels, use)

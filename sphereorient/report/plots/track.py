@@ -34,7 +34,7 @@ RATES = {
 }
 
 
-def figures(of: look.Reported) -> Iterator[look.Plan]:
+def track_figures(of: look.Reported) -> Iterator[look.Plan]:
     """Yield the tracks of the recording with most valid frames, and their path."""
     _, tracks, _ = of
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
