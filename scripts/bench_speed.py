@@ -190,7 +190,7 @@ def prepared(folder: Path, cameras: list[str] | None = None, say: Callable[[str,
         candidates=settings.refine.candidates,
     )
     learnt = estimate_appearance(first, sampled, base, settings.refine)
-    say("study (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
+    say("appearance (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
     return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
 
 

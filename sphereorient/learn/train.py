@@ -38,7 +38,7 @@ TRAINING, VALIDATION = 0, 1  # random streams: no picture occurs in both
 VALIDATION_SHAPE = 1, 2, 8  # of a validation batch: maps, groups of each, pictures of a group
 WARM_UP_STEPS = 100  # of the learning rate; at most a tenth of all steps
 RECALL_EVERY = 10  # steps between measurements of the recall on training pictures
-Row = dict[str, float]
+_Row = dict[str, float]
 
 
 class TrainingData(LightningDataModule):
@@ -125,7 +125,7 @@ class ProposerModule(LightningModule):
         self._predictions = []
         self.log("validation_nll", self.metrics.nll, logger=False)
 
-    def training_metrics(self) -> Row:
+    def training_metrics(self) -> _Row:
         """Return loss and recall on training pictures since the last call."""
         if not self._losses:
             return {}
@@ -144,7 +144,7 @@ class CheckpointCallback(Callback):
 
     def __init__(self, out: Path, progress: Progress, timer: Timer) -> None:
         self.out, self._progress, self._timer = out, progress, timer
-        self.rows: list[Row] = []
+        self.rows: list[_Row] = []
         self.best: dict[str, Tensor] = {}
         self.best_nll = math.inf
         self.best_step = 0
@@ -196,7 +196,7 @@ class Trained:
 
     checkpoint: Checkpoint
     metrics: Metrics  # on the validation pictures, with the temperature
-    rows: tuple[Row, ...]  # metrics of each epoch, as in metrics.csv; the first is the untrained network
+    rows: tuple[_Row, ...]  # metrics of each epoch, as in metrics.csv; the first is the untrained network
 
 
 def train_proposer(

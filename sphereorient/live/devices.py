@@ -18,7 +18,7 @@ from sphereorient.experiment.experiment import DeviceKeys
 from sphereorient.experiment.recording import CameraStream
 from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
-from sphereorient.live.feed import Arrival, Tell
+from sphereorient.live.feed import Arrival, Log
 from sphereorient.live.instants import Instants, Shot
 from sphereorient.movies import flipped_picture, flipped_shape
 
@@ -47,7 +47,7 @@ class Device:
 
 
 Open = Callable[[str], AbstractContextManager[Device]]  # by serial number
-Came = tuple[int, Shot | None] | None  # number of a camera, and what `Camera.shots` yields
+Came = tuple[int, Shot | None] | None  # number of a camera, and what `LiveCamera.pictures` yields
 
 
 @contextmanager
@@ -271,9 +271,9 @@ class LiveCamera:
     stream: CameraStream
     keys: DeviceKeys | None  # None: the device is as it is
     flip: str  # of `movies.flipped`
-    tell: Tell | None  # gets what is wrong, in one line; None: a movie, which ends
+    log: Log | None  # gets what is wrong, in one line; None: a movie, which ends
 
-    def shots(self, stopped: Event) -> Iterator[Shot | None]:
+    def pictures(self, stopped: Event) -> Iterator[Shot | None]:
         """Yield pictures until `stopped`; None whenever the device is opened: its clock starts again. After the first
         picture, a device that ends or fails is opened again each second. Raise MovieError: no camera, one that refuses
         its settings, or pictures of another size or type.
@@ -292,18 +292,18 @@ class LiveCamera:
                         if (shot := device.shot()) is None:
                             continue
                         fitting = self._fitting(shot)
-                        if fault and self.tell is not None:
-                            self.tell(f"{self.name}: pictures come again.")
+                        if fault and self.log is not None:
+                            self.log(f"{self.name}: pictures come again.")
                         fault, seen = "", True
                         yield fitting
             except MovieError as error:
-                if self.tell is None or not seen:
+                if self.log is None or not seen:
                     raise
                 found = str(error)
-            if self.tell is None or not seen:
+            if self.log is None or not seen:
                 return
             if not fault and not stopped.is_set():
-                self.tell(f"{found} It is opened again each second.")
+                self.log(f"{found} It is opened again each second.")
             fault = found
             stopped.wait(AGAIN_S)
 
@@ -343,12 +343,12 @@ def worded(name: str) -> Iterator[None]:
         raise MovieError(refusal(name, expected="a camera that works", got=error_words(error), do=do)) from None
 
 
-def device_frames(cameras: Sequence[LiveCamera], tell: Tell, stopped: Event) -> Iterator[Arrival]:
-    """Yield the instants of cameras until `stopped`, or the only one ends; errors: `Camera.shots`, `Instants`."""
-    instants, waiting = Instants([one.stream.name for one in cameras], tell), set(range(len(cameras)))
+def device_frames(cameras: Sequence[LiveCamera], log: Log, stopped: Event) -> Iterator[Arrival]:
+    """Yield the instants of cameras until `stopped`, or the only one ends; errors: as `LiveCamera`, `Instants`."""
+    instants, waiting = Instants([one.stream.name for one in cameras], log), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
-    shots: Iterator[Came] = ((0, shot) for shot in cameras[0].shots(stopped))
-    for came in shots if len(cameras) == 1 else _side_by_side(cameras, stopped, lambda: instants.due_s):
+    pictures: Iterator[Came] = ((0, shot) for shot in cameras[0].pictures(stopped))
+    for came in pictures if len(cameras) == 1 else _side_by_side(cameras, stopped, lambda: instants.due_s):
         if came is not None and came[1] is not None:
             instants.take(came[0], came[1])
             triggered = False
@@ -356,7 +356,7 @@ def device_frames(cameras: Sequence[LiveCamera], tell: Tell, stopped: Event) -> 
             instants.restart(came[0])
             waiting.discard(came[0])
             if triggered and not waiting:
-                tell("waiting for the first trigger.")
+                log("waiting for the first trigger.")
                 triggered = False
         yield from instants.ready(time.perf_counter())
 
@@ -367,7 +367,7 @@ def _side_by_side(cameras: Sequence[LiveCamera], stopped: Event, due_s: Callable
 
     def read(number: int) -> None:
         try:
-            for shot in cameras[number].shots(stopped):
+            for shot in cameras[number].pictures(stopped):
                 waiting.put((number, shot))
         except Exception as error:  # goes on in the thread that iterates
             waiting.put(error)

@@ -129,7 +129,7 @@ def _states_errors(now: Measured) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Forms:
     """A frame in the forms that outputs take; each is made where one takes it."""
 
     now: Measured

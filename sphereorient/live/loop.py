@@ -13,8 +13,8 @@ from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import limited_cores, silent
 from sphereorient.files.whole_file import writing
-from sphereorient.live.feed import Feed, FrameBytes, Tell
-from sphereorient.live.lines import FicTracLines, Quantities, Told
+from sphereorient.live.feed import Feed, FrameBytes, Log
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
 from sphereorient.live.page import Monitor, PageProcess
@@ -92,11 +92,11 @@ def run_live(
     source: Source,
     outputs: Sequence[tuple[Output, str]],
     page: PageProcess | None,
-    tell: Tell,
+    log: Log,
     fictrac: Path | None = None,
 ) -> Monitor:
-    """Track the frames of a source until it ends, or Ctrl-C. `outputs`: each with the attribute of `Told` that it
-    takes; `tell` gets messages for the user; `fictrac`: see `fictrac_axes`.
+    """Track the frames of a source until it ends, or Ctrl-C. `outputs`: each with the attribute of `Forms` that it
+    takes; `log` gets messages for the user; `fictrac`: see `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker
     first = next(iter(tracker.appearances))  # of several balls the page shows this one
@@ -106,17 +106,17 @@ def run_live(
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
     size = FrameBytes(recording.streams).size
-    feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, tell=tell)
-    monitor = Monitor(feed, tell)
+    feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, log=log)
+    monitor = Monitor(feed, log)
     try:
         if page is not None:
             page.begin(recording, monitor.running, opened.save_map)
         # In one thread: a second one may wait for a core that another program has.
         with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):
-                told = Told(now, table, known[now.ball])
+                forms = Forms(now, table, known[now.ball])
                 for output, form in outputs:
-                    output.send(getattr(told, form))
+                    output.send(getattr(forms, form))
                 if now.found:
                     feed.restart()
                 monitor.saw(now)

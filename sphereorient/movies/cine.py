@@ -24,7 +24,7 @@ FIRST = 64  # images that determine the usual size
 JPEG, FILTER_ARRAY = 1, 2  # values of `compression`
 PREFIX = 8  # bytes before the pixels at least: size of the annotation, size of the image
 COPY_AGAIN, EXPORT_AGAIN = "copy it from the camera again", "export it again; its header is damaged"
-Rows = NDArray[np.uint8]  # (H, stride), as stored
+_Rows = NDArray[np.uint8]  # (H, stride), as stored
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def _layout(path: Path, compression: int, packing: int, bits: int) -> _Layout:
     return layout
 
 
-def _grey(rows: Rows, width: int, layout: _Layout) -> NDArray[Any]:
+def _grey(rows: _Rows, width: int, layout: _Layout) -> NDArray[Any]:
     """Return the grey values (H, W) of an image's rows."""
     if layout.packed:  # without gaps, the most significant bits first; each pixel lies in two bytes
         first, offset = np.divmod(layout.bits * np.arange(width), 8)

@@ -39,10 +39,10 @@ _Table, _Task, _Stencil, _Scene, _Shot, Near = (
 )
 _RESULTS = [field[0] for field in _Task._fields_[-len(POSE_PARTS) :]]
 # What `linearise` tells of each place, in this order, with their numbers.
-TOLD = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
-TOLD |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
-TOLD |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
-OF_VIEW, OF_FIT = tuple(TOLD)[:8], ("residual", "model", "variance", "weight")
+COLUMNS = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
+COLUMNS |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
+COLUMNS |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
+OF_VIEW, OF_FIT = tuple(COLUMNS)[:8], ("residual", "model", "variance", "weight")
 
 
 def refine_library() -> ctypes.CDLL | None:
@@ -89,16 +89,16 @@ def residuals_compiled(
         return residuals_in_torch.residuals(pixels, X, R, state, model)
     (L, P), counts = pixels.grey.shape, torch.empty_like(pixels.inside)
     task, at = _task_on(pixels, begin, model)
-    told = torch.empty(L, sum(TOLD.values()), P)
+    columns = torch.empty(L, sum(COLUMNS.values()), P)
     coefficients = torch.empty(L, sum(model.shading.counts), dtype=torch.float64)
     deviation = torch.empty(L, dtype=torch.float64)
-    task.kept, task.told = counts.data_ptr(), told.data_ptr()
+    task.kept, task.told = counts.data_ptr(), columns.data_ptr()
     task.coefficients, task.deviation = coefficients.data_ptr(), deviation.data_ptr()
     if state is not None:
         task.expected, task.weight = at(state[0], torch.float32), at(state[1], torch.float32)
     _run("linearise", task, len(X))
-    each = torch.split(told, list(TOLD.values()), 1)
-    parts = {name: part.squeeze(1) for name, part in zip(TOLD, each, strict=True)}
+    each = torch.split(columns, list(COLUMNS.values()), 1)
+    parts = {name: part.squeeze(1) for name, part in zip(COLUMNS, each, strict=True)}
     distance = (X.repeat_interleave(cameras, 0) - pixels.origin[..., 0].double()).norm(dim=-1)
     blur = model.blur_px * (pixels.pitch_mm + pixels.pitch_rad * distance).float() / model.radius_mm
     hidden = pixels.inside & ~counts

@@ -73,7 +73,7 @@ def preflight(
         refine = settings.refine.model_copy(update=BRIEF)
         planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
         both = image is not None and len(recording.streams) > 1
-        learning = pool.submit(cameras.study, experiment, planned) if both else None
+        learning = pool.submit(cameras.learn_appearance, experiment, planned) if both else None
         sampling = [pool.submit(_sample, recording, one, sizes[one.name], settings) for one in recording.streams]
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
@@ -85,7 +85,7 @@ def preflight(
         progress("paint", 0, 1)
         matches = tuple(texture_map.match_texture(search.result(), samples) if search else ())
         doubted = [match.name for match in matches if texture_map.shows_no_map(match)]
-        studies = {name: pool.submit(cameras.study, experiment, planned, (name,)) for name in doubted}
+        alone = {name: pool.submit(cameras.learn_appearance, experiment, planned, (name,)) for name in doubted}
         tracked = cameras.NOT_TRACKED
         if learning is not None and closer and any(sample.balls for sample in samples):
             first = int(recording.timeline.number[closer[0][0].frame[0]])
@@ -99,7 +99,7 @@ def preflight(
             texture=image,
             unseen=unseen,
             matches=matches,
-            fitted=tuple(name for name, one in studies.items() if one.exception() is None),
+            fitted=tuple(name for name, one in alone.items() if one.exception() is None),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
             tracked=tracked,

@@ -37,7 +37,7 @@ SQUARES = {
     "xz": ((0.5, 0, -0.5), (-0.5, 0, -0.5), (-0.5, 0, 0.5), (0.5, 0, 0.5)),
 }
 SURE = 4.5  # half of 3^2: a square's tilt is sure at three sigmas of corners that are right to a pixel
-Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,9 +50,9 @@ class FicTracConfig:
     fisheye: bool  # equidistant: vfov_deg / height is the angle of every pixel
     ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
     circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
-    limb_px: Array  # (n, 2), u, v of the points of the limb
-    ahead_cam: Array | None  # (3,), towards the ball's middle, where the file states it: `roi_c` goes before the limb
-    turn: Array  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
+    limb_px: Floats  # (n, 2), u, v of the points of the limb
+    ahead_cam: Floats | None  # (3,), towards the ball's middle, where the file states it: `roi_c` goes before the limb
+    turn: Floats  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
     plane: str | None  # of the square: xy, yz or xz of the animal; None: `turn` is a rotation
     unread: tuple[str, ...]  # keys of the file that change nothing here
 
@@ -71,7 +71,7 @@ class FicTracConfig:
         height = image_size[1]
         return height / math.radians(self.vfov_deg) if self.fisheye else focal_of_field(height, self.vfov_deg)
 
-    def rays_cam(self, points_px: Array, image_size: tuple[int, int]) -> Array:
+    def rays_cam(self, points_px: Floats, image_size: tuple[int, int]) -> Floats:
         """Return unit rays (n, 3) of points (n, 2), px, by FicTrac's camera, whose axis is in the picture's middle."""
         aside = points_px - np.array(image_size) / 2
         away = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
@@ -124,13 +124,13 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     )
 
 
-def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
+def _R_of_square(square: Floats, seen: Floats, pixel_rad: float) -> Tensor:
     """Return the rotation (3, 3) from camera to animal where the corners (4, 3) of a square are seen along unit vectors
     (4, 3). Source: FicTrac's SquareRT: the least sum of squared differences between unit vectors. ExperimentError where
     corners that are off by a pixel could be those of the square's mirror image, tilted the other way.
     """
 
-    def off(pose: Array) -> Array:
+    def off(pose: Floats) -> Floats:
         there = square @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
         return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True) - seen).ravel()
 
@@ -178,12 +178,12 @@ def _numbers(text: str) -> list[float]:
     return [float(number) for number in re.findall(NUMBER, text)]
 
 
-def _points(text: str) -> Array:
+def _points(text: str) -> Floats:
     """Return numbers as points (n, 2); an odd last one is left out, as FicTrac does."""
     numbers = _numbers(text)
     return np.array(numbers[: len(numbers) // 2 * 2]).reshape(-1, 2)
 
 
-def _polygons(text: str) -> list[Array]:
+def _polygons(text: str) -> list[Floats]:
     """Return the innermost { ... } of a text as polygons (n, 2); those of less than three points hide nothing."""
     return [points for group in re.findall(r"\{([^{}]+)\}", text) if len(points := _points(group)) >= 3]

@@ -30,7 +30,7 @@ TILE, GAP, HEAD, TITLE, LINE, LINES = 152, 6, 54, 22, 17, 3  # px; lines of text
 BETWEEN = 18  # px, between frames
 PICTURES = 12  # side by side in a row, at most
 SUFFIXES = (".png", ".pdf", ".jpg")
-Progress = Callable[[int, int], None]
+Advance = Callable[[int, int], None]
 Rows = NDArray[np.int64]
 
 
@@ -64,7 +64,7 @@ class Gallery:
 
 
 def gallery(
-    track: Trajectory, experiment: Experiment, count: int, progress: Progress = lambda done, total: None
+    track: Trajectory, experiment: Experiment, count: int, progress: Advance = lambda done, total: None
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
     Raise the errors of `overlay.prepared`.
@@ -133,7 +133,7 @@ def worst_frames(
     count: int = 24,
     *,
     cameras: Sequence[str] | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
     """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
     Raise the errors of `overlay.prepared`, and OutputError for another suffix or a file that cannot be written.

@@ -24,7 +24,7 @@ SHOWN_LAGS = 5  # increments with a density, from one frame to the integral time
 WIDTHS_OF = ("velocity", "acceleration", "alpha_lab")
 STEPS = 10  # of the progress
 
-Progress = Callable[[int, int], None]
+Advance = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +67,7 @@ def summarise(
     tracks: Trajectory | Sequence[Trajectory],
     settings: StatisticsSettings | None = None,
     surroundings: Surroundings | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
     name: str = "tracks",
 ) -> Summary:
     """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
@@ -107,7 +107,7 @@ def summarise(
 
 
 def _distributions(
-    tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings, progress: Progress
+    tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings, progress: Advance
 ) -> Distributions:
     steps = count(4)
 

@@ -149,11 +149,11 @@ def limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     """
     found = torch.zeros(len(fitter.views), dtype=torch.float64)
     for k, view in enumerate(fitter.views):
-        told = use[:, k] & (use.sum(1) > 1)
+        shared = use[:, k] & (use.sum(1) > 1)
         to_centre = fit.position_lab_mm - perspective_centre_lab_mm(view.camera, fit.position_lab_mm)
         nearer = -(fit.own_move[:, k] * to_centre).sum(-1) / to_centre.square().sum(-1)
-        if int(told.sum()) >= FEWEST_BOTH:
-            found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[told].median()
+        if int(shared.sum()) >= FEWEST_BOTH:
+            found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[shared].median()
     return found
 
 
@@ -196,8 +196,8 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     others_px = []
     for k, m in combinations(range(cameras), 2):
         turn = so3.geodesic_distance(alone[k][2], alone[m][2])
-        told = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
-        others_px.append(turn * told * radius_px)
+        apart = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
+        others_px.append(turn * apart * radius_px)
     for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
         centre = perspective_centre_lab_mm(one_camera, X)
         sight = torch.nn.functional.normalize(X - centre, dim=-1)

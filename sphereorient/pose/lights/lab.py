@@ -305,9 +305,9 @@ def _sums(
         return some, left_over, taken[:, :count:tints]
 
     # A few poses at a time: the columns of all would fill the memory.
-    told = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
+    blocks = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
     whole, factor = torch.zeros(width, width).double(), torch.zeros(len(used), width).double()
-    for some, sums, own_part in side_by_side(of_poses, [part.tolist() for part in told]):
+    for some, sums, own_part in side_by_side(of_poses, [part.tolist() for part in blocks]):
         by_pose(factor, cameras)[some] = own_part
         whole += sums
     return whole, factor
