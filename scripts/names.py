@@ -21,7 +21,10 @@ RETIRED = {"tell", "tells", "told", "shots", "study", "studies"}
 
 def words(name: str) -> list[str]:
     """Return the words of a name in lower case, in the singular."""
-    return [word.lower().removesuffix("s") for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+    return [
+        word.lower().removesuffix("s")
+        for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", re.sub(r"\dD\b", "", name))
+    ]
 
 
 def definitions(tree: ast.Module) -> Iterator[tuple[str, str]]:

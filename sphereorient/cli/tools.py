@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from sphereorient.tools.design.judge import Judgement
     from sphereorient.tools.spin.disks import Photographs
-    from sphereorient.tools.spin.spin import SpinFound
+    from sphereorient.tools.spin.spin import SpinEstimate
 
 SPREAD = ("min", "median", "max")
 HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
@@ -69,7 +69,7 @@ def spin(given: _SpinOptions) -> None:
         typer.echo(f"Wrote {given.out}, {given.out.with_suffix('.png')}")
 
 
-def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, Any]:
+def _spin_document(found: "SpinEstimate", photographs: "Photographs") -> dict[str, Any]:
     spins, sigma = found.spins, found.spins.rate_sigma()
     rate = spins.omega_view_rad_s.norm(dim=-1)
     return {

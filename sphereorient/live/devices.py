@@ -19,7 +19,7 @@ from sphereorient.experiment.recording import CameraStream
 from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
 from sphereorient.live.feed import Arrival, Log
-from sphereorient.live.instants import Instants, Shot
+from sphereorient.live.instants import Instants, RawPicture
 from sphereorient.movies import flipped_picture, flipped_shape
 
 AGAIN_S = 1.0  # between attempts to open a camera
@@ -42,12 +42,12 @@ class Device:
 
     get: Callable[[str], Any]  # the value of a feature
     set: Callable[[str, Any], object]
-    shot: Callable[[], Shot | None]  # the next one; None: none within WAIT_S; EOFError: none comes any more
+    shot: Callable[[], RawPicture | None]  # the next one; None: none within WAIT_S; EOFError: none comes any more
     start: Callable[[], object] = lambda: None
 
 
 Open = Callable[[str], AbstractContextManager[Device]]  # by serial number
-Came = tuple[int, Shot | None] | None  # number of a camera, and what `LiveCamera.pictures` yields
+Came = tuple[int, RawPicture | None] | None  # number of a camera, and what `LiveCamera.pictures` yields
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def _genicam(producer: str) -> Iterator[Open]:
                 camera.num_buffers = max(BUFFERS, camera.min_num_buffers)
                 nodes = camera.remote_device.node_map
 
-                def shot() -> Shot | None:
+                def shot() -> RawPicture | None:
                     try:
                         buffer = camera.fetch(timeout=WAIT_S)
                     except driver.TimeoutException:
@@ -80,7 +80,7 @@ def _genicam(producer: str) -> Iterator[Open]:
                         picture = np.array(shown.data.reshape(shown.height, -1)[:, : shown.width])  # padding behind
                         stamp_s = _known(lambda: buffer.timestamp / buffer.timestamp_frequency)
                         counter = _known(lambda: buffer.frame_id)
-                    return Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
+                    return RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
 
                 opened.append(serial)
                 try:
@@ -109,7 +109,7 @@ def _pylon(serial: str) -> Iterator[Device]:
         tick_s = _tick_s(lambda name: getattr(camera, name).Value)
         camera.MaxNumBuffer.Value = BUFFERS
 
-        def shot() -> Shot | None:
+        def shot() -> RawPicture | None:
             with camera.RetrieveResult(int(1e3 * WAIT_S), driver.TimeoutHandling_Return) as result:
                 arrived_s = time.perf_counter()
                 if not result.IsValid():
@@ -118,7 +118,7 @@ def _pylon(serial: str) -> Iterator[Device]:
                     return None
                 picture = result.Array if result.GrabSucceeded() else None  # a copy
                 stamp_s, counter = result.TimeStamp * tick_s or None, result.BlockID
-            return Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
+            return RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
 
         yield Device(
             get=lambda name: getattr(camera, name).Value,
@@ -138,16 +138,16 @@ def _vimba(serial: str) -> Iterator[Device]:
         _check_seen(serial, [one.get_id() for one in system.get_all_cameras()])
         camera = opened.enter_context(system.get_camera_by_id(serial))
         tick_s = _tick_s(lambda name: camera.get_feature_by_name(name).get())
-        waiting: SimpleQueue[Shot] = SimpleQueue()
+        waiting: SimpleQueue[RawPicture] = SimpleQueue()
 
         def came(_camera: Any, _stream: Any, frame: Any) -> None:
             arrived_s, whole = time.perf_counter(), frame.get_status() == driver.FrameStatus.Complete
             picture = frame.as_numpy_ndarray()[..., 0].copy() if whole else None
             stamp_s, counter = (frame.get_timestamp() or 0) * tick_s or None, frame.get_id()
-            waiting.put(Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter))
+            waiting.put(RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter))
             camera.queue_frame(frame)
 
-        def shot() -> Shot | None:
+        def shot() -> RawPicture | None:
             with suppress(Empty):
                 return waiting.get(timeout=WAIT_S)
             if serial not in [one.get_id() for one in system.get_all_cameras()]:
@@ -185,12 +185,12 @@ def _opencv(where: str) -> Iterator[Device]:
             if not capture.set(known(name), float(value)):
                 raise OSError("not by this camera")
 
-        def shot() -> Shot:
+        def shot() -> RawPicture:
             there, picture = capture.read()
             if not there:
                 raise EOFError
             grey = picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
-            return Shot(picture=grey, arrived_s=time.perf_counter())
+            return RawPicture(picture=grey, arrived_s=time.perf_counter())
 
         yield Device(
             get=lambda name: "Mono8" if name == "PixelFormat" else capture.get(known(name)), set=put, shot=shot
@@ -273,7 +273,7 @@ class LiveCamera:
     flip: str  # of `movies.flipped`
     log: Log | None  # gets what is wrong, in one line; None: a movie, which ends
 
-    def pictures(self, stopped: Event) -> Iterator[Shot | None]:
+    def pictures(self, stopped: Event) -> Iterator[RawPicture | None]:
         """Yield pictures until `stopped`; None whenever the device is opened: its clock starts again. After the first
         picture, a device that ends or fails is opened again each second. Raise MovieError: no camera, one that refuses
         its settings, or pictures of another size or type.
@@ -318,7 +318,7 @@ class LiveCamera:
             do = f"set its PixelFormat to Mono8 or Mono16, or write pixel_format in camera: {name}: of experiment.yaml"
             raise MovieError(refusal(self.name, expected="grey pictures", got=form, do=do))
 
-    def _fitting(self, shot: Shot) -> Shot:
+    def _fitting(self, shot: RawPicture) -> RawPicture:
         """Return a picture as it lies in the movie; MovieError: of another size or type."""
         if (picture := shot.picture) is None:
             return shot

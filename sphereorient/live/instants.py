@@ -24,7 +24,7 @@ LOG_EVERY_S = 10.0  # between lines about pictures that are not there
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
+class RawPicture:
     """A picture as its device gave it."""
 
     picture: Picture | None  # None: it did not arrive whole
@@ -80,7 +80,7 @@ class Instants:
         """Forget a camera's clock: its device was opened."""
         self._clocks[camera].forget()
 
-    def take(self, camera: int, shot: Shot) -> None:
+    def take(self, camera: int, shot: RawPicture) -> None:
         """Take a picture of a camera. Raise MovieError: one of several whose device has no clock."""
         clock, several = self._clocks[camera], len(self._clocks) > 1
         if several and shot.stamp_s is None:
@@ -134,7 +134,7 @@ class Instants:
         agree = max(np.ptp(own), np.ptp(of_lead), 2 * np.median(abs(nearest - middle))) < within_s
         return offset_s + middle if agree and (abs(middle) < within_s or len(clock.lags) == SURE) else None
 
-    def _put(self, camera: int, time_s: float, shot: Shot, step: int, near_s: float) -> None:
+    def _put(self, camera: int, time_s: float, shot: RawPicture, step: int, near_s: float) -> None:
         clock = self._clocks[camera]
         found = next((one for one in self._open if abs(one.time_s - time_s) < near_s), None)
         if found is None:

@@ -28,7 +28,7 @@ MOST_WAITING, MOST_BYTES = 512, 64 << 20  # frames that wait
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LiveSetUp:
+class LiveSetup:
     """An opened experiment and who follows its balls."""
 
     recording: Recording
@@ -39,7 +39,7 @@ class LiveSetUp:
 @contextmanager
 def open_live(
     source: Experiment | Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
-) -> Iterator[LiveSetUp]:
+) -> Iterator[LiveSetup]:
     """Open an experiment. Without a texture map, that of a fixed ball is learnt meanwhile. Raises SphereOrientError:
     unusable inputs; ExperimentError: cameras that contradict each other, or no map of a ball that moves.
     """
@@ -57,13 +57,13 @@ def open_live(
         if not follower.tracker.balls:
             do = "look with `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
-        yield LiveSetUp(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
+        yield LiveSetup(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
 
 
 @contextmanager
 def _learning(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, path: Path
-) -> Iterator[LiveSetUp]:
+) -> Iterator[LiveSetup]:
     # Import late: with a map nothing is learnt.
     from sphereorient.live.learning import LearningTracker
     from sphereorient.mapping.disks import held_place
@@ -82,13 +82,13 @@ def _learning(
             return f"Wrote {path}{named}"
 
         try:
-            yield LiveSetUp(recording=recording, tracker=tracker, save_map=save)
+            yield LiveSetup(recording=recording, tracker=tracker, save_map=save)
         finally:
             tracker.close()
 
 
 def run_live(
-    opened: LiveSetUp,
+    opened: LiveSetup,
     source: Source,
     outputs: Sequence[tuple[Output, str]],
     page: PageProcess | None,

@@ -92,7 +92,7 @@ def residuals_compiled(
     columns = torch.empty(L, sum(COLUMNS.values()), P)
     coefficients = torch.empty(L, sum(model.shading.counts), dtype=torch.float64)
     deviation = torch.empty(L, dtype=torch.float64)
-    task.kept, task.told = counts.data_ptr(), columns.data_ptr()
+    task.kept, task.columns = counts.data_ptr(), columns.data_ptr()
     task.coefficients, task.deviation = coefficients.data_ptr(), deviation.data_ptr()
     if state is not None:
         task.expected, task.weight = at(state[0], torch.float32), at(state[1], torch.float32)

@@ -14,7 +14,7 @@ from live_examples import rows
 from overlay_examples import true_track
 
 from sphereorient import so3
-from sphereorient.live.lines import FicTracLines, Quantities, Forms
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import Measured
 from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Flag, Trajectory

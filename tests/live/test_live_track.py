@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.live.lines import FicTracLines, Quantities, Forms
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import REMARK, TrackBlocks, measured
 from sphereorient.live.loop import open_live
 from sphereorient.live.outputs import TrackOutput

@@ -15,7 +15,7 @@ from live_examples import LIMIT_S, rows, until
 from overlay_examples import true_track
 
 from sphereorient.errors import MovieError, OutputError
-from sphereorient.live.lines import FicTracLines, Quantities, Forms
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.outputs import open_output
 from sphereorient.live.shared import POSES, shared_poses
 from sphereorient.trajectory.walk import FicTracAxes
