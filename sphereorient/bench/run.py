@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sphereorient.bench.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.bench.score import (
+    Floats,
     given_to_others,
     named_as_true,
     score_track,
@@ -42,7 +42,6 @@ _Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; 
 Advance = Callable[[int, int], None]
 PLAN, RESULTS, KEPT, CACHE = "plan.json", "results.json", "scenes", "cache"
 DIGITS = 5
-Floats = NDArray[np.float64]
 TRACKERS: dict[str, _Tracker] = {
     "precise": partial(track_movies, method="precise"),
     "paper": partial(track_movies, method="paper"),
