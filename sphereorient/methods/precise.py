@@ -99,12 +99,12 @@ def join(job: Job, follower: Follower | None, measured: Iterable[Followed], prog
     for names in alike(job.recording):
         own, sure = _named([tables[name] for name in names], job, follower)
         for name, table, certain in zip(names, own, sure, strict=True):
-            track, learnt = _joined(job.of(name), follower.appearances[name], table)
+            track, learnt = join_ball(job.of(name), follower.appearances[name], table)
             found[name] = results.with_identity(track, certain), learnt
     return {name: found[name] for name in follower.appearances}
 
 
-def _joined(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Trajectory, Learnt]:
+def join_ball(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Trajectory, Learnt]:
     """Join the poses of one ball, as `join`."""
     clock, settings = job.recording.clock, job.settings
     given = None if job.given is None else job.given[job.recording.experiment.sphere.name]
