@@ -138,8 +138,8 @@ def in_turn(work: Callable[[], float]) -> tuple[list[float], list[float]]:
     for _ in range(TURNS):
         fast = work()
         with (
-            mock.patch.object(compiled, "library", return_value=None),
-            mock.patch.object(kalman, "library", return_value=None),
+            mock.patch.object(compiled, "refine_library", return_value=None),
+            mock.patch.object(kalman, "kalman_library", return_value=None),
         ):
             pairs.append((fast, work()))
     return [fast for fast, _ in pairs], [slow for _, slow in pairs]
@@ -190,7 +190,7 @@ def prepared(folder: Path, cameras: list[str] | None = None, say: Callable[[str,
         candidates=settings.refine.candidates,
     )
     learnt = estimate_appearance(first, sampled, base, settings.refine)
-    say("study (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
+    say("appearance (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
     return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
 
 

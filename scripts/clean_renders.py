@@ -206,7 +206,7 @@ def fitted(fitter: Fitter, seen: CleanSet, start: Poses, *, coarse: bool) -> Pos
 
 
 def with_light(fitter: Fitter, seen: CleanSet, pose: Poses) -> Fitter:
-    """Learn light and noise from the first pictures, as `orient.study` does from a movie's."""
+    """Learn light and noise from the first pictures, as `estimate_appearance` does from a movie's."""
     fine, first = fitter.optics.fine, torch.arange(min(16, len(seen.pictures)))
     X, R, use = pose.position_lab_mm[first], pose.R_lab_body[first], torch.ones(len(first), 1, dtype=torch.bool)
     pixels = fitter.pixels([[seen.pictures[i].numpy()] for i in first.tolist()], X, fine)

@@ -92,10 +92,10 @@ def fictrac_columns(R_cam_body: Floats, about: FicTracSetUp) -> Floats:
 
 def write_movie(folder: Path, frames: int) -> tuple[FicTracSetUp, Floats]:
     """Render the movie and its config.txt; return what FicTrac knows, and R_cam_body (N, 3, 3)."""
-    from sphereorient.bench.ball import BallScene, Paint, write_ball_scene
+    from sphereorient.bench.ball import BallScene, Caps, write_ball_scene
     from sphereorient.experiment import load_experiment
 
-    paint = Paint(caps=60, radius_deg=(8.0, 16.0))
+    paint = Caps(caps=60, radius_deg=(8.0, 16.0))
     scene = BallScene(
         size=SIZE, field_deg=VFOV_DEG, azimuth_deg=8.0, elevation_deg=-4.0, half_deg=HALF_DEG, paint=paint
     )

@@ -26,7 +26,7 @@ from sphereorient import so3
 from sphereorient.errors import SphereOrientError
 from sphereorient.tools.spin.disks import Photographs
 from sphereorient.tools.spin.dots import DotTable
-from sphereorient.tools.spin.spin import SpinFound, spin_of
+from sphereorient.tools.spin.spin import SpinEstimate, spin_of
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "real" / "spindoe"
 WITHIN_DEG = 10.0
@@ -78,7 +78,7 @@ def measure(folder: Path) -> None:
     print(f"{spent:.0f} s of one core for two rounds, {peak:.0f} MB")
 
 
-def spins(found: SpinFound, rate_reference: float) -> None:
+def spins(found: SpinEstimate, rate_reference: float) -> None:
     """Print each spin with its evidence, and that of the mirror image."""
     rates = found.spins.omega_view_rad_s.norm(dim=-1)
     for k, (omega, rate) in enumerate(zip(found.spins.omega_view_rad_s.tolist(), rates.tolist(), strict=True)):

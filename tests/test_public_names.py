@@ -1,9 +1,11 @@
-"""What `import sphereorient` offers: every name is there, completes, and is what its page says."""
+"""What `import sphereorient` offers: every name is there, completes, and is what its page says; one name, one thing."""
 
+import ast
 import inspect
 import subprocess
 import sys
 
+import names
 import pytest
 import torch
 
@@ -56,3 +58,20 @@ def test_names_come_in_a_fresh_process_in_any_order():
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'track_movie'"):
         _ = sphereorient.track_movie
+
+
+def test_a_public_name_has_one_meaning_a_term_is_in_the_glossary_and_no_retired_word_is_used():
+    assert not any(names.wrong().values()), "see `python scripts/names.py`"
+
+
+def test_each_list_of_names_finds_what_it_is_for():
+    first, second = "Rows = list[int]\ndef fit(told): ...\nclass _Part: ...", "Rows = list[str]\nclass OuterShell: ..."
+    trees = {
+        "a.py": ast.parse(first),
+        "b.py": ast.parse(second),
+        "c.py": ast.parse("Rows = list[int]\ndef _fit(): ..."),
+    }
+    assert names.meanings(trees) == {"Rows": ["a.py", "b.py"]}
+    assert names.unexplained(trees, "- **core**: not a shell\n") == {"shell": ["OuterShell"]}
+    assert names.unexplained(trees, "- **shells** (`Shell`): around a core\n") == {}
+    assert names.retired(trees) == {"told": ["a.py"]}

@@ -44,8 +44,8 @@ from sphereorient.synth.write import write_truth
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.rotations import rotation_vectors
 
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 RATE_HZ = 100.0
 RADIUS_MM = 5.0
@@ -59,7 +59,7 @@ GREY_BODY, GREY_LEG = 28.0, 22.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Paint:
+class Caps:
     """Dark caps on a bright ball."""
 
     caps: int = 150
@@ -74,7 +74,7 @@ class BallScene:
     """One scene; what peers print of theirs: median and 95 % of the steps, degrees, and drift, degrees a minute."""
 
     motion: str = "walk"  # or saccades: a third of the way, the same turns
-    paint: Paint = field(default_factory=Paint)
+    paint: Caps = field(default_factory=Caps)
     size: tuple[int, int] = (640, 480)  # px
     field_deg: float = 30.0  # vertical field of view
     azimuth_deg: float = 3.0  # of the ball, to the right
@@ -114,10 +114,10 @@ SCENES: Mapping[str, BallScene] = {
         exposure=0.8, blur_px=1.5, fictrac=(0.304, 0.845, -1.351), spintrack=(0.098, 0.459, -0.705)
     ),
     "sparse": BallScene(
-        paint=Paint(caps=40, radius_deg=(8.0, 16.0)), fictrac=(0.341, 0.835, -0.837), spintrack=(0.062, 0.159, -0.491)
+        paint=Caps(caps=40, radius_deg=(8.0, 16.0)), fictrac=(0.341, 0.835, -0.837), spintrack=(0.062, 0.159, -0.491)
     ),
     "speckle": BallScene(
-        paint=Paint(caps=1500, radius_deg=(1.0, 2.5), soft_deg=0.4),
+        paint=Caps(caps=1500, radius_deg=(1.0, 2.5), soft_deg=0.4),
         fictrac=(90.266, 175.677, 160.536),
         spintrack=(0.037, 0.091, -0.068),
     ),
@@ -134,7 +134,7 @@ SCENES: Mapping[str, BallScene] = {
         spintrack=(0.049, 0.099, 0.104),
     ),
     "low_contrast": BallScene(
-        paint=Paint(dark=(0.25, 0.35), base=0.7), fictrac=(0.346, 0.902, -1.030), spintrack=(0.046, 0.110, -0.008)
+        paint=Caps(dark=(0.25, 0.35), base=0.7), fictrac=(0.346, 0.902, -1.030), spintrack=(0.046, 0.110, -0.008)
     ),
     "lighting": BallScene(
         flicker=0.15,
@@ -150,7 +150,7 @@ SCENES: Mapping[str, BallScene] = {
 }
 
 
-def painted(paint: Paint, rng: np.random.Generator) -> Floats:
+def painted(paint: Caps, rng: np.random.Generator) -> Singles:
     """Return a map (H, 2 H) of caps that do not touch, over a ball with twelve large faint ones."""
     directions = map_directions(ROWS).float().numpy()
     grey = np.full(directions.shape[:2], paint.base, np.float32)
@@ -247,7 +247,7 @@ def _places(scene: BallScene, camera: PinholeCamera, count: int, rng: np.random.
 
 
 class _Film:
-    def __init__(self, scene: BallScene, camera: PinholeCamera, X: Tensor, paint: Floats, rng: np.random.Generator):
+    def __init__(self, scene: BallScene, camera: PinholeCamera, X: Tensor, paint: Singles, rng: np.random.Generator):
         self.scene, self._camera, self._paint, self._rng = scene, camera, paint, rng
         (u, v), (width, height) = camera.project(X).tolist(), scene.size
         self.radius_px, self.middle = float(camera.f_px) * math.tan(math.radians(scene.half_deg)), (u, v)
@@ -292,7 +292,7 @@ class _Film:
         self._shade = ((0.35 + 0.65 * lit).numpy() * self._hit).astype(np.float32)
         self._glint = (scene.specular * glint.clamp_min(0).numpy() ** 25 * self._hit).astype(np.float32)
 
-    def _seen(self, R_lab_body: Tensor) -> Floats:
+    def _seen(self, R_lab_body: Tensor) -> Singles:
         x, y, z = (self._normal.float() @ R_lab_body.float()).unbind(-1)
         rows, columns = self._paint.shape
         u = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * columns - 0.5
@@ -333,7 +333,7 @@ class _Film:
         axes = (int(0.38 * r * larger), int(0.22 * r * larger))
         cv2.ellipse(picture, (int(u), int(v - 0.78 * r)), axes, 0, 0, 360, grey, -1, cv2.LINE_AA)
 
-    def _put_animal(self, picture: Floats, k: int) -> None:
+    def _put_animal(self, picture: Singles, k: int) -> None:
         (u, v), r = self.middle, self.radius_px
         for leg in range(self.scene.legs):
             side, rank = (-1) ** (leg + 1), leg // 2
@@ -397,7 +397,7 @@ class BallErrors:
     behaviour: Behaviour
 
     @classmethod
-    def of(cls, time_s: Doubles, ours: Doubles, covariance: Doubles, true: Doubles) -> "BallErrors":
+    def of(cls, time_s: Floats, ours: Floats, covariance: Floats, true: Floats) -> "BallErrors":
         """Compare orientations (N, 3, 3), NaN: none, with true ones; covariances (N, 3, 3), lab, of what varies."""
         known: NDArray[np.bool_] = np.asarray(np.isfinite(ours).all((1, 2)))
         linked = known[1:] & known[:-1]
@@ -443,7 +443,7 @@ class BallRow:
         return {"radius_px": self.radius_px, "cpu_ms": self.cpu_ms, **rows}
 
 
-def measured(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
+def measure_scene(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
     """Track a scene from nothing; `refine`: by the precise method as well, with the map of the first pass."""
     with h5py.File(path.with_name("truth.h5")) as file:
         R_true = file["orientation"][()]

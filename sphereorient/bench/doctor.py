@@ -97,11 +97,11 @@ def fit_speed(diameter_px: float) -> dict[str, float]:
         R_true = orientations_at(path.parent / "truth.h5", np.arange(FRAMES))
         with open_live(path, Settings(), None, learnt) as opened:
             frames = list(movie_frames(opened.recording, paced=False))
-            views, told_s, found = opened.tracker.appearances[""].fitter.views, [], []
+            views, measured_s, found = opened.tracker.appearances[""].fitter.views, [], []
             for now in measured(opened.tracker, views, frames):
-                told_s.append((time.process_time(), time.perf_counter()))
+                measured_s.append((time.process_time(), time.perf_counter()))
                 found.append(now.R_lab_body)
-    cpu_ms, now_ms = (1e3 * (np.array(told_s[-1]) - told_s[FIRST - 1]) / (FRAMES - FIRST)).tolist()
+    cpu_ms, now_ms = (1e3 * (np.array(measured_s[-1]) - measured_s[FIRST - 1]) / (FRAMES - FIRST)).tolist()
     return {
         "diameter_px": diameter_px,
         "error_deg": float(distance_deg(np.array(found), R_true).max()),

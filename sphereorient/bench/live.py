@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from sphereorient.bench.score import orientations_at
+from sphereorient.bench.score import Floats, orientations_at
 from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.experiment.recording import open_recording
 from sphereorient.files.page_server import HOST
@@ -40,7 +40,6 @@ picture = numpy.random.default_rng(0).integers(0, 255, (1024, 1280), "uint8")
 while os.getppid() == int(sys.argv[1]):
     cv2.imencode(".jpg", cv2.GaussianBlur(picture, (0, 0), 2))
 """
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ BLOCK = 4  # frames: errors of neighbours are correlated
 DRAWS, SEED = 400, 2011
 MORE_OR_FEWER = {"levels", "seeds", "together"}  # settings by which scenes of one name do not differ
 Floats = NDArray[np.float64]
-Key = tuple[str, int, str]  # kind, level, method
+_Key = tuple[str, int, str]  # kind, level, method
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class SceneResult:
     hidden: float = 0.0  # share of its pictures that nearer balls hide by more than half
 
     @property
-    def key(self) -> Key:
+    def key(self) -> _Key:
         """Kind, level and method."""
         return self.kind, self.level, self.method
 
@@ -117,7 +117,7 @@ class ResultSummary:
 
 def summaries(results: Results) -> list[ResultSummary]:
     """Return the rows of the table, in the order of the scenes."""
-    groups: dict[Key, list[SceneResult]] = {}
+    groups: dict[_Key, list[SceneResult]] = {}
     for one in results.outcomes:
         groups.setdefault(one.key, []).append(one)
     return [summarised(group) for group in groups.values()]
@@ -129,8 +129,8 @@ def summarised(group: Sequence[SceneResult]) -> ResultSummary:
     distances_mm = np.array([x for one in group for x in one.position_mm if x is not None])
     frames, looks, stated = (sum(getattr(one, key) for one in group) for key in ("frames", "looks", "stated"))
     seen = errors[np.isfinite(errors)]
-    told = [(one.stated, one.over_stated) for one in group if one.over_stated is not None]
-    squares = sum(count * over**2 for count, over in told)
+    known = [(one.stated, one.over_stated) for one in group if one.over_stated is not None]
+    squares = sum(count * over**2 for count, over in known)
     p50, p95, largest = np.percentile(seen, (50, 95, 100)) if len(seen) else (np.nan,) * 3
     p50_mm, p95_mm = np.percentile(distances_mm, (50, 95)) if len(distances_mm) else (np.nan,) * 2
     kind, level, method = group[0].key
@@ -150,7 +150,7 @@ def summarised(group: Sequence[SceneResult]) -> ResultSummary:
         lost=sum(one.lost for one in group) / max(frames, 1),
         recall={str(k): sum(one.recall[str(k)] * one.looks for one in group) / max(looks, 1) for k in FIRST},
         inside=sum(one.inside for one in group) / stated if stated else float("nan"),
-        over_stated=math.sqrt(squares / sum(count for count, _ in told)) if told else float("nan"),
+        over_stated=math.sqrt(squares / sum(count for count, _ in known)) if known else float("nan"),
         frames_per_s=frames / max(sum(one.seconds for one in group), 1e-9),
         refused=next((one.refused for one in group if one.refused), ""),
         given=sum(one.given for one in group) / max(frames, 1),
@@ -223,7 +223,7 @@ def compare_runs(now: Results, baseline: Results) -> list[Change]:
     plans = [run.settings.model_dump(exclude=MORE_OR_FEWER) for run in (now, baseline)]
     same = plans[0] == plans[1]
     known = {(one.scene, one.ball, one.method): one for one in baseline.outcomes if same}
-    groups: dict[Key, list[tuple[SceneResult, SceneResult]]] = {}
+    groups: dict[_Key, list[tuple[SceneResult, SceneResult]]] = {}
     for one in now.outcomes:
         if (before := known.get((one.scene, one.ball, one.method))) is not None and before.frames == one.frames:
             groups.setdefault(one.key, []).append((before, one))
@@ -233,7 +233,7 @@ def compare_runs(now: Results, baseline: Results) -> list[Change]:
     return [change for key, pairs in groups.items() for change in _changes(key, pairs)]
 
 
-def _changes(key: Key, pairs: Sequence[tuple[SceneResult, SceneResult]]) -> list[Change]:
+def _changes(key: _Key, pairs: Sequence[tuple[SceneResult, SceneResult]]) -> list[Change]:
     errors = [np.concatenate([pair[k].errors_deg for pair in pairs]) for k in (0, 1)]
     numbers = []
     p50 = [float(np.nanmedian(x)) if np.isfinite(x).any() else np.nan for x in errors]

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sphereorient.bench.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.bench.score import (
+    Floats,
     given_to_others,
     named_as_true,
     score_track,
@@ -38,12 +38,11 @@ from sphereorient.synth.scene import hidden_shares
 from sphereorient.trajectory import CameraTrack, Tracks, Trajectory
 from sphereorient.trajectory.rotations import distance_deg
 
-Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
-Progress = Callable[[int, int], None]
+_Tracker = Callable[[Path], Trajectory | Tracks]  # experiment.yaml to a track; can be pickled
+Advance = Callable[[int, int], None]
 PLAN, RESULTS, KEPT, CACHE = "plan.json", "results.json", "scenes", "cache"
 DIGITS = 5
-Floats = NDArray[np.float64]
-TRACKERS: dict[str, Tracker] = {
+TRACKERS: dict[str, _Tracker] = {
     "precise": partial(track_movies, method="precise"),
     "paper": partial(track_movies, method="paper"),
     "precise_network": partial(track_movies, method="precise", settings=with_proposer(None, "default")),
@@ -51,7 +50,7 @@ TRACKERS: dict[str, Tracker] = {
 DEFAULT = ("precise", "paper")
 
 
-def trackers_of(names: Sequence[str]) -> dict[str, Tracker]:
+def trackers_of(names: Sequence[str]) -> dict[str, _Tracker]:
     """Return the trackers of some methods; raise BenchError for an unknown name."""
     for name in names:
         if name not in TRACKERS:
@@ -63,10 +62,10 @@ def trackers_of(names: Sequence[str]) -> dict[str, Tracker]:
 def run_benchmark(
     folder: Path,
     settings: BenchSettings,
-    trackers: Mapping[str, Tracker] | None = None,
+    trackers: Mapping[str, _Tracker] | None = None,
     *,
     jobs: int = 1,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
 ) -> Results:
     """Render all scenes, track each with all methods (None: precise and paper), and measure; results.json holds all. An
     interrupted run of the same plan is continued. `jobs` processes do one scene each; `progress` gets finished and all
@@ -107,10 +106,10 @@ def run_all(
 def run_benchmarks(
     folder: Path,
     plans: Mapping[str, BenchSettings],
-    trackers: Mapping[str, Tracker],
+    trackers: Mapping[str, _Tracker],
     *,
     jobs: int = 1,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
 ) -> list[Results]:
     """Run plans one after the other, each in a folder of its name; `progress` gets the scenes of all."""
     counts = [len(scenes_of(plan)) for plan in plans.values()]
@@ -149,7 +148,7 @@ def _path(folder: Path, scene: BenchmarkScene, method: str) -> Path:
     return folder / KEPT / f"{scene.name}.{method}.json"
 
 
-def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker]) -> dict[str, Tracker]:
+def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, _Tracker]) -> dict[str, _Tracker]:
     return {name: tracker for name, tracker in trackers.items() if not _path(folder, scene, name).exists()}
 
 
@@ -162,7 +161,7 @@ def kept_results(path: Path) -> list[SceneResult]:
         raise BenchError(refusal(str(path), expected="the result of a scene", got="something else", do=do)) from None
 
 
-def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker]) -> None:
+def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, _Tracker]) -> None:
     """Render a scene, track it, keep the results; the movies are not kept."""
     with tempfile.TemporaryDirectory(prefix="scene") as rendered:
         experiment = write_scene(Path(rendered), scene)
@@ -171,7 +170,7 @@ def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracke
             write_text(_path(folder, scene, name), json.dumps(found, separators=(",", ":")))
 
 
-def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: Tracker) -> list[SceneResult]:
+def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: _Tracker) -> list[SceneResult]:
     """Track a scene and measure the track of each ball; a refusal of the method is a result too."""
     begin = time.perf_counter()
     balls, truth_path = scene.base.worn, experiment.parent / "truth.h5"

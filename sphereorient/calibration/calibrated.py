@@ -12,7 +12,7 @@ from rich.table import Column, Table
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sphereorient.calibration.document import Picture
+from sphereorient.calibration.document import Photo
 from sphereorient.calibration.targets import PlateView
 from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, in_air
 from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
@@ -29,7 +29,7 @@ FIELD_DEG = (1.0, 150.0)  # of view, along the longer side
 class PictureReport:
     """The result of one picture."""
 
-    picture: Picture
+    picture: Photo
     pose: int
     view: PlateView
     residual_px: NDArray[np.float64]  # (n, 2), measured minus expected

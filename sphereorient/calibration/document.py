@@ -26,8 +26,8 @@ SCHEMA = "sphereorient-calibration/1"
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: rounding to four digits after the point
 COLUMNS = ("x", "y", "z", "u", "v")  # mm, mm, mm, px, px
 Positive = Annotated[FiniteFloat, Field(gt=0)]
-Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Model = Literal["tsai", "pinhole", "brown"]
+_Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+ModelName = Literal["tsai", "pinhole", "brown"]
 # Points of tables are lab points: a plate whose frame is the lab's.
 IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
 
@@ -36,8 +36,8 @@ class SurveyedKeys(Entry):
     """The plate's pose in the lab in one picture; it defines the lab frame."""
 
     pose: int
-    R_lab_plate: tuple[Triple, Triple, Triple]
-    T_lab_plate: Triple
+    R_lab_plate: tuple[_Triple, _Triple, _Triple]
+    T_lab_plate: _Triple
 
 
 class PictureKeys(BaseModel, frozen=True, extra="allow"):
@@ -58,12 +58,12 @@ class CalibrationKeys(BaseModel, frozen=True, extra="forbid"):
     ports: dict[str, PortEntry] = {}
     pictures: list[PictureKeys] = []
     points: dict[str, str] = {}
-    model: Model = "tsai"
+    model: ModelName = "tsai"
     fit_ports: tuple[str, ...] = ()  # names of the ports' parameters that are fitted too
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Picture:
+class Photo:
     """One picture of the plate."""
 
     camera: str
@@ -81,7 +81,7 @@ class CalibrationDocument:
     plate: CalibrationTarget | None
     poses: tuple[int, ...]  # numbers of the poses, by row
     surveyed: Mapping[int, tuple[Tensor, Tensor]]  # row of the pose -> R_lab_plate, T_lab_plate (mm)
-    pictures: tuple[Picture, ...]
+    pictures: tuple[Photo, ...]
     points: Mapping[str, Path]  # camera -> table of lab points and their pixels
     cameras: tuple[str, ...]  # names, in the file's order
     ports: Mapping[str, Port]
@@ -158,7 +158,7 @@ def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[
     return ports
 
 
-def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> Iterator[Picture]:
+def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> Iterator[Photo]:
     seen = set()
     for k, entry in enumerate(keys.pictures):
         row, files, where = numbers.index(entry.pose), entry.model_extra or {}, f"{path}, pictures, {k}"
@@ -173,7 +173,7 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> It
             clicked = None
             if name in entry.clicked:
                 clicked = checked_clicks(entry.clicked[name], keys.image_size, f"{where}, clicked, {name}")
-            yield Picture(camera=name, row=row, path=path.parent / file, clicked_px=clicked)
+            yield Photo(camera=name, row=row, path=path.parent / file, clicked_px=clicked)
         check_known(entry.clicked, files, f"{where}, clicked")
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
 from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubts
-from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
+from sphereorient.calibration.document import CalibrationDocument, Photo, load_calibration, read_points
 from sphereorient.calibration.solve import SIGMA_PX
 from sphereorient.calibration.targets import PlateView, placed
 from sphereorient.calibration.tsai_method import guess_from_points, guess_rig
@@ -23,11 +23,10 @@ from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
-from sphereorient.files.threads import counted, side_by_side
+from sphereorient.files.threads import Progress, counted, side_by_side
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
-Progress = Callable[[str, int, int], None]
 WALL = 0.3  # of the way from the plates to the camera: where the search for a wall starts
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
 # Sigmas from which a parameter counts as undetermined, by the begin of its name: shares of focal length, distance and
@@ -62,17 +61,17 @@ def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: P
     return _judged(document, tied, _collected(document, views, tied, fitted), progress)
 
 
-def _read_tables(document: CalibrationDocument) -> dict[Picture, PlateView]:
+def _read_tables(document: CalibrationDocument) -> dict[Photo, PlateView]:
     views = {}
     for name, path in document.points.items():
         table = read_points(path)
         zeros, index = np.zeros(len(table)), np.pad(np.arange(len(table))[:, None], ((0, 0), (0, 1)))
         view = PlateView(table[:, :3], table[:, 3:], zeros + SIGMA_PX, zeros, index)
-        views[Picture(camera=name, row=0, path=path)] = view
+        views[Photo(camera=name, row=0, path=path)] = view
     return views
 
 
-def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Picture, PlateView]:
+def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Photo, PlateView]:
     """Read all pictures and find the plate in them."""
     assert document.plate is not None
     plate = document.plate
@@ -100,7 +99,7 @@ def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) ->
     return np.asarray(picture)
 
 
-def _check_seen(document: CalibrationDocument, views: Mapping[Picture, PlateView]) -> None:
+def _check_seen(document: CalibrationDocument, views: Mapping[Photo, PlateView]) -> None:
     for name in document.cameras:
         own = [view for picture, view in views.items() if picture.camera == name]
         if all(view.state != "tied" for view in own):
@@ -108,7 +107,7 @@ def _check_seen(document: CalibrationDocument, views: Mapping[Picture, PlateView
             raise camera_error(f"{document.path}, {name}", "pictures of the plate", got, do)
 
 
-def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> Rig:
+def _first_rig(document: CalibrationDocument, tied: Mapping[Photo, PlateView]) -> Rig:
     if not document.points:
         return guess_rig(document, _by_camera(document, tied))
     cameras = {}
@@ -120,11 +119,11 @@ def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
     return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
 
 
-def _by_camera(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> dict[str, dict[int, PlateView]]:
+def _by_camera(document: CalibrationDocument, tied: Mapping[Photo, PlateView]) -> dict[str, dict[int, PlateView]]:
     return {name: {one.row: view for one, view in tied.items() if one.camera == name} for name in document.cameras}
 
 
-def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, PlateView]) -> Problem:
+def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Photo, PlateView]) -> Problem:
     of_port = {name: document.keys.fit_ports if name in document.ports else () for name in rig.cameras}
     return Problem(
         rig=rig,
@@ -134,9 +133,7 @@ def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, Pla
     )
 
 
-def tie_floating(
-    document: CalibrationDocument, rig: Rig, views: Mapping[Picture, PlateView]
-) -> dict[Picture, PlateView]:
+def tie_floating(document: CalibrationDocument, rig: Rig, views: Mapping[Photo, PlateView]) -> dict[Photo, PlateView]:
     """Tie views without fiducials through cameras that saw the same pose, if exactly one placement fits."""
     assert document.plate is not None
     known = {picture.row for picture, view in views.items() if view.state == "tied" and picture.row in rig.posed}
@@ -154,7 +151,7 @@ def tie_floating(
     return tied
 
 
-def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
+def _missed(rig: Rig, picture: Photo, view: PlateView) -> float:
     expected = rig.cameras[picture.camera].project(rig.placed(picture.row, view.points_plate_mm)).numpy()
     return float(np.nan_to_num(np.median(np.linalg.norm(view.uv_px - expected, axis=1)), nan=np.inf))
 
@@ -177,7 +174,7 @@ def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
 
 
 def _collected(
-    document: CalibrationDocument, views: Mapping[Picture, PlateView], tied: Mapping[Picture, PlateView], fitted: Fitted
+    document: CalibrationDocument, views: Mapping[Photo, PlateView], tied: Mapping[Photo, PlateView], fitted: Fitted
 ) -> Calibrated:
     reports = []
     for picture, view in views.items():
@@ -203,7 +200,7 @@ def _collected(
 
 
 def _judged(
-    document: CalibrationDocument, tied: Mapping[Picture, PlateView], result: Calibrated, progress: Progress
+    document: CalibrationDocument, tied: Mapping[Photo, PlateView], result: Calibrated, progress: Progress
 ) -> Calibrated:
     """Add what contradicts the calibration, with its most likely cause; CameraError where nothing can be trusted."""
     found = doubts(result)
@@ -220,7 +217,7 @@ def _judged(
 
 
 def _cause(
-    document: CalibrationDocument, tied: Mapping[Picture, PlateView], result: Calibrated, structured: Sequence[str]
+    document: CalibrationDocument, tied: Mapping[Photo, PlateView], result: Calibrated, structured: Sequence[str]
 ) -> str:
     """Return advice: the change of lens or wall after which no residuals have structure, if there is one."""
     ports = {name: _wall_before(result, name) for name in structured} | dict(document.ports)

@@ -183,16 +183,16 @@ class CircleGrid(CalibrationTarget):
         return np.full(len(index), self.dot_diameter_mm)
 
 
-Kind = type[CalibrationTarget]
-KINDS: dict[str, Kind] = {"dots": DotPlate, "chessboard": Chessboard, "charuco": CharucoBoard, "circles": CircleGrid}
+_Kind = type[CalibrationTarget]
+KINDS: dict[str, _Kind] = {"dots": DotPlate, "chessboard": Chessboard, "charuco": CharucoBoard, "circles": CircleGrid}
 
 
-def target_keys(kind: Kind) -> dict[str, tuple[str, bool]]:
+def target_keys(kind: _Kind) -> dict[str, tuple[str, bool]]:
     """Return the field of each key of calibration.yaml, and whether the key is required."""
     return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
 
 
-def _kind_of(entry: Any) -> Kind | None:
+def _kind_of(entry: Any) -> _Kind | None:
     kind = entry.get("type") if isinstance(entry, Mapping) else None
     return KINDS.get(kind) if isinstance(kind, str) else None
 

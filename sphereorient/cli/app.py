@@ -66,8 +66,8 @@ def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., Non
 
     @wraps(function)
     def guarded(force: bool = False, **given: Any) -> None:
-        told = [each if isinstance(each, list) else [each] for name, each in given.items() if name not in OUTPUTS]
-        paths = [path for each in told for path in each if isinstance(path, Path)] if writes else []
+        values = [each if isinstance(each, list) else [each] for name, each in given.items() if name not in OUTPUTS]
+        paths = [path for each in values for path in each if isinstance(path, Path)] if writes else []
         with writing((file for path in paths for file in _read(path, textured)), force=force):
             function(record(**given)) if record else function(**given)
 
@@ -155,11 +155,11 @@ def print_table(table: Any) -> None:
     console.print(table)
 
 
-Advance = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]
 
 
 @contextmanager
-def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
+def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Progress]:
     """Show a line of progress for each stage, with units per second and the time left; nothing if `quiet`.
     Where there is no terminal: print a line as a stage begins, each minute, and at the end of one of over a second.
     """
@@ -173,7 +173,7 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
     if not console.is_terminal:
         yield _lines(unit)
         return
-    columns = ("{task.description:16}", progress.BarColumn(), progress.TimeElapsedColumn(), "{task.fields[told]}")
+    columns = ("{task.description:16}", progress.BarColumn(), progress.TimeElapsedColumn(), "{task.fields[rate]}")
     bar = progress.Progress(*columns, console=console)
     tasks: dict[str, Any] = {}
     with ExitStack() as shown:
@@ -182,14 +182,14 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
             if not tasks:
                 shown.enter_context(bar)  # not earlier: a refusal prints one line only
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total or None, told="")
+                tasks[stage] = bar.add_task(stage, total=total or None, rate="")
             elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed or 0.0
-            bar.update(tasks[stage], completed=done, total=total or None, told=_told(done, total, elapsed, unit))
+            bar.update(tasks[stage], completed=done, total=total or None, rate=_rate(done, total, elapsed, unit))
 
         yield advance
 
 
-def _told(done: int, total: int, elapsed_s: float, unit: str) -> str:
+def _rate(done: int, total: int, elapsed_s: float, unit: str) -> str:
     """Return how much is done, how fast, and the time left, in words; a stage of one step has nothing to count."""
     if total == 1 or (not done and not total):
         return ""
@@ -208,7 +208,7 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
-def _lines(unit: str) -> Advance:
+def _lines(unit: str) -> Progress:
     begun = time.monotonic()
     first: dict[str, float] = {}  # by stage, when it began
     last: dict[str, float] = {}  # when its last line was printed
@@ -219,8 +219,8 @@ def _lines(unit: str) -> Advance:
         ended = done == total > 1 and now - since > 1.0
         if ended or now - last.get(stage, -math.inf) >= LINE_S:
             last[stage] = now
-            told = _told(done, total, now - since, unit)
-            typer.echo(f"{now - begun:6.0f} s  {stage}{': ' if told else ''}{told}", err=True)
+            rate = _rate(done, total, now - since, unit)
+            typer.echo(f"{now - begun:6.0f} s  {stage}{': ' if rate else ''}{rate}", err=True)
 
     return advance
 
@@ -268,8 +268,8 @@ def doctor(as_json: Annotated[bool, Option("--json", help="Print all of it as on
 def _print_findings(found: dict[str, Any]) -> None:
     fits = found.pop("live_one_camera", [])
     for name, value in found.items():
-        told = [f"{key}: {_words(one)}" for key, one in value.items()] if isinstance(value, dict) else [_words(value)]
-        for words in told or ["none"]:
+        lines = [f"{key}: {_words(one)}" for key, one in value.items()] if isinstance(value, dict) else [_words(value)]
+        for words in lines or ["none"]:
             typer.echo(f"{name.replace('_', ' '):24} {words}")
     if fits:
         table = Table(*fits[0], title="live, one camera: time of a frame, and the rates that can be held")

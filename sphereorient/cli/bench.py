@@ -323,7 +323,7 @@ class _BallOptions:
 def ball_scenes(given: _BallOptions) -> None:
     """Track a ball under an animal of which nothing is known, in scenes as another program publishes its own."""
     check_writable(given.out, folder_made=True)
-    from sphereorient.bench.ball import SCENES, measured, write_ball_scene
+    from sphereorient.bench.ball import SCENES, measure_scene, write_ball_scene
     from sphereorient.methods.settings import Settings
 
     names = list(SCENES) if given.scenes is None else names_in(given.scenes)
@@ -338,7 +338,7 @@ def ball_scenes(given: _BallOptions) -> None:
             folder = done.with_suffix("")
             with progress_bar(given.quiet) as advance, writing(force=True):  # of this run
                 path = write_ball_scene(folder, SCENES[name], given.frames, given.seed, advance)
-                row = measured(path, Settings(), not given.first, advance)
+                row = measure_scene(path, Settings(), not given.first, advance)
                 write_text(done, json.dumps({"scene": name, **row.numbers()}, indent=1))
         rows.append(json.loads(done.read_text()))
     if not given.quiet:

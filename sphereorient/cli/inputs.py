@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
+from sphereorient.cli.app import Progress, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, NoCache, Overrides, Quiet, SettingsPath, frames_of
 from sphereorient.errors import MovieError
 from sphereorient.files.whole_file import check_ending, writing
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sphereorient.movies.survey import Survey
     from sphereorient.preflight import Finding
 
-Source = Annotated[str, Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")]
+_Movie = Annotated[str, Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")]
 Flip = Annotated[str, Option(help="Mirror: none, vertical (rows), horizontal (columns), both, transpose.")]
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
@@ -75,7 +75,7 @@ def _print_findings(findings: "Sequence[Finding]", quiet: bool) -> None:
 
 @app.command("movie")
 def show_movie(
-    source: Source,
+    source: _Movie,
     out: Annotated[
         Path | None, Option("--out", "-o", help="Contact sheet (.png, .pdf); else FILE.contact.png.")
     ] = None,
@@ -106,7 +106,7 @@ def show_movie(
 
 @app.command()
 def convert(
-    source: Source,
+    source: _Movie,
     target: Annotated[Path, Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
     frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
     flip: Flip = "none",
@@ -180,7 +180,7 @@ def _numbers(numbers: Sequence[int], after: str = ": ") -> str:
     return _frames(len(numbers)) + after + ", ".join(map(str, numbers[:SHOWN])) + more
 
 
-def _pictures(opened: "Movie", first: int, last: int, dead: list[int], advance: Advance) -> "Iterator[Grey | None]":
+def _pictures(opened: "Movie", first: int, last: int, dead: list[int], advance: Progress) -> "Iterator[Grey | None]":
     """Yield the frames to write; append the numbers of those that cannot be decoded to `dead`."""
     for number, picture in enumerate(opened.readable(first, last), start=first):
         if picture is None:

@@ -22,7 +22,7 @@ SphereName = Annotated[str | None, Option("--sphere", help="Of several balls, on
 Align = Annotated[
     str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
 ]
-FicTracConfig = Annotated[
+FicTracConfigPath = Annotated[
     Path | None,
     Option("--axes", metavar="CONFIG", help="FicTrac's config.txt: its table in its own axes; default: in the lab's."),
 ]

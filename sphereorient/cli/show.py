@@ -13,7 +13,7 @@ from sphereorient.cli.options import (
     Align,
     CommonOptions,
     ExperimentPath,
-    FicTracConfig,
+    FicTracConfigPath,
     Quiet,
     SphereName,
     TrackPath,
@@ -120,8 +120,8 @@ def overlay(given: _OverlayOptions) -> None:
             chosen = FrameSelection(cameras=names, first=first, last=last, every=given.every)
             shown = overlay_movie(seen, loaded, given.out, chosen, given.fps, lambda *at: advance("overlay", *at))
         for ball, sheet in sheets.items():
-            told = partial(advance, f"worst {ball}".strip())
-            bad[sheet] = len(worst_frames(seen[ball], loaded, sheet, given.count, cameras=names, progress=told))
+            advancing = partial(advance, f"worst {ball}".strip())
+            bad[sheet] = len(worst_frames(seen[ball], loaded, sheet, given.count, cameras=names, progress=advancing))
     if not given.quiet and given.out is not None:
         typer.echo(f"Wrote {given.out}: {shown} frames")
     for sheet, frames_shown in bad.items() if not given.quiet else ():
@@ -150,7 +150,7 @@ class _ExportOptions:
         ),
     ] = None
     experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None
-    axes: FicTracConfig = None
+    axes: FicTracConfigPath = None
     sphere: SphereName = None
     quiet: Quiet = False
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from sphereorient.tools.design.judge import Judgement
     from sphereorient.tools.spin.disks import Photographs
-    from sphereorient.tools.spin.spin import SpinFound
+    from sphereorient.tools.spin.spin import SpinEstimate
 
 SPREAD = ("min", "median", "max")
 HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
@@ -69,7 +69,7 @@ def spin(given: _SpinOptions) -> None:
         typer.echo(f"Wrote {given.out}, {given.out.with_suffix('.png')}")
 
 
-def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, Any]:
+def _spin_document(found: "SpinEstimate", photographs: "Photographs") -> dict[str, Any]:
     spins, sigma = found.spins, found.spins.rate_sigma()
     rate = spins.omega_view_rad_s.norm(dim=-1)
     return {
@@ -171,9 +171,9 @@ def design(given: _DesignOptions) -> None:
         judgement = judge_texture(drawn, settings)
     else:
         with progress_bar(given.quiet or given.as_json, unit="maps") as advance:
-            told, kinds = partial(advance, "search"), names_in(given.kinds)
+            advancing, kinds = partial(advance, "search"), names_in(given.kinds)
             drawn, judgement, title = design_texture(
-                kinds, given.stroke, settings, tries=given.tries, seed=given.seed, advance=told
+                kinds, given.stroke, settings, tries=given.tries, seed=given.seed, advance=advancing
             )
     files = _written(given.out, drawn, judgement, title, make=given.map_ is None)
     if strips is not None:
@@ -214,9 +214,9 @@ def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, 
 
 
 def _print_judgement(judgement: "Judgement", title: str) -> None:
-    told = judgement.as_dict()
+    measures = judgement.as_dict()
     table = Table(title, "least", "middle", "most", title="judgement", title_justify="left")
-    white, bound = told["white_share"], told["bound_deg"]
+    white, bound = measures["white_share"], measures["bound_deg"]
     table.add_row("white in a view, %", *(_number(white[name], 100, 0) for name in SPREAD))
     table.add_row("best possible error of a view, degrees", *(_number(bound[name], 1, 3) for name in SPREAD))
     print_table(table)
@@ -224,9 +224,9 @@ def _print_judgement(judgement: "Judgement", title: str) -> None:
     lines = [
         f"(ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} % of black to white, "
         f"{settings.views} views, position of the ball unknown)",
-        f"worst view: {_place(told['worst_view_lon_lat_deg'])}; best: {_place(told['best_view_lon_lat_deg'])}",
-        f"most similar views, {told['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, "
-        f"margin {judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
+        f"worst view: {_place(measures['worst_view_lon_lat_deg'])}; best: {_place(measures['best_view_lon_lat_deg'])}",
+        f"most similar views, {measures['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, "
+        f"margin {judgement.margin:.2f}: {' and '.join(_place(each) for each in measures['most_alike_lon_lat_deg'])}",
         f"widest brush that paints it: {judgement.stroke_deg:.0f} degrees; borders {judgement.border:.1f} radii long",
     ]
     echo_lines(lines)

@@ -11,7 +11,7 @@ from rich.table import Column, Table
 from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
-from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfig, NoCache, Resume, ball_words
+from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfigPath, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
 from sphereorient.files.whole_file import check_ending
 
@@ -150,8 +150,8 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
     for outcome in outcomes:
         rate = f"{outcome.frames / outcome.seconds:.1f}" if outcome.frames else ""
         counts = (str(outcome.frames), str(outcome.valid)) if outcome.error is None else ("", "")
-        told = str(outcome.request.out) if outcome.error is None else "failed, see below"
-        table.add_row(outcome.name, *counts, f"{outcome.seconds:.0f}", rate, told)
+        state = str(outcome.request.out) if outcome.error is None else "failed, see below"
+        table.add_row(outcome.name, *counts, f"{outcome.seconds:.0f}", rate, state)
     print_table(table)
 
 
@@ -186,7 +186,7 @@ class _LiveOptions(CameraOptions):
     ] = None
     record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
     learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
-    axes: FicTracConfig = None
+    axes: FicTracConfigPath = None
     page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
 
 
@@ -206,9 +206,9 @@ def live(given: _LiveOptions) -> None:
     from sphereorient.movies.record import Recorder
 
     chosen, experiment = given.chosen("precise"), load_experiment(given.experiment)
-    source, page, movies = source_of(given.source, _tell), None, _movies_of(given, experiment)
+    source, page, movies = source_of(given.source, _log), None, _movies_of(given, experiment)
     with ExitStack() as opened:
-        outputs = [open_output(name, _tell) for name in given.to or ()]
+        outputs = [open_output(name, _log) for name in given.to or ()]
         opened.callback(source.close)
         for output, _ in outputs:
             opened.callback(output.close)
@@ -219,7 +219,7 @@ def live(given: _LiveOptions) -> None:
             got, do = ", ".join(given.to or ()) or "none", "add --to tcp:PORT, or leave out --axes"
             raise SettingsError(refusal("--axes", expected="an output with FicTrac's table", got=got, do=do))
         if given.page is not None:
-            page = PageProcess(given.experiment, given.names, given.page, _tell)
+            page = PageProcess(given.experiment, given.names, given.page, _log)
             opened.callback(page.close)
             typer.echo(f"page: {page.address}", err=True)
         set_up = opened.enter_context(open_live(experiment, chosen, given.names, given.learnt))
@@ -230,15 +230,15 @@ def live(given: _LiveOptions) -> None:
         recorders, frame_s = [], recording.timeline.frame_s
         for stream in recording.streams if movies else ():
             filmed = flipped(stream.movie, experiment.flip.get(stream.name, "none"))
-            recorders.append(Recorder(movies[stream.name], filmed, frame_s, _tell, wait=source.waits))
+            recorders.append(Recorder(movies[stream.name], filmed, frame_s, _log, wait=source.waits))
             opened.callback(recorders[-1].close)
-        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _tell, given.axes)
+        monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _log, given.axes)
         if set_up.save_map is not None:
-            _tell("the map is finished; this takes some seconds")
+            _log("the map is finished; this takes some seconds")
             try:
                 typer.echo(set_up.save_map())
             except PaintError as error:
-                _tell(str(error))
+                _log(str(error))
     if not given.quiet:
         echo_lines([*monitor.summary(), *(one.summary() for one in recorders)])
 
@@ -260,5 +260,5 @@ def _movies_of(given: _LiveOptions, experiment: "Experiment") -> dict[str, Path]
     return movies
 
 
-def _tell(line: str) -> None:
+def _log(line: str) -> None:
     typer.echo(f"note: {line}", err=True)

@@ -88,7 +88,7 @@ class Experiment:
             return replace(self, spheres=(self.sphere,))
         if self.names == (UNNAMED,):
             do = "name the experiment of the track"
-            raise refused(f"{self.path}, spheres", f"a ball {name}", "one without name", do)
+            raise input_error(f"{self.path}, spheres", f"a ball {name}", "one without name", do)
         check_known([name], self.names, f"{self.path}, spheres", ExperimentError)
         return replace(self, spheres=(self.spheres[self.names.index(name)],))
 
@@ -101,7 +101,7 @@ class Experiment:
         """The only sphere; ExperimentError if there are several."""
         if not self.alone:
             do = "name a file with one of them under `sphere`, or take experiment.of(NAME) in Python"
-            raise refused(f"{self.path}, spheres", "one ball", ", ".join(self.names), do)
+            raise input_error(f"{self.path}, spheres", "one ball", ", ".join(self.names), do)
         return self.spheres[0]
 
     @property
@@ -130,7 +130,7 @@ class Experiment:
         """
         path = self.texture_path or self.folder / MAP
         if path.exists():
-            raise refused(str(path), "no map there yet", "a file", "write it under sphere: texture:, or rename it")
+            raise input_error(str(path), "no map there yet", "a file", "write it under sphere: texture:, or rename it")
         return path
 
     @property
@@ -144,7 +144,7 @@ class Experiment:
         return 1.0 if self.diameter_mm is None else self.diameter_mm / 2
 
 
-def refused(name: str, expected: str, got: str, do: str) -> ExperimentError:
+def input_error(name: str, expected: str, got: str, do: str) -> ExperimentError:
     """Return an ExperimentError worded by `refusal`."""
     return ExperimentError(refusal(name, expected=expected, got=got, do=do))
 
@@ -209,7 +209,7 @@ def load_experiment(source: Experiment | Path | str) -> Experiment:
     path = Path(source)
     if is_movie(path):
         do = f"write its experiment.yaml first: `sphereorient init {path}`"
-        raise refused(str(path), "an experiment.yaml", "a movie", do)
+        raise input_error(str(path), "an experiment.yaml", "a movie", do)
     do = "write one with `sphereorient init MOVIE`, or correct the path"
     document = read_document(path, SCHEMA, ExperimentError, do)
     needed = (("frame_rate", "times"), ("sphere", "spheres"))
@@ -325,34 +325,34 @@ def response_of(where: str, given: Any) -> Response:
         if table.shape == (len(table), 2) and not table[0].any() and bool((np.diff(table, axis=0) > 0).all()):
             return Response(table=tuple(map(tuple, table / table[-1])))
     expected = "linear, srgb, {gamma: NUMBER}, or a table [[0, 0], ...] of grey level and light, both increasing"
-    raise refused(where, expected, short(given), "write one of these, or leave it out: it is learnt then")
+    raise input_error(where, expected, short(given), "write one of these, or leave it out: it is learnt then")
 
 
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     if (keys.frame_rate is None) == (keys.times is None):
         got, do = "neither" if keys.times is None else "both", "write frame_rate: in Hz, or times: with a file"
-        raise refused(str(path), "either frame_rate or times", got, do)
+        raise input_error(str(path), "either frame_rate or times", got, do)
     if keys.frames is not None and keys.frames[0] >= keys.frames[1]:
-        raise refused(f"{path}, frames", "first below last", str(keys.frames), "write first and last + 1")
+        raise input_error(f"{path}, frames", "first below last", str(keys.frames), "write first and last + 1")
     if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
         expected = f"at most the time between frames, {1 / keys.frame_rate:.4g} s"
-        raise refused(f"{path}, exposure", expected, f"{keys.exposure:g}", "write it in seconds")
+        raise input_error(f"{path}, exposure", expected, f"{keys.exposure:g}", "write it in seconds")
     for name, device in keys.camera.items():
         if device.exposure_ms and device.rate_hz and device.exposure_ms > 1e3 / device.rate_hz:
             where, expected = f"{path}, camera.{name}.exposure_ms", f"at most {1e3 / device.rate_hz:.4g} ms, by rate_hz"
-            raise refused(where, expected, f"{device.exposure_ms:g}", "expose for less, or at a lower rate")
+            raise input_error(where, expected, f"{device.exposure_ms:g}", "expose for less, or at a lower rate")
 
 
 def _check_spheres(path: Path, keys: ExperimentKeys) -> None:
     where = f"{path}, spheres"
     if keys.sphere is None and not keys.spheres:
-        raise refused(f"{path}, sphere", "a value", "none", "add the key, or `spheres` with a name for each ball")
+        raise input_error(f"{path}, sphere", "a value", "none", "add the key, or `spheres` with a name for each ball")
     if keys.sphere is not None and keys.spheres:
         do = "write `sphere` for one ball, else `spheres`"
-        raise refused(f"{path}, sphere", "either sphere or spheres", "both", do)
+        raise input_error(f"{path}, sphere", "either sphere or spheres", "both", do)
     for name, sphere in keys.spheres.items():
         if not name.strip() or "/" in name or name == ".":
-            raise refused(where, "names without '/'", short(name), "give each ball a name, such as a")
+            raise input_error(where, "names without '/'", short(name), "give each ball a name, such as a")
         if sphere.diameter is None and len(keys.spheres) > 1:
             do = "measure it: lengths of several balls are in mm"
-            raise refused(f"{where}.{name}.diameter", "a number (mm)", "none", do)
+            raise input_error(f"{where}.{name}.diameter", "a number (mm)", "none", do)

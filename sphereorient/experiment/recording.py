@@ -18,7 +18,14 @@ from torch import Tensor
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.cameras.response import SRGB, Response
 from sphereorient.errors import ExperimentError, MovieError, Reason, refusal
-from sphereorient.experiment.experiment import Experiment, Sphere, load_experiment, open_movies, outside_paths, refused
+from sphereorient.experiment.experiment import (
+    Experiment,
+    Sphere,
+    input_error,
+    load_experiment,
+    open_movies,
+    outside_paths,
+)
 from sphereorient.experiment.timeline import NONE, Rows, Timeline, timeline
 from sphereorient.files.picture import OnDemand, claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
@@ -168,7 +175,7 @@ def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
     picture = _picture(path, name, frame_shape, do)
     shown = np.asarray(picture > np.iinfo(picture.dtype).max // 2)
     if not shown.any():
-        raise refused(name, "white where the ball is seen", "black only", do)
+        raise input_error(name, "white where the ball is seen", "black only", do)
     return shown
 
 
@@ -177,12 +184,12 @@ def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> ND
     content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
     claimed, expected = claimed_pixels(content), f"{width} x {height} px as the movie"
     if claimed is not None and claimed > height * width:  # before allocating memory
-        raise refused(name, expected, f"{claimed} px", do)
+        raise input_error(name, expected, f"{claimed} px", do)
     picture = None if claimed is None else decoded_grey(content)
     if picture is None:
-        raise refused(name, "a picture", "a file that cannot be decoded", do)
+        raise input_error(name, "a picture", "a file that cannot be decoded", do)
     if picture.shape != frame_shape:
-        raise refused(name, expected, f"{picture.shape[1]} x {picture.shape[0]} px", do)
+        raise input_error(name, expected, f"{picture.shape[1]} x {picture.shape[0]} px", do)
     return picture
 
 
@@ -300,7 +307,7 @@ def _texture_path(experiment: Experiment, sphere: Sphere) -> Path:
         return sphere.texture_path
     key, name = (f"spheres.{sphere.name}", f", ball {sphere.name}") if sphere.name else ("sphere", "")
     do = f"learn it with `sphereorient map`, then write {key}.texture: the file that this gives"
-    raise refused(f"{experiment.path}{name}", "a texture", "none", do)
+    raise input_error(f"{experiment.path}{name}", "a texture", "none", do)
 
 
 def load_map(path: Path) -> TextureMap:
@@ -314,5 +321,5 @@ def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
     wanted = known if cameras is None else list(cameras)
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
-        raise refused("cameras", " or ".join(known), ", ".join(unknown) or "none", "name cameras of the experiment")
+        raise input_error("cameras", " or ".join(known), ", ".join(unknown) or "none", "name cameras of the experiment")
     return [name for name in known if name in wanted]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.experiment.experiment import MOVIES_OWN, Experiment, refused
+from sphereorient.experiment.experiment import MOVIES_OWN, Experiment, input_error
 from sphereorient.files.whole_file import read_text
 from sphereorient.movies import Movie
 from sphereorient.movies.stamps import UNITS, doubt, other_units, rate_of, unit_in
@@ -53,7 +53,7 @@ class Timeline:
         if (off[steps < LONGEST_PAUSE] > ON_GRID * self.frame_s).any():
             do = "use --method precise, which takes any times"
             got = f"steps from {np.diff(self.time_s).min():.4g} to {np.diff(self.time_s).max():.4g} s"
-            raise refused("times", "frames on an even grid", got, do)
+            raise input_error("times", "frames on an even grid", got, do)
         frames = np.arange(int(place[-1]) + 1)
         rows = {name: np.full(len(frames), NONE) for name in self.rows}
         for name, row in self.rows.items():
@@ -110,7 +110,7 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         time_s = load_times(Path(experiment.times), experiment.time_unit)
         if len(time_s) != count:
             do = "give one time for each frame of the experiment, counted after start:"
-            raise refused(experiment.times, f"{count} times", f"{len(time_s)}", do)
+            raise input_error(experiment.times, f"{count} times", f"{len(time_s)}", do)
     return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
 
 
@@ -137,7 +137,7 @@ def load_times(path: Path, unit: str = "") -> Floats:
             values += [float(text)] if text else []
         except ValueError:
             if number > 1:  # the first line may be a heading
-                raise refused(f"{path}, line {number}", "a number", repr(text[:40]), do) from None
+                raise input_error(f"{path}, line {number}", "a number", repr(text[:40]), do) from None
     times = _increasing(str(path), np.asarray(values, np.float64), do)
     unit = unit_in(lines[0]) or unit  # there is a time, or it was refused
     return _in_s(str(path), times, unit)
@@ -148,7 +148,7 @@ def _in_s(name: str, times: Floats, unit: str) -> Floats:
     rate_hz = rate_of(times)
     if not unit and (others := other_units(rate_hz)):
         do = "write time_unit: ms (or us, ns, s) in experiment.yaml, as they are"
-        raise refused(name, "times in s", f"{doubt(rate_hz)}; by their size they are in {others}", do)
+        raise input_error(name, "times in s", f"{doubt(rate_hz)}; by their size they are in {others}", do)
     return times * UNITS[unit or "s"]
 
 
@@ -156,10 +156,10 @@ def _increasing(name: str, time_s: Floats, do: str) -> Floats:
     wrong = np.flatnonzero(~(np.diff(time_s) > 0))
     if not len(time_s) or not np.isfinite(time_s).all():
         got = "none" if not len(time_s) else f"{time_s[~np.isfinite(time_s)][0]}"
-        raise refused(name, "finite times", got, do)
+        raise input_error(name, "finite times", got, do)
     if len(wrong):
         k = int(wrong[0])
-        raise refused(name, "times that increase", f"{time_s[k + 1]:.9g} after {time_s[k]:.9g}", do)
+        raise input_error(name, "times that increase", f"{time_s[k + 1]:.9g} after {time_s[k]:.9g}", do)
     return time_s
 
 
@@ -188,7 +188,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     chosen = {names[0]: np.arange(len(clocks[names[0]]))}
     taken = clocks[names[0]][None]
     for name in names[1:]:
-        before, own = paired(np.nanmean(taken, axis=0), clocks[name], PAIR_STEPS * usual_s).T
+        before, own = paired_times(np.nanmean(taken, axis=0), clocks[name], PAIR_STEPS * usual_s).T
         chosen = {one: np.where(before >= 0, row[before], NONE) for one, row in chosen.items()} | {name: own}
         taken = np.stack([np.where(row >= 0, clocks[one][row], np.nan) for one, row in chosen.items()])
         order = np.argsort(np.nanmean(taken, axis=0), kind="stable")
@@ -210,7 +210,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     return Timeline(number=number, time_s=np.nanmean(taken, axis=0), rows=rows, remarks=tuple(remarks))
 
 
-def paired(one: Floats, other: Floats, within_s: float) -> Rows:
+def paired_times(one: Floats, other: Floats, within_s: float) -> Rows:
     """Pair increasing times nearer than `within_s`; return (N, 2) indices in order of time, NONE without a partner."""
     high = np.searchsorted(other, one).clip(max=len(other) - 1)
     low = (high - 1).clip(0)

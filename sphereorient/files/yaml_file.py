@@ -109,7 +109,7 @@ def flow(value: Any) -> str:
     return text.strip().removesuffix("...").strip()
 
 
-def assigned(text: str) -> tuple[str, Any]:
+def parse_override(text: str) -> tuple[str, Any]:
     """Return the key and the value, YAML, of `key=value`, the text of an option --set; SettingsError for another."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
@@ -315,7 +315,7 @@ def given(keys: Sequence[DraftKey], changes: Iterable[str]) -> list[DraftKey]:
     """Return keys with values `name=value`, YAML, put in; SettingsError for an unknown name or no YAML."""
     known = {key.name: key for key in keys}
     for text in changes:
-        name, found = assigned(text)
+        name, found = parse_override(text)
         if name not in known:
             raise SettingsError(refuse_unknown(name, known, "--set"))
         key = known[name]

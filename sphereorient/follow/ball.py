@@ -23,7 +23,7 @@ from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import SIZES, Picture, Shown, size_steps
 from sphereorient.pose.fit import HOPELESS
 from sphereorient.pose.fitter import DisksPx, Fitter, Steps
-from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.neighbours import Neighbours, joined_neighbours
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, poses_of, supported
 
 Floats = NDArray[np.float64]
@@ -44,8 +44,8 @@ OWN = ("own_covariance", "own_sigma_mm", "limb_coverage", "excess", "score")
 class _Predicted:
     """B predictions of a ball, and the pictures of C cameras that may show it."""
 
-    shots: Sequence[Sequence[Frame]]  # B of C
-    frames: Sequence[Sequence[Shown]]
+    frames: Sequence[Sequence[Frame]]  # B of C
+    pictures: Sequence[Sequence[Shown]]
     position_lab_mm: Tensor  # (B, 3)
     R_lab_body: Tensor  # (B, 3, 3)
     precision: Tensor  # (B, 3, 3), mm^-2, of the position
@@ -130,13 +130,13 @@ class BallTracker:
         place, spread = self.centre.position_lab_mm.numpy(), self.centre.spread_mm2.numpy()
         return replace(pose, position_lab_mm=place, place_spread=spread)
 
-    def follow(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
+    def follow(self, expected: Sequence[Expected], frames: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
         asked, missing = len(expected), self._lanes(len(expected)) - len(expected)
-        expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
-        there = self._predicted(expected, shots)
+        expected, frames = [*expected, *[expected[-1]] * missing], [*frames, *[frames[-1]] * missing]
+        there = self._predicted(expected, frames)
         first = self._first_fit(there)
         found, alone = self._with_fewer(there, first)
         found, doubtful = self._with_more(there, found)
@@ -151,39 +151,39 @@ class BallTracker:
         reasons = [
             [_reason(*of_camera) for of_camera in zip(*seen, row, one.reason, strict=True)]
             for *seen, row, one in zip(
-                found.use.tolist(), others.tolist(), there.sees.tolist(), shots, expected, strict=True
+                found.use.tolist(), others.tolist(), there.sees.tolist(), frames, expected, strict=True
             )
         ]
         poses = [
             poses_of(fit, slice(n, n + 1), found.use[n], reasons[n]) if found.good[n] else None for n in range(asked)
         ]
         for n in torch.nonzero(there.beyond[:asked])[:, 0].tolist():
-            (poses[n],) = self._wider(float(there.disks_px.largest_px[n])).follow([expected[n]], [shots[n]])
+            (poses[n],) = self._wider(float(there.disks_px.largest_px[n])).follow([expected[n]], [frames[n]])
         return poses
 
-    def followed(self, expected: Expected, shots: Sequence[Frame]) -> Poses | None:
+    def followed(self, expected: Expected, frames: Sequence[Frame]) -> Poses | None:
         """Fit the predicted pose of one frame, as `follow`; at once None where no picture shows anything like it."""
-        frames = [[shot.shown for shot in shots]]
+        pictures = [[shot.shown for shot in frames]]
         contradicted = Reason.CONTRADICTS in expected.reason
-        if not contradicted and bool(expected.use.all()) and all(shot.readable for shot in shots):
+        if not contradicted and bool(expected.use.all()) and all(shot.readable for shot in frames):
             use = expected.use[None]
-            X, R, precision, moved = self._begun([expected], frames, use, None)
+            X, R, precision, moved = self._begun([expected], pictures, use, None)
             disks_px = self._disks_px(X)
             if float(disks_px.largest_px) <= self.fitter.widest_px:
                 start = PoseStart(X, R, use, precision, moved, held=self.centre is not None)
-                fit = self.fitter.settled(frames, start, disks_px)
+                fit = self.fitter.settled(pictures, start, disks_px)
                 if fit.score.numpy().max() < HOPELESS:
                     return None
                 if not bool(self._poor(fit, use)) and bool(self._supported(fit, use)):
-                    return poses_of(fit, slice(1), expected.use, [Reason.OK] * len(shots))
-        (poses,) = self.follow([expected], [shots])
+                    return poses_of(fit, slice(1), expected.use, [Reason.OK] * len(frames))
+        (poses,) = self.follow([expected], [frames])
         return poses
 
-    def spotted(self, shots: Sequence[Frame]) -> Poses:
+    def spotted(self, frames: Sequence[Frame]) -> Poses:
         """Find the pose of a frame without history by the ball's blob, in a quarter of the time of `searched`, which
         finds it also where others are beside the ball or before it.
         """
-        there = self.search.glanced(shots, None if self.centre is None else self.centre.position_lab_mm)
+        there = self.search.glanced(frames, None if self.centre is None else self.centre.position_lab_mm)
         if not bool(there.use.any()) or not len(there):
             return there
         spread = (LOOSE * self.fitter.radius_mm) ** 2 * torch.eye(3).double()
@@ -198,12 +198,12 @@ class BallTracker:
             moved=np.zeros(6),
             open_share=0.0,
         )
-        return self.followed(begin, shots) or no_pose(len(shots), there.reason)
+        return self.followed(begin, frames) or no_pose(len(frames), there.reason)
 
     def _begun(
         self,
         expected: Sequence[Expected],
-        frames: Sequence[Sequence[Shown]],
+        pictures: Sequence[Sequence[Shown]],
         use: Tensor,
         among: Neighbours | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -217,24 +217,24 @@ class BallTracker:
         R, precision = so3.exp(turn) @ R_before, torch.from_numpy(np.linalg.inv(spread.numpy()))
         if any(one.rough for one in expected):
             was, rough = (X, R), torch.tensor([one.rough for one in expected])
-            X, R = self._approached(frames, (X, R), use, precision, rough, among)
+            X, R = self._approached(pictures, (X, R), use, precision, rough, among)
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         return X, R, precision, moved
 
-    def _predicted(self, expected: Sequence[Expected], shots: Sequence[Sequence[Frame]]) -> _Predicted:
+    def _predicted(self, expected: Sequence[Expected], frames: Sequence[Sequence[Frame]]) -> _Predicted:
         """Return where the ball is expected, and the pictures that may show it."""
-        known, among = torch.stack([one.use for one in expected]), joined([one.among for one in expected])
-        frames = [[shot.shown for shot in row] for row in shots]
-        readable = torch.tensor([[shot.readable for shot in row] for row in shots])
-        X, R, precision, moved = self._begun(expected, frames, known & readable, among)
+        known, among = torch.stack([one.use for one in expected]), joined_neighbours([one.among for one in expected])
+        pictures = [[shot.shown for shot in row] for row in frames]
+        readable = torch.tensor([[shot.readable for shot in row] for row in frames])
+        X, R, precision, moved = self._begun(expected, pictures, known & readable, among)
         disks_px = self._disks_px(X)
         if among is not None:
             disks_px = disks_px._replace(spoilt=self.fitter.spoilt(X, disks_px, moved, among))
         visible = None if disks_px.spoilt is None else disks_px.spoilt.left
         return _Predicted(
-            shots=shots,
             frames=frames,
+            pictures=pictures,
             position_lab_mm=X,
             R_lab_body=R,
             precision=precision,
@@ -257,16 +257,16 @@ class BallTracker:
         if visible is None and bool((poor := self._poor(fit, use)).any()):
             # A sharp picture holds the fit where it began: once more, from coarse to fine.
             which = poor.nonzero()[:, 0]
-            some, frames = there.start(X, R, use).of(which), [there.frames[k] for k in which.tolist()]
+            some, pictures = there.start(X, R, use).of(which), [there.pictures[k] for k in which.tolist()]
             at = some.position_lab_mm, some.R_lab_body
-            near, turned = self._approached(frames, at, some.use, there.precision[which], poor[which], None)
-            again = self.fitter.settled(frames, replace(some, position_lab_mm=self._from(near), R_lab_body=turned))
+            near, turned = self._approached(pictures, at, some.use, there.precision[which], poor[which], None)
+            again = self.fitter.settled(pictures, replace(some, position_lab_mm=self._from(near), R_lab_body=turned))
             better = (again.score * some.use).sum(1) > (fit.score * use)[which].sum(1)
             fit = fit.with_rows(which[better].tolist(), again.of(better))
         good = self._supported(fit, use, visible)
         if not bool(good.all()):
             # Whether a picture is dark or white takes all of it: only where it is not as expected.
-            rows = zip(usable, good.tolist(), there.shots, strict=True)
+            rows = zip(usable, good.tolist(), there.frames, strict=True)
             usable = there.sees & torch.stack([all_ if ok else _usable(row) for all_, ok, row in rows])
             changed = (use != (there.known & usable)).any(1)
             if bool(changed.any()):
@@ -340,7 +340,7 @@ class BallTracker:
 
     def _approached(
         self,
-        frames: Sequence[Sequence[Shown]],
+        pictures: Sequence[Sequence[Shown]],
         poses: tuple[Tensor, Tensor],
         use: Tensor,
         precision: Tensor,
@@ -350,7 +350,7 @@ class BallTracker:
         """Bring those poses that are rough, (B,) bool, into the basin of the finest level, through coarser ones."""
         X, R = poses
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
-            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px, neighbours=among)
+            pixels = self.fitter.pixels(pictures, X, level, self.fitter.widest_px, neighbours=among)
             fit = self.fitter.fit(pixels.thinned(every), PoseStart(X, R, use, precision), level, iterations)
             X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
             R = torch.where(rough[:, None, None], fit.R_lab_body, R)
@@ -361,7 +361,7 @@ class BallTracker:
     ) -> FittedPoses:
         """Fit poses that are nearly right."""
         begin = there.start(position_lab_mm=self._from(X), R_lab_body=R, use=use)
-        return self.fitter.settled(there.frames, begin, disks_px)
+        return self.fitter.settled(there.pictures, begin, disks_px)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
@@ -395,49 +395,49 @@ class BallTracker:
         return wrong
 
     def start(
-        self, shots: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
+        self, frames: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
     ) -> dict[str, Poses]:
         """Find a ball that is alone in the scene, as `SceneStart` finds several."""
-        return dict.fromkeys(names, self.searched(shots))
+        return dict.fromkeys(names, self.searched(frames))
 
-    def searched(self, shots: Sequence[Frame]) -> Poses:
+    def searched(self, frames: Sequence[Frame]) -> Poses:
         """Find the poses of a frame without history, with those cameras whose pictures support them."""
-        poses = self.search.poses(shots)
+        poses = self.search.poses(frames)
         if not len(poses):
             return poses
-        frames, usable = [shot.picture for shot in shots], _usable(shots)
+        pictures, usable = [shot.picture for shot in frames], _usable(frames)
         if self.centre is not None:
             optics = self.search.fitter.optics
-            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
+            fit = self._looked_at(pictures, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
             order = explaining_first(fit, poses.use).argsort(stable=True)
             poses = poses_of(fit, order, poses.use, poses.reason)
         if bool((usable & ~poses.use).any()):
-            poses = self._all_seeing(poses, frames, usable)
+            poses = self._all_seeing(poses, pictures, usable)
         seen = poses.use & (poses.score[0] >= self.score_min)
         reason = [
             Reason.LOW_SCORE if was and not now else why
             for was, now, why in zip(poses.use.tolist(), seen.tolist(), poses.reason, strict=True)
         ]
         if not bool(seen.any()):
-            return no_pose(len(shots), reason)
+            return no_pose(len(frames), reason)
         if bool(self.contradictory(poses, seen.expand(len(poses), -1))[0]):
-            return self._by_each(poses, frames, seen)
+            return self._by_each(poses, pictures, seen)
         if bool((seen == poses.use).all()):
             return poses
-        fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
+        fit = self._looked_at(pictures, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
-    def looked_past(self, poses: Poses, shots: Sequence[Frame], among: Neighbours) -> Poses:
+    def looked_past(self, poses: Poses, frames: Sequence[Frame], among: Neighbours) -> Poses:
         """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
         those whose pictures support none are left out.
         """
         fitter, count = self.search.fitter, len(poses)
-        frames, X = [shot.picture for shot in shots], poses.position_lab_mm[:1]
+        pictures, X = [shot.picture for shot in frames], poses.position_lab_mm[:1]
         visible = self.fitter.spoilt(X, fitter.disks_px(X), None, among).left[0]
         use, every = poses.use & (visible > LEAST_VISIBLE), among.of([0] * count)
         if not bool(use.any()):
             return replace(poses, use=use)
-        fit = self._looked_at(frames, poses, use, ((fitter.optics.fine, 1, 4),), every)
+        fit = self._looked_at(pictures, poses, use, ((fitter.optics.fine, 1, 4),), every)
         order = explaining_first(fit, use).argsort(stable=True)
         best = fit.of(order[:1])
         seen = use & (best.score[0] > 0) & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
@@ -447,26 +447,26 @@ class BallTracker:
             for now, why in zip(seen.tolist(), poses.reason, strict=True)
         ]
         if bool(seen.any()) and not bool((seen == use).all()):
-            fit = self._looked_at(frames, poses, seen, ((fitter.optics.fine, 1, 4),), every)
+            fit = self._looked_at(pictures, poses, seen, ((fitter.optics.fine, 1, 4),), every)
             order = explaining_first(fit, seen).argsort(stable=True)
         return poses_of(fit, order, seen, reason)
 
     def _looked_at(
-        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps, among: Neighbours | None = None
+        self, pictures: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps, among: Neighbours | None = None
     ) -> FittedPoses:
         """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
         X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
         begin = PoseStart(X, R, use.expand(count, -1), known, held=self.centre is not None, among=among)
-        return self.search.fitter.fit_through(steps, [frames] * count, begin)
+        return self.search.fitter.fit_through(steps, [pictures] * count, begin)
 
-    def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
+    def _by_each(self, poses: Poses, pictures: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
         each = seen.expand(len(poses), -1)
         steps = ((self.search.fitter.optics.fine, 1, 4),)
 
         def supporting(some: Sequence[Sequence[int]]) -> dict[tuple[int, ...], FittedPoses]:
-            fits = {tuple(one): self._looked_at(frames, poses, _only(each, one), steps) for one in some}
+            fits = {tuple(one): self._looked_at(pictures, poses, _only(each, one), steps) for one in some}
             return {one: fit for one, fit in fits.items() if bool(self._supported(fit, _only(each, one))[0])}
 
         seeing = torch.nonzero(seen)[:, 0].tolist()
@@ -483,9 +483,9 @@ class BallTracker:
         ]
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
-    def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
+    def _all_seeing(self, poses: Poses, pictures: Sequence[Picture], usable: Tensor) -> Poses:
         """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
-        fit = self._looked_at(frames, poses, usable, self.search.fitter.optics.steps)
+        fit = self._looked_at(pictures, poses, usable, self.search.fitter.optics.steps)
         order = fit.nll.argsort(stable=True)
         if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
             return poses
@@ -493,8 +493,8 @@ class BallTracker:
         return poses_of(fit, order, usable, reason)
 
 
-def _usable(shots: Sequence[Frame]) -> Tensor:
-    return torch.tensor([shot.usable for shot in shots])
+def _usable(frames: Sequence[Frame]) -> Tensor:
+    return torch.tensor([shot.usable for shot in frames])
 
 
 def _only(usable: Tensor, cameras: Sequence[int]) -> Tensor:
@@ -512,10 +512,10 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
         "own_move": other.position_lab_mm - fit.position_lab_mm,
         **{name: getattr(other, name)[:, camera] for name in OWN},
     }
-    told = {name: getattr(fit, name).clone() for name in own}
+    parts = {name: getattr(fit, name).clone() for name in own}
     for name, value in own.items():
-        told[name][rows, camera] = value[rows]
-    return replace(fit, **told)
+        parts[name][rows, camera] = value[rows]
+    return replace(fit, **parts)
 
 
 def _reason(used: bool, contradicts: bool, sees: bool, shot: Frame, before: Reason) -> Reason:

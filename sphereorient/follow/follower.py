@@ -46,11 +46,11 @@ class PerCameraTracker:
         return self.trackers[0].batches(frames)
 
     def track(
-        self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
+        self, frames: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
     ) -> Iterator[dict[str, Poses]]:
         """Track the chunks of one batch; see `Tracker`."""
         each = [
-            tracker.track([shots[k] for k in part], batch, time_s)
+            tracker.track([frames[k] for k in part], batch, time_s)
             for tracker, part in zip(self.trackers, self.parts, strict=True)
         ]
         for apart in zip(*each, strict=True):
@@ -65,22 +65,22 @@ def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> 
     if not seeing:
         return no_pose(len(reason), reason)
     main, own = apart[seeing[0]], parts[seeing[0]]
-    told, use = main.parts(), torch.zeros(len(reason), dtype=torch.bool)
+    arrays, use = main.parts(), torch.zeros(len(reason), dtype=torch.bool)
     use[list(own)] = main.use
     for name in ("own_turn", "own_move", *OWN):
-        whole = told[name].new_zeros(len(main), len(reason), *told[name].shape[2:])
-        whole[:, list(own)] = told[name]
-        told[name] = whole
+        whole = arrays[name].new_zeros(len(main), len(reason), *arrays[name].shape[2:])
+        whole[:, list(own)] = arrays[name]
+        arrays[name] = whole
     for other, (k, *several) in ((apart[part], parts[part]) for part in seeing):
         if several:
             continue  # only the first part, those that agree, has more than one
-        told["own_turn"][:, k] = so3.log(other.R_lab_body[:1] @ main.R_lab_body.mT)
-        told["own_move"][:, k] = other.position_lab_mm[:1] - main.position_lab_mm
+        arrays["own_turn"][:, k] = so3.log(other.R_lab_body[:1] @ main.R_lab_body.mT)
+        arrays["own_move"][:, k] = other.position_lab_mm[:1] - main.position_lab_mm
         if other is not main:
             reason[k] = Reason.CONTRADICTS
             for name in OWN:
-                told[name][:, k] = getattr(other, name)[:1, 0]
-    return Poses(**told, use=use, reason=tuple(reason))
+                arrays[name][:, k] = getattr(other, name)[:1, 0]
+    return Poses(**arrays, use=use, reason=tuple(reason))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,16 +171,16 @@ def sample_frames(
         ]
         best: tuple[Frame, ...] = ()
         place = first
-        for k, shots in enumerate(zip(*movies, strict=True), first):
-            if not best or sum(shot.usable for shot in shots) > sum(shot.usable for shot in best):
-                best, place = shots, k
+        for k, frames in enumerate(zip(*movies, strict=True), first):
+            if not best or sum(shot.usable for shot in frames) > sum(shot.usable for shot in best):
+                best, place = frames, k
             if all(shot.usable for shot in best):
                 break
         return best, place
 
     with ThreadPoolExecutor(DECODING) as parts:  # `usable` decodes all of a picture
         found = list(side_by_side(of_stretch, zip(spread, [*spread[1:], total], strict=True)))
-    return [shots for shots, _ in found], [place for _, place in found]
+    return [frames for frames, _ in found], [place for _, place in found]
 
 
 def frames_showing(
@@ -207,7 +207,7 @@ def frames_showing(
         more = sorted(set(spread_frames(range(total), times * count)) - set(looked))
         looked += more
         new = frames_at(recording, views, more)
-        seen |= {k: (shots, by) for k, shots, by in zip(more, new, shown(new), strict=True) if by.any()}
+        seen |= {k: (frame, by) for k, frame, by in zip(more, new, shown(new), strict=True) if by.any()}
     kept, room = [], KEPT * count * len(views)
     for cameras in range(len(views), 0, -1):
         alike = sorted(k for k, (_, by) in seen.items() if by.sum() == cameras)
@@ -223,9 +223,9 @@ def frames_at(recording: Recording, views: Sequence[CameraView], places: Sequenc
 
     def at(k: int) -> tuple[Frame, ...]:
         pairs = zip(recording.streams, views, strict=True)
-        shots = tuple(next(screened_frames(stream, view.background, k, k + 1, parts)) for stream, view in pairs)
-        _ = [shot.reason for shot in shots]  # decodes all of a picture
-        return shots
+        frames = tuple(next(screened_frames(stream, view.background, k, k + 1, parts)) for stream, view in pairs)
+        _ = [shot.reason for shot in frames]  # decodes all of a picture
+        return frames
 
     with ThreadPoolExecutor(DECODING) as parts:
         return list(side_by_side(at, places))

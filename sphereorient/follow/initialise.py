@@ -58,30 +58,30 @@ class Initialiser:
         with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
             return list(pool.map(self.poses, frames))
 
-    def poses(self, shots: Sequence[Frame]) -> Poses:
+    def poses(self, frames: Sequence[Frame]) -> Poses:
         """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
         explained well, outlines nearer to the usual size are tried, and the texture locates the disk. Where neither an
         outline nor the texture is found, there is no ball.
         """
         if self.known is None:
-            return replace(self, known={}).poses(shots)
-        shots = [self._looked_at(shot, view) for shot, view in zip(shots, self.fitter.views, strict=True)]
-        if not any(shot.usable for shot in shots):
-            return no_pose(len(shots), [shot.reason for shot in shots])
-        poses = self._with_outlines(shots, self.locating)
+            return replace(self, known={}).poses(frames)
+        frames = [self._looked_at(shot, view) for shot, view in zip(frames, self.fitter.views, strict=True)]
+        if not any(shot.usable for shot in frames):
+            return no_pose(len(frames), [shot.reason for shot in frames])
+        poses = self._with_outlines(frames, self.locating)
         if _best_score(poses) >= self.score_min:
             return poses
-        textured = self._found(shots, self.relocalise)
-        if not any(outline for outline, _ in [*textured, *self._found(shots, self.outline)]):
+        textured = self._found(frames, self.relocalise)
+        if not any(outline for outline, _ in [*textured, *self._found(frames, self.outline)]):
             return poses
         for tolerance in NARROWER:
             tolerance = min(tolerance, self.locating.diameter_tolerance)
             narrower = self.locating.model_copy(update={"diameter_tolerance": tolerance})
-            poses = max(poses, self._with_outlines(shots, narrower), key=_best_score)
+            poses = max(poses, self._with_outlines(frames, narrower), key=_best_score)
             if _best_score(poses) >= self.score_min:
                 return poses
-        return max(poses, self._search(shots, textured), key=_best_score)
+        return max(poses, self._search(frames, textured), key=_best_score)
 
     def _looked_at(self, shot: Frame, view: CameraView) -> Frame:
         """Return a frame that is not used further where it shows no blob like the sphere's."""
@@ -103,35 +103,35 @@ class Initialiser:
         blobs: list[Blob] = self._once(picture, ("blobs", view.name, size), find)
         return [blob for blob in blobs if blob.merit >= view.merit_min]
 
-    def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
-        found = self._found(shots, replace(self, locating=locating).outline)
+    def _with_outlines(self, frames: Sequence[Frame], locating: LocateSettings) -> Poses:
+        found = self._found(frames, replace(self, locating=locating).outline)
         seeing = [k for k, (outline, _) in enumerate(found) if outline is not None]
         if len(seeing) < 2 or self._meet(found):
-            return self._search(shots, found)
+            return self._search(frames, found)
         # The cameras see different things: take those whose lines of sight meet and whose pictures are explained best.
         for some in by_decreasing_size(seeing):
             each = [[one if k in kept else (None, Reason.OUTLINE) for k, one in enumerate(found)] for kept in some]
             if meeting := [one for one in each if self._meet(one)]:
                 break
-        return max((self._search(shots, one) for one in meeting), key=_best_score)
+        return max((self._search(frames, one) for one in meeting), key=_best_score)
 
     def _meet(self, found: Sequence[Found]) -> bool:
         """Return whether the lines of sight meet; that of one camera does."""
         return not float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm
 
-    def glanced(self, shots: Sequence[Frame], place: Tensor | None = None) -> Poses:
+    def glanced(self, frames: Sequence[Frame], place: Tensor | None = None) -> Poses:
         """Return the likeliest pose by blobs of the usual size alone, or with the ball at a `place` (3,), lab, mm; or
         that there is none. It is right to some degrees and pixels, in a quarter of the time of `poses`.
         """
         fitter, views = self.fitter, self.fitter.views
         if place is None:
-            found = self._found(shots, self._glimpse)
+            found = self._found(frames, self._glimpse)
         else:
             found = [
                 (_usual_disk(view.camera.project(place).tolist(), float(view.radius_px(place, fitter.radius_mm))), why)
                 if (why := shot.reason) is Reason.OK
                 else (None, why)
-                for view, shot in zip(views, shots, strict=True)
+                for view, shot in zip(views, frames, strict=True)
             ]
         reason = [why for _, why in found]
         use = torch.tensor([disk is not None for disk, _ in found])
@@ -139,14 +139,14 @@ class Initialiser:
             return no_pose(len(views), reason)
         glimpses = [
             self._glimpsed(view, shot.picture, disk)
-            for view, shot, (disk, _) in zip(views, shots, found, strict=True)
+            for view, shot, (disk, _) in zip(views, frames, found, strict=True)
             if disk is not None
         ]
         R, X_k, precisions = (torch.cat(parts) for parts in zip(*glimpses, strict=True))
         precision = precisions.sum(0)
         X = torch.linalg.solve(precision, (precisions @ X_k[..., None]).sum(0)).mT if place is None else place[None]
         level, count = fitter.optics.coarse, len(R)
-        pixels = fitter.pixels([[shot.picture for shot in shots]], X, level).thinned(4)
+        pixels = fitter.pixels([[shot.picture for shot in frames]], X, level).thinned(4)
         begin = PoseStart(X.expand(count, 3), R, use.expand(count, -1), precision.expand(count, 3, 3))
         fit = fitter.fit(pixels.where(torch.arange(len(pixels)).repeat(count)), begin, level, 4)
         chosen = distinct_indices(fit.R_lab_body, explaining_first(fit, use), 1)
@@ -184,9 +184,9 @@ class Initialiser:
         found: Found = self._once(picture, key, find)
         return found
 
-    def disks(self, shots: Sequence[Frame]) -> list[Outline | None]:
+    def disks(self, frames: Sequence[Frame]) -> list[Outline | None]:
         """Return the outline of a painted sphere in each of C pictures; None without one."""
-        return [one if one is not None and one.painted else None for one, _ in self._found(shots, self.outline)]
+        return [one if one is not None and one.painted else None for one, _ in self._found(frames, self.outline)]
 
     def relocalise(self, picture: Picture, view: CameraView) -> Found:
         """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
@@ -217,9 +217,9 @@ class Initialiser:
         R, _ = self._proposed(self.fitter.views.index(view), picture, disk)
         return (disk, Reason.OK) if len(R) else (None, Reason.LOW_SCORE)
 
-    def claimants(self, shots: Sequence[Frame]) -> int:
+    def claimants(self, frames: Sequence[Frame]) -> int:
         """Return how many disks wear the texture map about equally well, in the camera that shows most of them."""
-        pairs = zip(self.fitter.views, shots, strict=True)
+        pairs = zip(self.fitter.views, frames, strict=True)
         return max((self._claimants(shot.picture, view) for view, shot in pairs if shot.usable), default=0)
 
     def _claimants(self, picture: Picture, view: CameraView) -> int:
@@ -252,10 +252,10 @@ class Initialiser:
             self.known[place] = picture, find()  # the picture is kept: its identity is that of no other
         return self.known[place][1]
 
-    def _found(self, shots: Sequence[Frame], find: Callable[[Picture, CameraView], Found]) -> list[Found]:
+    def _found(self, frames: Sequence[Frame], find: Callable[[Picture, CameraView], Found]) -> list[Found]:
         return [
             find(shot.picture, view) if shot.usable else (None, shot.reason)
-            for view, shot in zip(self.fitter.views, shots, strict=True)
+            for view, shot in zip(self.fitter.views, frames, strict=True)
         ]
 
     def _placed(self, found: Sequence[Found]) -> Positions:
@@ -285,10 +285,10 @@ class Initialiser:
             rows.append((R_lab_view @ own.R_view_body[: self.candidates], own.score[: self.candidates]))
         return rows
 
-    def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
-        seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(shots, found, strict=True)) if one]
+    def _search(self, frames: Sequence[Frame], found: Sequence[Found]) -> Poses:
+        seen = [(k, shot.picture, one) for k, (shot, (one, _)) in enumerate(zip(frames, found, strict=True)) if one]
         none = torch.zeros(0, 3, 3, dtype=torch.float64)
-        return self.fitted(shots, found, torch.cat([none, *(self._proposed(*one)[0] for one in seen)]))
+        return self.fitted(frames, found, torch.cat([none, *(self._proposed(*one)[0] for one in seen)]))
 
     def _proposed(self, k: int, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor]:
         """Return the proposals of one disk of camera `k`, alone: sums depend on how many are added."""
@@ -296,7 +296,7 @@ class Initialiser:
         ((R, score),) = self._once(picture, key, look)
         return R, score
 
-    def fitted(self, shots: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
+    def fitted(self, frames: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
         """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
@@ -311,7 +311,7 @@ class Initialiser:
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
             slack = slack + DEPTH_SHARE**2 * along[:, None] * along
-        place, precision, pictures = placed.position_lab_mm, torch.linalg.inv(slack), [shot.picture for shot in shots]
+        place, precision, pictures = placed.position_lab_mm, torch.linalg.inv(slack), [shot.picture for shot in frames]
         optics, X = fitter.optics, place.expand(len(R), 3)
         # (level, every n-th pixel, iterations, poses kept): coarse levels need few pixels, the last fit all.
         steps = (

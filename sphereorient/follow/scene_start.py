@@ -59,19 +59,19 @@ class SceneStart:
 
     def __call__(
         self,
-        shots: Sequence[Frame],
+        frames: Sequence[Frame],
         names: Sequence[str],
         known: Mapping[str, Tensor],
         past: Mapping[str, Ahead] | None = None,
     ) -> dict[str, Poses]:
-        """Find the named balls in the pictures of one instant, `shots` of C views. `known`: positions (3,), lab, mm, of
+        """Find the named balls in the pictures of one instant, frames of C views. `known`: positions (3,), lab, mm, of
         other balls in this frame; `past`: what is expected of those looked for. Without it balls that are alike come in
         any order. A ball that is not found has no pose, but each camera's reason.
         """
-        disks = self._unexplained(shots, known)
+        disks = self._unexplained(frames, known)
         matches = match_disks(disks, list(self.cameras.values()))
-        looks = {self._kind[name]: self._looks(name, shots, disks, matches) for name in names}
-        cost = np.stack([self._costs(name, shots, matches, looks, (past or {}).get(name)) for name in names])
+        looks = {self._kind[name]: self._looks(name, frames, disks, matches) for name in names}
+        cost = np.stack([self._costs(name, frames, matches, looks, (past or {}).get(name)) for name in names])
         fits: dict[tuple[Kind, int], Poses] = {}
         while True:
             pairs = [(self._kind[names[row]], n, names[row]) for row, n in assigned(cost, matches)]
@@ -79,9 +79,9 @@ class SceneStart:
                 if (kind, n) not in fits:
                     found = [
                         (disk, Reason.OK if disk else Reason.NOT_FOUND if shot.usable else shot.reason)
-                        for disk, shot in zip(matches[n].disks, shots, strict=True)
+                        for disk, shot in zip(matches[n].disks, frames, strict=True)
                     ]
-                    fits[kind, n] = self.balls[name].fitted(shots, found, looks[kind][n].R_lab_body)
+                    fits[kind, n] = self.balls[name].fitted(frames, found, looks[kind][n].R_lab_body)
             # A paint is wrong that explains the pictures in use no better than an unknown one.
             gains = {(kind, n): _gain(fits[kind, n].score[:1, fits[kind, n].use]).sum() for kind, n, _ in pairs}
             wrong = {each for each, gain in gains.items() if not float(gain) > 0}
@@ -90,14 +90,14 @@ class SceneStart:
             for row, name in enumerate(names):
                 cost[row, [n for kind, n in wrong if kind == self._kind[name]]] = np.inf
         found_ = {name: fits[kind, n] for kind, n, name in pairs}
-        reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
-        return {name: found_[name] if name in found_ else no_pose(len(shots), reason) for name in names}
+        reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in frames]
+        return {name: found_[name] if name in found_ else no_pose(len(frames), reason) for name in names}
 
-    def _unexplained(self, shots: Sequence[Frame], known: Mapping[str, Tensor]) -> list[list[Outline]]:
+    def _unexplained(self, frames: Sequence[Frame], known: Mapping[str, Tensor]) -> list[list[Outline]]:
         """Return the disks of each picture without those of balls at known positions."""
         of_balls = [one.fitter.views for one in self.balls.values()]
         disks = []
-        for k, shot in enumerate(shots):
+        for k, shot in enumerate(frames):
             views = [views[k] for views in of_balls]
             first = next(iter(self.balls.values()))
             sizes = [view.diameter_px for view in views]
@@ -110,19 +110,19 @@ class SceneStart:
         return disks
 
     def _looks(
-        self, name: str, shots: Sequence[Frame], disks: Sequence[Sequence[Outline]], matches: Sequence[Match]
+        self, name: str, frames: Sequence[Frame], disks: Sequence[Sequence[Outline]], matches: Sequence[Match]
     ) -> list[_Look]:
         """Return how the paint of a ball looks at each match."""
         ball = self.balls[name]
         where = [(k, n) for k, seen in enumerate(disks) for n in range(len(seen))]
-        proposed = ball.proposals([(k, shots[k].picture, disks[k][n]) for k, n in where])
+        proposed = ball.proposals([(k, frames[k].picture, disks[k][n]) for k, n in where])
         each = dict(zip(where, proposed, strict=True))
         return [look_of([each[k, n] for k, n in enumerate(match.chosen) if n >= 0]) for match in matches]
 
     def _costs(
         self,
         name: str,
-        shots: Sequence[Frame],
+        frames: Sequence[Frame],
         matches: Sequence[Match],
         looks: Mapping[Kind, Sequence[_Look]],
         ahead: Ahead | None,
@@ -134,7 +134,7 @@ class SceneStart:
         places = places_of(matches, self.cameras, 2 * ball.fitter.radius_mm)
         X = places.position_lab_mm
         cost = np.array([0.5 * match.chi2 - one.gain for match, one in zip(matches, look, strict=True)]) - NOT_SEEN
-        for k, (view, shot) in enumerate(zip(ball.fitter.views, shots, strict=True)):
+        for k, (view, shot) in enumerate(zip(ball.fitter.views, frames, strict=True)):
             if shot.usable:
                 place = view.camera.project(X)
                 inside = ((place >= 0) & (place <= place.new_tensor(view.camera.image_size) - 1)).all(-1)

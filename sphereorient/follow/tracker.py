@@ -15,7 +15,7 @@ from sphereorient.follow.chunk import MOVE_SHARE, Ahead, Chunk, Expected, mirror
 from sphereorient.follow.initialise import DISTINCT_RAD, Initialiser
 from sphereorient.follow.scene_start import SceneStart
 from sphereorient.locate import Frame
-from sphereorient.pose.neighbours import Neighbours, joined
+from sphereorient.pose.neighbours import Neighbours, joined_neighbours
 from sphereorient.pose.poses import Poses, supported
 
 Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[str, Ahead]], dict[str, Poses]]
@@ -46,17 +46,15 @@ class Tracker:
         return [lengths[k : k + settings.chunks] for k in range(0, len(lengths), settings.chunks)]
 
     def track(
-        self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
+        self, movies: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
     ) -> Iterator[dict[str, Poses]]:
-        """Yield the poses of each ball in a batch's frames: shots of each view, lengths of the chunks, times of all
-        frames.
-        """
+        """Yield the poses of each ball in a batch's frames: movies of each view, lengths of the chunks, all times."""
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = {name: [Chunk(first, time_s) for first in firsts] for name in self.balls}
         found: dict[int, dict[str, Poses]] = {}
         for k in range(max(batch)):
             now = [n for n, length in enumerate(batch) if k < length]
-            frames = [[movie[firsts[n] + k] for movie in shots] for n in now]
+            frames = [[movie[firsts[n] + k] for movie in movies] for n in now]
             here = self.step({name: [of_ball[n] for n in now] for name, of_ball in chunks.items()}, k, frames)
             for name, tracker in self.balls.items():
                 own = [chunks[name][n] for n in now]
@@ -64,12 +62,14 @@ class Tracker:
                 for chunk, one, turn in zip(own, poses, tracker.turns(own, poses), strict=True):
                     chunk.saw(chunk.first + k, one, turn)
             found |= {firsts[n] + k: row for n, row in zip(now, here, strict=True)}
-        self._follow_back(shots, [range(k, k + length) for k, length in zip(firsts, batch, strict=True)], time_s, found)
+        self._follow_back(
+            movies, [range(k, k + length) for k, length in zip(firsts, batch, strict=True)], time_s, found
+        )
         yield from (found[k] for k in range(sum(batch)))
 
     def _follow_back(
         self,
-        shots: Sequence[Sequence[Frame]],
+        movies: Sequence[Sequence[Frame]],
         spans: Sequence[range],
         time_s: Sequence[float],
         found: dict[int, dict[str, Poses]],
@@ -102,7 +102,7 @@ class Tracker:
                 ]
                 for name, of_ball in ahead.items()
             }
-            frames = [[movie[number] for movie in shots] for number in numbers]
+            frames = [[movie[number] for movie in movies] for number in numbers]
             followed = self._followed(wanted, places, frames)
             for name, tracker in self.balls.items():
                 for n, number, row in zip(now, numbers, followed, strict=True):
@@ -178,16 +178,16 @@ class Tracker:
         frame: tuple[dict[str, Poses], Mapping[str, Tensor], Sequence[Frame], Mapping[str, Ahead]],
     ) -> dict[str, Poses]:
         """Return the poses of all balls of a frame: those followed, and those that a search finds."""
-        done, known, shots, past = frame
+        done, known, frames, past = frame
         lost = [name for name in self.balls if name not in done]
         if not lost:
             return done
         places = {name: _found_place(poses, known.get(name)) for name, poses in done.items()}
-        there = self.start(shots, lost, {name: place[0] for name, place in places.items()}, past)
+        there = self.start(frames, lost, {name: place[0] for name, place in places.items()}, past)
         places |= {name: _found_place(poses, None) for name, poses in there.items() if len(poses)}
         for name in lost:
             among = self._among(name, places) if len(there[name]) else None
-            done[name] = there[name] if among is None else self.balls[name].looked_past(there[name], shots, among)
+            done[name] = there[name] if among is None else self.balls[name].looked_past(there[name], frames, among)
         return {name: done[name] for name in self.balls}
 
     def _among(self, name: str, places: Mapping[str, Tensor]) -> Neighbours | None:
@@ -203,7 +203,7 @@ def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[
         places = {other: _found_place(poses, None) for other, poses in there.items() if len(poses)}
         radii = {other: one.fitter.radius_mm for other, one in balls.items() if other != name}
         each.append(_neighbours(radii, places))
-    found = joined(each)
+    found = joined_neighbours(each)
     assert found is not None
     return found
 

@@ -123,7 +123,7 @@ def predict(network: Correlator, batch: TrainingBatch) -> Predictions:
     return Predictions(logits=logits, R_view_body=batch.R_view_body.flatten(0, 1))
 
 
-def joined(parts: Sequence[Predictions]) -> Predictions:
+def joined_predictions(parts: Sequence[Predictions]) -> Predictions:
     """Join several predictions."""
     return Predictions(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
@@ -244,7 +244,7 @@ def benchmark_checkpoint(
             find_modes(part, network.grid, CANDIDATES)
         taken_s += time.perf_counter() - began
         mixed.append(Predictions(logits=torch.cat(parts), R_view_body=R))
-    predictions = joined(mixed)
+    predictions = joined_predictions(mixed)
     spread_rad = math.radians(checkpoint.settings.training.spread_deg)
     return ProposerBenchmark(
         families=tuple(

@@ -38,7 +38,7 @@ TRAINING, VALIDATION = 0, 1  # random streams: no picture occurs in both
 VALIDATION_SHAPE = 1, 2, 8  # of a validation batch: maps, groups of each, pictures of a group
 WARM_UP_STEPS = 100  # of the learning rate; at most a tenth of all steps
 RECALL_EVERY = 10  # steps between measurements of the recall on training pictures
-Row = dict[str, float]
+_Row = dict[str, float]
 
 
 class TrainingData(LightningDataModule):
@@ -120,11 +120,12 @@ class ProposerModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Compute the metrics."""
-        self.metrics = metrics.metrics_of(metrics.joined(self._predictions), self.network.grid, self.spread_rad)
+        predictions = metrics.joined_predictions(self._predictions)
+        self.metrics = metrics.metrics_of(predictions, self.network.grid, self.spread_rad)
         self._predictions = []
         self.log("validation_nll", self.metrics.nll, logger=False)
 
-    def training_metrics(self) -> Row:
+    def training_metrics(self) -> _Row:
         """Return loss and recall on training pictures since the last call."""
         if not self._losses:
             return {}
@@ -143,7 +144,7 @@ class CheckpointCallback(Callback):
 
     def __init__(self, out: Path, progress: Progress, timer: Timer) -> None:
         self.out, self._progress, self._timer = out, progress, timer
-        self.rows: list[Row] = []
+        self.rows: list[_Row] = []
         self.best: dict[str, Tensor] = {}
         self.best_nll = math.inf
         self.best_step = 0
@@ -195,7 +196,7 @@ class Trained:
 
     checkpoint: Checkpoint
     metrics: Metrics  # on the validation pictures, with the temperature
-    rows: tuple[Row, ...]  # metrics of each epoch, as in metrics.csv; the first is the untrained network
+    rows: tuple[_Row, ...]  # metrics of each epoch, as in metrics.csv; the first is the untrained network
 
 
 def train_proposer(
@@ -220,7 +221,7 @@ def train_proposer(
     network.load_state_dict(kept.best)
     network.cpu().eval()
     with torch.no_grad():
-        predictions = metrics.joined([metrics.predict(network, batch) for batch in data.validation])
+        predictions = metrics.joined_predictions([metrics.predict(network, batch) for batch in data.validation])
     temperature = metrics.fitted_temperature(predictions, network.grid)
     measured = metrics.metrics_of(predictions, network.grid, math.radians(settings.training.spread_deg), temperature)
     own = settings.pictures.texture

@@ -18,8 +18,8 @@ from sphereorient.experiment.experiment import DeviceKeys
 from sphereorient.experiment.recording import CameraStream
 from sphereorient.files.picture import luma
 from sphereorient.files.provenance import package
-from sphereorient.live.feed import Arrival, Tell
-from sphereorient.live.instants import Instants, Shot
+from sphereorient.live.feed import Arrival, Log
+from sphereorient.live.instants import Instants, RawPicture
 from sphereorient.movies import flipped_picture, flipped_shape
 
 AGAIN_S = 1.0  # between attempts to open a camera
@@ -42,12 +42,12 @@ class Device:
 
     get: Callable[[str], Any]  # the value of a feature
     set: Callable[[str, Any], object]
-    shot: Callable[[], Shot | None]  # the next one; None: none within WAIT_S; EOFError: none comes any more
+    shot: Callable[[], RawPicture | None]  # the next one; None: none within WAIT_S; EOFError: none comes any more
     start: Callable[[], object] = lambda: None
 
 
 Open = Callable[[str], AbstractContextManager[Device]]  # by serial number
-Came = tuple[int, Shot | None] | None  # number of a camera, and what `Camera.shots` yields
+Came = tuple[int, RawPicture | None] | None  # number of a camera, and what `LiveCamera.pictures` yields
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def _genicam(producer: str) -> Iterator[Open]:
                 camera.num_buffers = max(BUFFERS, camera.min_num_buffers)
                 nodes = camera.remote_device.node_map
 
-                def shot() -> Shot | None:
+                def shot() -> RawPicture | None:
                     try:
                         buffer = camera.fetch(timeout=WAIT_S)
                     except driver.TimeoutException:
@@ -80,7 +80,7 @@ def _genicam(producer: str) -> Iterator[Open]:
                         picture = np.array(shown.data.reshape(shown.height, -1)[:, : shown.width])  # padding behind
                         stamp_s = _known(lambda: buffer.timestamp / buffer.timestamp_frequency)
                         counter = _known(lambda: buffer.frame_id)
-                    return Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
+                    return RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
 
                 opened.append(serial)
                 try:
@@ -109,7 +109,7 @@ def _pylon(serial: str) -> Iterator[Device]:
         tick_s = _tick_s(lambda name: getattr(camera, name).Value)
         camera.MaxNumBuffer.Value = BUFFERS
 
-        def shot() -> Shot | None:
+        def shot() -> RawPicture | None:
             with camera.RetrieveResult(int(1e3 * WAIT_S), driver.TimeoutHandling_Return) as result:
                 arrived_s = time.perf_counter()
                 if not result.IsValid():
@@ -118,7 +118,7 @@ def _pylon(serial: str) -> Iterator[Device]:
                     return None
                 picture = result.Array if result.GrabSucceeded() else None  # a copy
                 stamp_s, counter = result.TimeStamp * tick_s or None, result.BlockID
-            return Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
+            return RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
 
         yield Device(
             get=lambda name: getattr(camera, name).Value,
@@ -138,16 +138,16 @@ def _vimba(serial: str) -> Iterator[Device]:
         _check_seen(serial, [one.get_id() for one in system.get_all_cameras()])
         camera = opened.enter_context(system.get_camera_by_id(serial))
         tick_s = _tick_s(lambda name: camera.get_feature_by_name(name).get())
-        waiting: SimpleQueue[Shot] = SimpleQueue()
+        waiting: SimpleQueue[RawPicture] = SimpleQueue()
 
         def came(_camera: Any, _stream: Any, frame: Any) -> None:
             arrived_s, whole = time.perf_counter(), frame.get_status() == driver.FrameStatus.Complete
             picture = frame.as_numpy_ndarray()[..., 0].copy() if whole else None
             stamp_s, counter = (frame.get_timestamp() or 0) * tick_s or None, frame.get_id()
-            waiting.put(Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter))
+            waiting.put(RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter))
             camera.queue_frame(frame)
 
-        def shot() -> Shot | None:
+        def shot() -> RawPicture | None:
             with suppress(Empty):
                 return waiting.get(timeout=WAIT_S)
             if serial not in [one.get_id() for one in system.get_all_cameras()]:
@@ -185,12 +185,12 @@ def _opencv(where: str) -> Iterator[Device]:
             if not capture.set(known(name), float(value)):
                 raise OSError("not by this camera")
 
-        def shot() -> Shot:
+        def shot() -> RawPicture:
             there, picture = capture.read()
             if not there:
                 raise EOFError
             grey = picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
-            return Shot(picture=grey, arrived_s=time.perf_counter())
+            return RawPicture(picture=grey, arrived_s=time.perf_counter())
 
         yield Device(
             get=lambda name: "Mono8" if name == "PixelFormat" else capture.get(known(name)), set=put, shot=shot
@@ -263,7 +263,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Camera:
+class LiveCamera:
     """A camera of an experiment, and how its device is opened."""
 
     name: str  # in messages
@@ -271,9 +271,9 @@ class Camera:
     stream: CameraStream
     keys: DeviceKeys | None  # None: the device is as it is
     flip: str  # of `movies.flipped`
-    tell: Tell | None  # gets what is wrong, in one line; None: a movie, which ends
+    log: Log | None  # gets what is wrong, in one line; None: a movie, which ends
 
-    def shots(self, stopped: Event) -> Iterator[Shot | None]:
+    def pictures(self, stopped: Event) -> Iterator[RawPicture | None]:
         """Yield pictures until `stopped`; None whenever the device is opened: its clock starts again. After the first
         picture, a device that ends or fails is opened again each second. Raise MovieError: no camera, one that refuses
         its settings, or pictures of another size or type.
@@ -292,18 +292,18 @@ class Camera:
                         if (shot := device.shot()) is None:
                             continue
                         fitting = self._fitting(shot)
-                        if fault and self.tell is not None:
-                            self.tell(f"{self.name}: pictures come again.")
+                        if fault and self.log is not None:
+                            self.log(f"{self.name}: pictures come again.")
                         fault, seen = "", True
                         yield fitting
             except MovieError as error:
-                if self.tell is None or not seen:
+                if self.log is None or not seen:
                     raise
                 found = str(error)
-            if self.tell is None or not seen:
+            if self.log is None or not seen:
                 return
             if not fault and not stopped.is_set():
-                self.tell(f"{found} It is opened again each second.")
+                self.log(f"{found} It is opened again each second.")
             fault = found
             stopped.wait(AGAIN_S)
 
@@ -318,7 +318,7 @@ class Camera:
             do = f"set its PixelFormat to Mono8 or Mono16, or write pixel_format in camera: {name}: of experiment.yaml"
             raise MovieError(refusal(self.name, expected="grey pictures", got=form, do=do))
 
-    def _fitting(self, shot: Shot) -> Shot:
+    def _fitting(self, shot: RawPicture) -> RawPicture:
         """Return a picture as it lies in the movie; MovieError: of another size or type."""
         if (picture := shot.picture) is None:
             return shot
@@ -343,12 +343,12 @@ def worded(name: str) -> Iterator[None]:
         raise MovieError(refusal(name, expected="a camera that works", got=error_words(error), do=do)) from None
 
 
-def device_frames(cameras: Sequence[Camera], tell: Tell, stopped: Event) -> Iterator[Arrival]:
-    """Yield the instants of cameras until `stopped`, or the only one ends; errors: `Camera.shots`, `Instants`."""
-    instants, waiting = Instants([one.stream.name for one in cameras], tell), set(range(len(cameras)))
+def device_frames(cameras: Sequence[LiveCamera], log: Log, stopped: Event) -> Iterator[Arrival]:
+    """Yield the instants of cameras until `stopped`, or the only one ends; errors: as `LiveCamera`, `Instants`."""
+    instants, waiting = Instants([one.stream.name for one in cameras], log), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
-    shots: Iterator[Came] = ((0, shot) for shot in cameras[0].shots(stopped))
-    for came in shots if len(cameras) == 1 else _side_by_side(cameras, stopped, lambda: instants.due_s):
+    pictures: Iterator[Came] = ((0, shot) for shot in cameras[0].pictures(stopped))
+    for came in pictures if len(cameras) == 1 else _side_by_side(cameras, stopped, lambda: instants.due_s):
         if came is not None and came[1] is not None:
             instants.take(came[0], came[1])
             triggered = False
@@ -356,18 +356,18 @@ def device_frames(cameras: Sequence[Camera], tell: Tell, stopped: Event) -> Iter
             instants.restart(came[0])
             waiting.discard(came[0])
             if triggered and not waiting:
-                tell("waiting for the first trigger.")
+                log("waiting for the first trigger.")
                 triggered = False
         yield from instants.ready(time.perf_counter())
 
 
-def _side_by_side(cameras: Sequence[Camera], stopped: Event, due_s: Callable[[], float]) -> Iterator[Came]:
+def _side_by_side(cameras: Sequence[LiveCamera], stopped: Event, due_s: Callable[[], float]) -> Iterator[Came]:
     """Yield the pictures of cameras, each read in a thread, as they come; None: none came until one was due."""
     waiting: SimpleQueue[Came | Exception] = SimpleQueue()
 
     def read(number: int) -> None:
         try:
-            for shot in cameras[number].shots(stopped):
+            for shot in cameras[number].pictures(stopped):
                 waiting.put((number, shot))
         except Exception as error:  # goes on in the thread that iterates
             waiting.put(error)

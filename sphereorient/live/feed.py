@@ -6,14 +6,15 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from threading import Condition, Thread
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.experiment.recording import CameraStream
 
-Picture = NDArray[np.generic]
-Tell = Callable[[str], object]  # gets what is wrong, in one line
+Picture = NDArray[Any]
+Log = Callable[[str], object]  # gets what is wrong, in one line
 LATE, GROWS = 1, 2  # frames that may wait; times the step before, of the next one
 STEADY = 8  # frames in a row without a search: then the next search is not for a motion that steps hide
 STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
@@ -49,13 +50,13 @@ class FrameBytes:
 class Feed:
     """Reads a source in a thread, and yields its frames in order, or its error. At most `most` frames wait: then the
     oldest is dropped, or with `wait` the source waits. While more than `LATE` wait, frames are skipped, in steps that
-    grow slowly: the motion stays known. `tell` gets a line where the source stalls, and where it goes on.
+    grow slowly: the motion stays known. `log` gets a line where the source stalls, and where it goes on.
     """
 
-    def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, tell: Tell = lambda line: None) -> None:
+    def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, log: Log = lambda line: None) -> None:
         self.dropped = 0
         self.newest_s = -math.inf  # time of the newest frame of a source that does not wait
-        self._tell, self._usual_s, self._last_s = tell, 0.0, 0.0
+        self._log, self._usual_s, self._last_s = log, 0.0, 0.0
         self._source, self._most, self._wait = source, most, wait
         self._waiting: deque[Arrival] = deque()
         self._changed = Condition()
@@ -136,7 +137,7 @@ class Feed:
         since = time.perf_counter()
         if self._changed.wait_for(is_there, max(STALLED_S, STALLED_FRAMES * self._usual_s)):
             return
-        self._tell(f"source: no frame for {time.perf_counter() - since:.1f} s; tracking waits.")
+        self._log(f"source: no frame for {time.perf_counter() - since:.1f} s; tracking waits.")
         self._changed.wait_for(is_there)
         if self._waiting:
-            self._tell(f"source: frames come again, after {time.perf_counter() - since:.1f} s.")
+            self._log(f"source: frames come again, after {time.perf_counter() - since:.1f} s.")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sphereorient.errors import MovieError, refusal
-from sphereorient.live.feed import Arrival, Picture, Tell
+from sphereorient.live.feed import Arrival, Log, Picture
 
 JOINING, SURE = 16, 256  # pictures by which a camera comes into step; by which it does in any case
 NEAR = 0.25  # shortest intervals of late: pictures of one instant lie nearer
@@ -20,11 +20,11 @@ LATE_S = 0.01, 0.1  # an instant waits for its last picture for one usual interv
 SILENT = 3  # usual intervals without a picture: no instant waits for the camera
 SILENT_S = 1.0  # at least: then another camera gives the time
 JUMP_S = 1.0  # a clock that goes back further was set anew
-TOLD_S = 10.0  # between lines about pictures that are not there
+LOG_EVERY_S = 10.0  # between lines about pictures that are not there
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
+class RawPicture:
     """A picture as its device gave it."""
 
     picture: Picture | None  # None: it did not arrive whole
@@ -60,17 +60,17 @@ class _Instant:
 class Instants:
     """Groups the pictures of several cameras by instant. The first camera gives the time; another one is synchronised
     by its first 16 pictures, by the shortest delays, then by its time stamps with the drift of its clock. An instant
-    has None for a camera whose picture is missing, late or incomplete; `tell` gets the counts.
+    has None for a camera whose picture is missing, late or incomplete; `log` gets the counts.
     """
 
-    def __init__(self, names: Sequence[str], tell: Tell) -> None:
+    def __init__(self, names: Sequence[str], log: Log) -> None:
         self._clocks = [_Clock(name) for name in names]
-        self._tell, self._begun_s = tell, math.nan  # arrival of the first picture
+        self._log, self._begun_s = log, math.nan  # arrival of the first picture
         self._steps: deque[float] = deque(maxlen=32)  # between pictures of a camera
         self._open: list[_Instant] = []  # in order of time
         self._times: deque[float] = deque(maxlen=2 * JOINING)  # of those that are gone
         self._number = -1
-        self._lacks, self._told, self._tell_s = Counter[str](), 0, -math.inf
+        self._lacks, self._logged, self._log_s = Counter[str](), 0, -math.inf
 
     @property
     def _usual_s(self) -> float:
@@ -80,7 +80,7 @@ class Instants:
         """Forget a camera's clock: its device was opened."""
         self._clocks[camera].forget()
 
-    def take(self, camera: int, shot: Shot) -> None:
+    def take(self, camera: int, shot: RawPicture) -> None:
         """Take a picture of a camera. Raise MovieError: one of several whose device has no clock."""
         clock, several = self._clocks[camera], len(self._clocks) > 1
         if several and shot.stamp_s is None:
@@ -134,7 +134,7 @@ class Instants:
         agree = max(np.ptp(own), np.ptp(of_lead), 2 * np.median(abs(nearest - middle))) < within_s
         return offset_s + middle if agree and (abs(middle) < within_s or len(clock.lags) == SURE) else None
 
-    def _put(self, camera: int, time_s: float, shot: Shot, step: int, near_s: float) -> None:
+    def _put(self, camera: int, time_s: float, shot: RawPicture, step: int, near_s: float) -> None:
         clock = self._clocks[camera]
         found = next((one for one in self._open if abs(one.time_s - time_s) < near_s), None)
         if found is None:
@@ -154,10 +154,10 @@ class Instants:
         """Yield the instants that wait for no picture any more, in order."""
         while self._open and (self.due_s <= now_s or not self._awaited(self._open[0])):
             yield self._arrival(self._open.pop(0))
-        if now_s > self._tell_s and (count := self._lacks.total()) > self._told:
-            self._told, self._tell_s = count, now_s + TOLD_S
+        if now_s > self._log_s and (count := self._lacks.total()) > self._logged:
+            self._logged, self._log_s = count, now_s + LOG_EVERY_S
             lacks = ", ".join(f"{what} {count}" for what, count in self._lacks.items() if count)
-            self._tell(f"pictures not used or not there so far: {lacks}; frames go on without them.")
+            self._log(f"pictures not used or not there so far: {lacks}; frames go on without them.")
 
     def _awaited(self, instant: _Instant) -> bool:
         """Return whether a camera may yet give its picture of an instant."""

@@ -62,11 +62,11 @@ class LearningTracker:
         self._adjusting: tuple[KeptFrames, Future[tuple[Array, ...]]] | None = None
         self._adjusted_by_rad = 0.0  # turn within the frames that are adjusted
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
+    def next(self, time_s: float, frames: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
         """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
-        frames = self._coarse.frames(shots)
-        poses, searched = self._pass.next(time_s, frames)
-        self._now = (frames, poses) if supported(poses) else None
+        coarse = self._coarse.frames(frames)
+        poses, searched = self._pass.next(time_s, coarse)
+        self._now = (coarse, poses) if supported(poses) else None
         if self._now is not None:
             self.appearances = {"": replace(self._known, lasting=self._known.lasting.with_place(self._turned(poses)))}
         return {"": (poses, searched)}

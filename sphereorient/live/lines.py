@@ -8,17 +8,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sphereorient.errors import Flag
 from sphereorient.files.provenance import without_nan
-from sphereorient.live.live import Measured
+from sphereorient.live.live import Floats, Measured
 from sphereorient.motion.forward import UNKNOWN, ForwardRate, Rate
 from sphereorient.trajectory import quaternions_wxyz
 from sphereorient.trajectory.rotations import rotation_vectors
 from sphereorient.trajectory.walk import FicTracAxes, arcs, fictrac_rows, turned
 
-Floats = NDArray[np.float64]
 AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
@@ -129,7 +127,7 @@ def _states_errors(now: Measured) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Forms:
     """A frame in the forms that outputs take; each is made where one takes it."""
 
     now: Measured

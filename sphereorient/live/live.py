@@ -56,44 +56,44 @@ class OnlineTracker:
         self._lost: list[str] = []  # balls that the last frame was searched for
         self._searched_s = math.nan  # time of the last long search
 
-    def next(self, time_s: float, shots: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
+    def next(self, time_s: float, frames: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
         """Return the poses of each ball in the frame of a time, and whether it was searched for, since it was not
-        predicted, or not there. `shots`: a frame of each view. Where time does not increase, the history is dropped.
+        predicted, or not there. `frames`: a frame of each view. Where time does not increase, the history is dropped.
         """
         self.between()
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
             for chunk in self._chunks.values():
                 chunk.forget()
         self._time_s[self._number], self._lost = time_s, []
-        self._last = self._step(shots)
+        self._last = self._step(frames)
         for name in self._lost:
             if supported(self._last[name]):
                 self._chunks[name].forget()  # what was before says nothing of the motion from here
         return {name: (poses, name in self._lost) for name, poses in self._last.items()}
 
-    def _step(self, shots: Sequence[Frame]) -> dict[str, Poses]:
+    def _step(self, frames: Sequence[Frame]) -> dict[str, Poses]:
         if len(self._chunks) > 1:
-            return self._tracker.step({one: [chunk] for one, chunk in self._chunks.items()}, self._number, [shots])[0]
+            return self._tracker.step({one: [chunk] for one, chunk in self._chunks.items()}, self._number, [frames])[0]
         (name,) = self._chunks
         ball = self._tracker.balls[name]
         ahead = ball.ahead(self._chunks[name], self._number)
-        poses = None if ahead is None else ball.followed(ahead, shots)
-        return self._searched(shots, [name], {}, {}) if poses is None else {name: poses}
+        poses = None if ahead is None else ball.followed(ahead, frames)
+        return self._searched(frames, [name], {}, {}) if poses is None else {name: poses}
 
     def _searched(
-        self, shots: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
+        self, frames: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
     ) -> dict[str, Poses]:
         """Find balls, as `Tracker.start`: by its blob if there is only one; the long search once in a while."""
         time_s, self._lost = self._time_s[self._number], list(names)
         if len(self._tracker.balls) == 1:
-            found = {name: self._tracker.balls[name].spotted(shots) for name in names}
+            found = {name: self._tracker.balls[name].spotted(frames) for name in names}
         else:
-            reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in shots]
-            found = {name: no_pose(len(shots), reason) for name in names}
+            reason = [Reason.NOT_FOUND if shot.usable else shot.reason for shot in frames]
+            found = {name: no_pose(len(frames), reason) for name in names}
         if any(supported(poses) for poses in found.values()) or abs(time_s - self._searched_s) < SEARCH_S:
             return found
         self._searched_s = time_s
-        return self._look(shots, names, known, past)
+        return self._look(frames, names, known, past)
 
     def between(self) -> None:
         """Update the motion history; deferred until the pose has been sent."""
@@ -143,14 +143,14 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
     number: int | None = None  # of the frame before
     for arrival in frames:
         dropped = 0 if number is None else arrival.number - number - 1
-        shots = []
+        frame = []
         for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True)):
             if picture is None:
                 nothing = np.zeros(view.camera.image_size[::-1], np.uint8)
-                shots.append(Frame(shown=nothing, read=Reason.UNDECODABLE))
+                frame.append(Frame(shown=nothing, read=Reason.UNDECODABLE))
             else:
-                shots.append(screened(picture, None if before is None else before[c].shown, view.background))
-        for ball, (poses, searched) in tracker.next(arrival.time_s, shots).items():
+                frame.append(screened(picture, None if before is None else before[c].shown, view.background))
+        for ball, (poses, searched) in tracker.next(arrival.time_s, frame).items():
             there, appearance = supported(poses), tracker.appearances[ball]
             yield Measured(
                 ball=ball,
@@ -169,7 +169,7 @@ def measured(tracker: LiveTracker, views: Sequence[CameraView], frames: Iterable
                 latency_s=time.perf_counter() - arrival.arrived_s,
             )
         tracker.between()
-        before, number = shots, arrival.number
+        before, number = frame, arrival.number
 
 
 def _flags(poses: Poses, learnt: Appearance) -> int:

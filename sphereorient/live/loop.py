@@ -13,8 +13,8 @@ from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import limited_cores, silent
 from sphereorient.files.whole_file import writing
-from sphereorient.live.feed import Feed, FrameBytes, Tell
-from sphereorient.live.lines import FicTracLines, Quantities, Told
+from sphereorient.live.feed import Feed, FrameBytes, Log
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import LiveTracker, OnlineTracker, measured
 from sphereorient.live.outputs import Output
 from sphereorient.live.page import Monitor, PageProcess
@@ -28,7 +28,7 @@ MOST_WAITING, MOST_BYTES = 512, 64 << 20  # frames that wait
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LiveSetUp:
+class LiveSetup:
     """An opened experiment and who follows its balls."""
 
     recording: Recording
@@ -39,7 +39,7 @@ class LiveSetUp:
 @contextmanager
 def open_live(
     source: Experiment | Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
-) -> Iterator[LiveSetUp]:
+) -> Iterator[LiveSetup]:
     """Open an experiment. Without a texture map, that of a fixed ball is learnt meanwhile. Raises SphereOrientError:
     unusable inputs; ExperimentError: cameras that contradict each other, or no map of a ball that moves.
     """
@@ -57,13 +57,13 @@ def open_live(
         if not follower.tracker.balls:
             do = "look with `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
-        yield LiveSetUp(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
+        yield LiveSetup(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
 
 
 @contextmanager
 def _learning(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, path: Path
-) -> Iterator[LiveSetUp]:
+) -> Iterator[LiveSetup]:
     # Import late: with a map nothing is learnt.
     from sphereorient.live.learning import LearningTracker
     from sphereorient.mapping.disks import held_place
@@ -82,21 +82,21 @@ def _learning(
             return f"Wrote {path}{named}"
 
         try:
-            yield LiveSetUp(recording=recording, tracker=tracker, save_map=save)
+            yield LiveSetup(recording=recording, tracker=tracker, save_map=save)
         finally:
             tracker.close()
 
 
 def run_live(
-    opened: LiveSetUp,
+    opened: LiveSetup,
     source: Source,
     outputs: Sequence[tuple[Output, str]],
     page: PageProcess | None,
-    tell: Tell,
+    log: Log,
     fictrac: Path | None = None,
 ) -> Monitor:
-    """Track the frames of a source until it ends, or Ctrl-C. `outputs`: each with the attribute of `Told` that it
-    takes; `tell` gets messages for the user; `fictrac`: see `fictrac_axes`.
+    """Track the frames of a source until it ends, or Ctrl-C. `outputs`: each with the attribute of `Forms` that it
+    takes; `log` gets messages for the user; `fictrac`: see `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker
     first = next(iter(tracker.appearances))  # of several balls the page shows this one
@@ -106,17 +106,17 @@ def run_live(
     gc.collect()
     gc.freeze()  # what is here stays: no pause looks through it
     size = FrameBytes(recording.streams).size
-    feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, tell=tell)
-    monitor = Monitor(feed, tell)
+    feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, log=log)
+    monitor = Monitor(feed, log)
     try:
         if page is not None:
             page.begin(recording, monitor.running, opened.save_map)
         # In one thread: a second one may wait for a core that another program has.
         with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):
-                told = Told(now, table, known[now.ball])
+                forms = Forms(now, table, known[now.ball])
                 for output, form in outputs:
-                    output.send(getattr(told, form))
+                    output.send(getattr(forms, form))
                 if now.found:
                     feed.restart()
                 monitor.saw(now)

@@ -17,7 +17,7 @@ import numpy as np
 from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.page_server import HOST
 from sphereorient.files.provenance import package
-from sphereorient.live.feed import Tell
+from sphereorient.live.feed import Log
 from sphereorient.live.live import TrackBlocks
 from sphereorient.live.shared import POSE_BYTES, POSES, SharedFrames
 from sphereorient.trajectory import Trajectory, journal
@@ -131,7 +131,7 @@ class UdpOutput(Output):
 
 
 class OscOutput(UdpOutput):
-    """OSC over UDP: a message /sphereorient a frame, all `Told.numbers` as int32 or float32. OutputError: no python-
+    """OSC over UDP: a message /sphereorient a frame, all `Forms.numbers` as int32 or float32. OutputError: no python-
     osc, no host.
     """
 
@@ -147,12 +147,12 @@ class OscOutput(UdpOutput):
 
 
 class LslOutput(Output):
-    """A stream of LSL: a sample of float64 a frame, of all numbers (`Told.numbers`), with names and units; the least
+    """A stream of LSL: a sample of float64 a frame, of all numbers (`Forms.numbers`), with names and units; the least
     delayed of the last frames sets LSL's clock. Only this machine sees it, unless LSLAPICFG names a configuration.
     Raise OutputError: the package pylsl, or its library liblsl, is missing.
     """
 
-    def __init__(self, name: str, tell: Tell) -> None:
+    def __init__(self, name: str, log: Log) -> None:
         self._name = name
         try:
             self._lsl = package("pylsl", "live")
@@ -191,7 +191,7 @@ class SharedOutput(Output):
     folder.
     """
 
-    def __init__(self, address: str, tell: Tell) -> None:
+    def __init__(self, address: str, log: Log) -> None:
         self._ring = SharedFrames(Path(address), POSE_BYTES, POSES)
 
     def send(self, numbers: dict[str, float]) -> None:
@@ -204,12 +204,12 @@ class SharedOutput(Output):
 
 
 class SerialOutput(Output):
-    """A serial port, PORT@BAUD. `tell` gets a line where it fails, or is too slow: then the oldest lines are lost.
+    """A serial port, PORT@BAUD. `log` gets a line where it fails, or is too slow: then the oldest lines are lost.
     Raise OutputError: the package pyserial is missing, or no such port, one in use, or not a baud rate.
     """
 
-    def __init__(self, address: str, tell: Tell) -> None:
-        self._name, self._tell = f"serial:{address}", tell
+    def __init__(self, address: str, log: Log) -> None:
+        self._name, self._log = f"serial:{address}", log
         serial, (port, _, baud) = package("serial", "live"), address.rpartition("@")
         try:
             self._port = serial.Serial(port, int(baud) or -1, exclusive=True)  # 0 hangs up
@@ -221,14 +221,14 @@ class SerialOutput(Output):
 
     def _failed(self, error: OSError) -> None:
         do = "connect it and begin again; tracking goes on without it"
-        self._tell(refusal(self._name, expected="a port that takes lines", got=error_words(error), do=do))
+        self._log(refusal(self._name, expected="a port that takes lines", got=error_words(error), do=do))
 
     def send(self, line: str) -> None:
         """Take a line."""
         before = self._spool.lost
         self._spool.send(line)
         if self._spool.lost > before == 0:
-            self._tell(f"{self._name}: lines are lost: they come faster than they are taken; try a higher baud rate.")
+            self._log(f"{self._name}: lines are lost: they come faster than they are taken; try a higher baud rate.")
 
     def close(self) -> None:
         """Write what waits, within a second, and close the port."""
@@ -319,15 +319,15 @@ def _joined(lines: list[str]) -> bytes:
 
 
 class FileOutput(Output):
-    """A new text file, a line a frame, flushed. `tell` gets a line where the disk is full or too slow. Raise
+    """A new text file, a line a frame, flushed. `log` gets a line where the disk is full or too slow. Raise
     OutputError: there is such a file, or no folder for it.
     """
 
-    def __init__(self, path: Path, tell: Tell, pause_s: float = 0.0) -> None:
+    def __init__(self, path: Path, log: Log, pause_s: float = 0.0) -> None:
         check_new(path)
-        self._path, self._tell = path, tell
+        self._path, self._log = path, log
         self._file: IO[bytes] | None = None
-        self._spool = Spool(self._write, lambda error: tell(no_room(path, error)), 100_000, pause_s)  # minutes
+        self._spool = Spool(self._write, lambda error: log(no_room(path, error)), 100_000, pause_s)  # minutes
 
     def send(self, thing: Any) -> None:
         """Take a line."""
@@ -345,7 +345,7 @@ class FileOutput(Output):
         """Write what waits, and close the file."""
         self._spool.close(DISK_S)
         if self._spool.lost and not self._spool.gone:
-            self._tell(f"{self._path}: the disk was too slow for {self._spool.lost} frames; they are missing.")
+            self._log(f"{self._path}: the disk was too slow for {self._spool.lost} frames; they are missing.")
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
@@ -354,11 +354,11 @@ class FileOutput(Output):
 class TrackOutput(FileOutput):
     """A new track.h5 (docs/data-format.md): rows in a journal beside it until it is written whole at the end."""
 
-    def __init__(self, path: Path, tell: Tell) -> None:
+    def __init__(self, path: Path, log: Log) -> None:
         check_new(path)
         self._track = path
         self._blocks: TrackBlocks | None = None
-        super().__init__(journal.journal_path(path), tell, BLOCK_S)
+        super().__init__(journal.journal_path(path), log, BLOCK_S)
 
     def begin(self, blocks: TrackBlocks) -> None:
         """Begin the journal; raise OutputError if it cannot be written."""
@@ -388,7 +388,7 @@ class TrackOutput(FileOutput):
             Trajectory.load(self._path).save(self._track)
             self._path.unlink()
         except (SphereOrientError, OSError) as error:
-            self._tell(f"{error} What was measured is in {self._path}.")
+            self._log(f"{error} What was measured is in {self._path}.")
 
 
 def check_new(path: Path) -> None:
@@ -398,27 +398,27 @@ def check_new(path: Path) -> None:
         raise OutputError(refusal(str(path), expected="a new file", got=got, do="name another one"))
 
 
-# By the part before ":" or the suffix: the class, and what it takes of a frame, an attribute of `lines.Told`.
+# By the part before ":" or the suffix: the class, and what it takes of a frame, an attribute of `lines.Forms`.
 SOCKETS: Mapping[str, tuple[Callable[[str, int], Output], str]] = {
     "tcp": (TcpOutput, "marked"),
     "udp": (UdpOutput, "marked"),
     "zmq": (ZmqOutput, "json"),
     "osc": (OscOutput, "numbers"),
 }
-NAMED: Mapping[str, tuple[Callable[[str, Tell], Output], str]] = {
+NAMED: Mapping[str, tuple[Callable[[str, Log], Output], str]] = {
     "serial": (SerialOutput, "marked"),
     "serial-short": (SerialOutput, "short"),
     "lsl": (LslOutput, "numbers"),
     "shared": (SharedOutput, "numbers"),
 }
-FILES: Mapping[str, tuple[Callable[[Path, Tell], Output], str]] = {
+FILES: Mapping[str, tuple[Callable[[Path, Log], Output], str]] = {
     ".dat": (FileOutput, "fictrac"),
     ".jsonl": (FileOutput, "json"),
     ".h5": (TrackOutput, "now"),
 }
 
 
-def open_output(name: str, tell: Tell) -> tuple[Output, str]:
+def open_output(name: str, log: Log) -> tuple[Output, str]:
     """Open an output by its name, and return what it takes of a frame too; raise SettingsError for an unknown one."""
     kind, _, address = name.partition(":")
     host, _, port = address.rpartition(":")
@@ -427,10 +427,10 @@ def open_output(name: str, tell: Tell) -> tuple[Output, str]:
         return to_socket(host or HOST, int(port)), form
     if kind in NAMED and address:
         to_name, form = NAMED[kind]
-        return to_name(address, tell), form
+        return to_name(address, log), form
     if (suffix := Path(name).suffix) in FILES:
         to_file, form = FILES[suffix]
-        return to_file(Path(name), tell), form
+        return to_file(Path(name), log), form
     named = "serial:PORT@BAUD", "serial-short:PORT@BAUD", "lsl:NAME", "shared:FILE"
     others = [*named, *(f"NAME{suffix}" for suffix in FILES)]
     expected = ", ".join([*(f"{kind}:PORT" for kind in SOCKETS), *others])

@@ -34,7 +34,7 @@ from sphereorient.files.page_server import Answer, Json, PageServer, address, li
 from sphereorient.files.picture import eight_bits
 from sphereorient.files.provenance import without_nan
 from sphereorient.files.threads import limit_cores
-from sphereorient.live.feed import Arrival, Feed, FrameBytes, Tell
+from sphereorient.live.feed import Arrival, Feed, FrameBytes, Log
 from sphereorient.live.lines import FicTracLines
 from sphereorient.live.live import Measured
 from sphereorient.live.shared import POSES, WORD, SharedFrames, SlotReader
@@ -74,19 +74,19 @@ REASONS = list(Reason)
 @dataclass(eq=False)
 class _Absence:
     lost: tuple[float, Measured] | None = None  # time of the source, s, and the last frame without a pose
-    told: bool = False
+    logged: bool = False
     in_a_row: int = 0  # frames with a pose
 
 
 class Monitor:
     """Yields the frames of a feed unless stopped, and counts them; a frame is lost where one of several balls is."""
 
-    def __init__(self, feed: Feed, tell: Tell = lambda line: None) -> None:
+    def __init__(self, feed: Feed, log: Log = lambda line: None) -> None:
         self.count = self.lost = 0
         self.latency_ms: deque[float] = deque(maxlen=KEPT)
         self.running = Event()
         self.running.set()
-        self._feed, self._tell = feed, tell
+        self._feed, self._log = feed, log
         self._absence: defaultdict[str, _Absence] = defaultdict(_Absence)  # of each ball
         self._counted = self._counted_lost = -1  # numbers of the last frames
         self.arrival: Arrival  # the last frame
@@ -95,7 +95,7 @@ class Monitor:
         for arrival in self._feed:
             self.running.wait()
             for absence in self._absence.values():  # before this one is searched: that takes long
-                self._tell_lost(absence, max(arrival.time_s, self._feed.newest_s))
+                self._log_lost(absence, max(arrival.time_s, self._feed.newest_s))
             self.arrival = arrival
             yield arrival
 
@@ -112,24 +112,24 @@ class Monitor:
         of.in_a_row = of.in_a_row + 1 if now.valid else 0
         if now.valid:
             if of.in_a_row >= CONFIRMED:
-                if of.told:
-                    self._tell(f"frame {now.number}: {_called(now)} is found again.")
-                of.lost, of.told = None, False
+                if of.logged:
+                    self._log(f"frame {now.number}: {_called(now)} is found again.")
+                of.lost, of.logged = None, False
             return
         of.lost = now.time_s if of.lost is None else of.lost[0], now
-        self._tell_lost(of, now.time_s)
+        self._log_lost(of, now.time_s)
 
-    def _tell_lost(self, of: _Absence, time_s: float) -> None:
+    def _log_lost(self, of: _Absence, time_s: float) -> None:
         """Tell a ball that is not found for a while at a time of the source, once, with the likely cause."""
-        if of.lost is None or of.told or time_s - of.lost[0] < LOST_S:
+        if of.lost is None or of.logged or time_s - of.lost[0] < LOST_S:
             return
-        now, of.told = of.lost[1], True
+        now, of.logged = of.lost[1], True
         why = ", ".join(sorted({str(reason) for reason in now.reason}))
         cause = next((words for reason, words in CAUSES.items() if reason in now.reason), "no picture can be used")
         if Reason.LOW_SCORE in now.reason and self.lost > MOSTLY * self.count:
             cause = NOT_EXPLAINED
         lost = f"{_called(now)} is not found for {LOST_S:g} s ({why})"
-        self._tell(f"frame {now.number}: {lost}: {cause}; tracking goes on.")
+        self._log(f"frame {now.number}: {lost}: {cause}; tracking goes on.")
 
     def summary(self) -> list[str]:
         """Return the counts and latencies in words."""
@@ -147,11 +147,11 @@ def _called(now: Measured) -> str:
 
 class PageWriter:
     """The loop side of the page: it copies a row of each frame, and at most `PICTURES_HZ` times a second its pictures,
-    into rings in a folder, and obeys commands. `tell` gets a line where none can come any more.
+    into rings in a folder, and obeys commands. `log` gets a line where none can come any more.
     """
 
-    def __init__(self, folder: Path, commands: Connection, tell: Tell) -> None:
-        self.folder, self._commands, self._tell = folder, commands, tell
+    def __init__(self, folder: Path, commands: Connection, log: Log) -> None:
+        self.folder, self._commands, self._log = folder, commands, log
         self._closing, self._next_s = False, 0.0
         self._rings: tuple[SharedFrames, SharedFrames] | None = None
 
@@ -187,7 +187,7 @@ class PageWriter:
                 self._commands.send_bytes(json.dumps(said).encode())
         if not self._closing:
             running.set()  # nobody could start it again
-            self._tell("page: its process has ended; tracking goes on without the page.")
+            self._log("page: its process has ended; tracking goes on without the page.")
 
     def close(self) -> None:
         """Remove the rings."""
@@ -204,7 +204,7 @@ def _shown_bytes(recording: Recording) -> int:
 class PageProcess(PageWriter):
     """A page in the browser, served by a process of its own; port 0: any free one. Raise OutputError: it is in use."""
 
-    def __init__(self, experiment: Path, cameras: Sequence[str] | None, port: int, tell: Tell) -> None:
+    def __init__(self, experiment: Path, cameras: Sequence[str] | None, port: int, log: Log) -> None:
         door, token = listen(port, "--page", OutputError), new_token()
         memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
         folder = Path(tempfile.mkdtemp(prefix="sphereorient-", dir=memory))
@@ -216,7 +216,7 @@ class PageProcess(PageWriter):
         self.address = address(door, token)
         door.close()
         theirs.close()
-        super().__init__(folder, commands, tell)
+        super().__init__(folder, commands, log)
 
     def close(self) -> None:
         """End the process."""
@@ -270,7 +270,7 @@ class LivePage:
         self._count = self._lost = self._dropped = 0
         self._heading_rad = float("nan")
         self._latency_ms: deque[float] = deque(maxlen=KEPT)
-        self._told_s: deque[float] = deque(maxlen=KEPT)  # when a frame was measured
+        self._measured_s: deque[float] = deque(maxlen=KEPT)  # when a frame was measured
         self._path: deque[tuple[float, float]] = deque(maxlen=20_000)
 
     @cached_property
@@ -301,12 +301,12 @@ class LivePage:
                 if (slot := poses.read(number)) is not None:
                     self._add(slot[1], np.frombuffer(slot[2]))
 
-    def _add(self, told_s: float, row: NDArray[np.float64]) -> None:
+    def _add(self, measured_s: float, row: NDArray[np.float64]) -> None:
         number, time_s, latency_ms, dropped, error_rad = row[:5].tolist()
         R = row[8:].reshape(3, 3)
         self._lost, self._dropped = self._lost + bool(np.isnan(R[0, 0])), self._dropped + int(dropped)
         self._latency_ms.append(latency_ms)
-        self._told_s.append(told_s)
+        self._measured_s.append(measured_s)
         columns = self._lines.columns(int(number), time_s, R, error_rad)
         x, y = columns[FICTRAC["path"]].tolist()
         self._path.append((x, y))
@@ -354,7 +354,7 @@ class LivePage:
         words, row = np.split(np.frombuffer(slot[2], np.float64, offset=self._layout.size).copy(), [cameras + 1])
         R, valid = row[8:].reshape(3, 3), bool(np.isfinite(row[8]))
         with self._lock:
-            latency, told_s = np.array(self._latency_ms), self._told_s.copy()
+            latency, measured_s = np.array(self._latency_ms), self._measured_s.copy()
             path = list(islice(self._path, 0, None, max(1, len(self._path) // 1000)))  # of the path
         counts, edges = np.histogram(latency, 40, (0.0, max(float(np.quantile(latency, 0.99)) * 1.2, 1.0)))
         middle, slow = np.quantile(latency, (0.5, 0.99))
@@ -364,7 +364,7 @@ class LivePage:
             "count": self._count,
             "lost": self._lost,
             "dropped": self._dropped,
-            "rate_hz": (len(told_s) - 1) / (told_s[-1] - told_s[0]) if len(told_s) > 1 else None,
+            "rate_hz": (len(measured_s) - 1) / (measured_s[-1] - measured_s[0]) if len(measured_s) > 1 else None,
             "frame": int(row[0]),
             "time_s": row[1],
             "valid": valid,

@@ -63,12 +63,12 @@ def cameras_here(limit_s: float = 10.0) -> dict[str, list[str] | str]:
 def _asked(kind: str, limit_s: float) -> list[str] | str:
     command = [sys.executable, "-P", __file__, kind]  # -P: the modules beside this file hide no others
     try:
-        told = subprocess.run(command, capture_output=True, errors="replace", timeout=limit_s)
+        ended = subprocess.run(command, capture_output=True, errors="replace", timeout=limit_s)
     except subprocess.TimeoutExpired:
         return f"no answer within {limit_s:g} s"
-    if told.returncode:
-        return "the driver fails: " + (told.stderr.strip().splitlines() or [f"status {told.returncode}"])[-1][:200]
-    return told.stdout.splitlines()
+    if ended.returncode:
+        return "the driver fails: " + (ended.stderr.strip().splitlines() or [f"status {ended.returncode}"])[-1][:200]
+    return ended.stdout.splitlines()
 
 
 if __name__ == "__main__":

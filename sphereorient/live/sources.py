@@ -15,8 +15,8 @@ from typing import BinaryIO
 
 from sphereorient.errors import MovieError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording
-from sphereorient.live.devices import MAKERS, RELEASE_S, Camera, device_frames, worded
-from sphereorient.live.feed import Arrival, FrameBytes, Tell
+from sphereorient.live.devices import MAKERS, RELEASE_S, LiveCamera, device_frames, worded
+from sphereorient.live.feed import Arrival, FrameBytes, Log
 from sphereorient.live.shared import shared_frames
 from sphereorient.movies import flipped_picture
 from sphereorient.movies.record import Recorder
@@ -59,7 +59,7 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
         number += 1
 
 
-def _devices(kind: str, where: str, tell: Tell) -> Source:
+def _devices(kind: str, where: str, log: Log) -> Source:
     """Return the cameras of a maker: a serial number for each camera of the experiment, in its order."""
     ends = kind == "camera:" and Path(where).is_file()  # a movie
     stopped, released = Event(), Event()
@@ -82,17 +82,17 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
                 with worded(f"{kind}{where}"):
                     open_device = drivers.enter_context(MAKERS[kind](producer))
                 cameras = [
-                    Camera(
+                    LiveCamera(
                         name=f"{kind}{serial or producer}",
                         open=partial(open_device, serial),
                         stream=stream,
                         keys=None if ends else opened.experiment.devices.get(stream.name),
                         flip=opened.experiment.flip.get(stream.name, "none"),
-                        tell=None if ends else tell,
+                        log=None if ends else log,
                     )
                     for serial, stream in zip(serials, opened.streams, strict=True)
                 ]
-                yield from device_frames(cameras, tell, stopped)
+                yield from device_frames(cameras, log, stopped)
         finally:
             released.set()
 
@@ -100,7 +100,7 @@ def _devices(kind: str, where: str, tell: Tell) -> Source:
 
 
 # By name; the functions get what is behind ":".
-SOURCES: Mapping[str, Callable[[str, Tell], Source]] = {
+SOURCES: Mapping[str, Callable[[str, Log], Source]] = {
     "movie": lambda *_: Source(frames=partial(movie_frames, paced=True), even=True),
     "movie-fast": lambda *_: Source(frames=partial(movie_frames, paced=False), waits=True, even=True),
     "-": lambda *_: Source(
@@ -113,13 +113,13 @@ SOURCES: Mapping[str, Callable[[str, Tell], Source]] = {
 }
 
 
-def source_of(name: str, tell: Tell) -> Source:
+def source_of(name: str, log: Log) -> Source:
     """Return the source of a name, such as movie or camera:0; raise SettingsError for an unknown one."""
     kind, colon, where = name.partition(":")
     if kind + colon not in SOURCES or bool(colon) != bool(where):
         expected = "movie, movie-fast, -, shared:FILE, camera:NUMBER, genicam:PRODUCER.cti, pylon:SERIAL or vimba:ID"
         raise SettingsError(refusal("--source", expected=expected, got=name, do="choose one of these"))
-    return SOURCES[kind + colon](where, tell)
+    return SOURCES[kind + colon](where, log)
 
 
 def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:

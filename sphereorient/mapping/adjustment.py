@@ -45,7 +45,7 @@ FARTHEST = 0.1  # of the radius, of a step: a place is near
 AT_ONCE = 4096  # cells
 LEAST = 1e-6  # of a weight
 
-Picture = NDArray[np.float32]
+Singles = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,7 +55,7 @@ class Adjustment:
     crops: Crops  # as given, at the place found
     R_lab_body: Tensor  # (N, 3, 3) float64; the first is as given
     cells: PaintCells  # in which it was found, of paint in shares of the light
-    light: Sequence[Picture]  # of each camera, in the pixels of its crops
+    light: Sequence[Singles]  # of each camera, in the pixels of its crops
     left: float  # root mean square of what the pictures differ from the paint
     moved_mm: Tensor  # (3,), by which the places found are off those given, in the mean
 
@@ -162,7 +162,7 @@ class _Seen:
     def where(self, rows: Tensor) -> "_Seen":
         return _Seen(grey=self.grey[rows], cosine=self.cosine[rows], pixel=self.pixel[rows])
 
-    def paint(self, light: Picture) -> Tensor:
+    def paint(self, light: Singles) -> Tensor:
         """Return the grey in shares of the light."""
         shares: Tensor = self.grey / torch.from_numpy(light).reshape(-1)[self.pixel]
         return shares
@@ -211,7 +211,7 @@ def within_limb(
     return within
 
 
-def _smooth(crops: Crops, camera: int, total: Picture, share: Picture) -> Picture:
+def _smooth(crops: Crops, camera: int, total: Singles, share: Singles) -> Singles:
     """Return the local mean of what counts: sums over pixels, by the share that each has."""
     radius_px = float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
     side = (2 * int(LIGHT_RADII * radius_px) + 1,) * 2
@@ -224,14 +224,14 @@ def _smooth(crops: Crops, camera: int, total: Picture, share: Picture) -> Pictur
     return np.asarray(np.maximum(level, max(BLACKEST * float(level.max()), LEAST)), np.float32)
 
 
-def _mean_light(crops: Crops, camera: int) -> Picture:
+def _mean_light(crops: Crops, camera: int) -> Singles:
     """Return the local mean of all crops: the light, as far as paint averages out."""
     counts = _within(crops, camera).astype(np.float32)
     mean = np.mean([crop.grey for crop in crops.crops[camera] if crop is not None], axis=0, dtype=np.float32)
     return _smooth(crops, camera, mean * counts, counts)
 
 
-def _light(at: Adjustment, seen: _Seen, camera: int) -> Picture:
+def _light(at: Adjustment, seen: _Seen, camera: int) -> Singles:
     """Return the light under which the paint that all pictures have in common looks like them."""
     light, count = at.light[camera], len(seen.grey)
     some = seen.where(torch.linspace(0, count - 1, min(LIGHT_FRAMES, count)).long())

@@ -63,10 +63,10 @@ def crops_of_balls(
     each = list(zip(streams, scenes, strict=True))
     movies = [screened_frames(stream, scene[names[0]].background) for stream, scene in each]
     instants = []
-    for k, shots in enumerate(zip(*movies, strict=True)):
+    for k, frames in enumerate(zip(*movies, strict=True)):
         disks: list[list[Outline]] = []
         crops: list[list[Crop]] = []
-        for shot, size_px in zip(shots, sizes_px, strict=True):
+        for shot, size_px in zip(frames, sizes_px, strict=True):
             usable = shot.usable and shot.background is not None
             disks.append(find_disks(shot.picture, shot.background, size_px, locating) if usable else [])
             crops.append([cut_crop(shot.picture, *one.circle) for one in disks[-1]])

@@ -199,8 +199,8 @@ def held_place(
             seen = sightings_of([(scene.outline, Reason.OK)])
         else:
             count = min(frames_max, len(recording.timeline))
-            shots = locate.screened_frames(stream, scene.background, 0, count)
-            found = side_by_side(partial(_outline, scene, locating), shots)
+            frames = locate.screened_frames(stream, scene.background, 0, count)
+            found = side_by_side(partial(_outline, scene, locating), frames)
             seen = smoothed(sightings_of(counted(f"{stream.name}: ball", found, count, progress)), locating)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = seen

@@ -71,12 +71,12 @@ class CoarserPictures:
         coarse = replace(place, views=[_coarser_view(view, factor) for view in place.views])
         return cls(place=coarse, whole=place.views, factor=factor)
 
-    def frames(self, shots: Sequence[Frame]) -> Sequence[Frame]:
+    def frames(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Return the frames of all cameras so."""
         if self.factor == 1:
-            return shots
+            return frames
         # Pictures that show nothing are not looked at.
-        return [Frame(shown=coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in shots]
+        return [Frame(shown=coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in frames]
 
 
 def _coarser_view(view: CameraView, factor: int) -> CameraView:
@@ -168,31 +168,31 @@ class FirstPass:
         self._even = [EvenLight(view, self._X, self._ball.radius_mm) for view in self._ball.views]
 
     def next(
-        self, time_s: float, shots: Sequence[Frame], there: tuple[Tensor, Tensor] | None = None
+        self, time_s: float, frames: Sequence[Frame], there: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Poses, bool]:
         """Return the pose of the frame of a time, none where the map does not explain it, and whether it was searched
         for; the map grows by it. `there`: the position (3,) of a ball that moves, and the cameras (C,) that see it.
         """
-        use = torch.tensor([shot.usable for shot in shots])
-        reason = [shot.reason for shot in shots]
+        use = torch.tensor([shot.usable for shot in frames])
+        reason = [shot.reason for shot in frames]
         if there is not None:
             reason = [why if sees else Reason.NOT_FOUND for why, sees in zip(reason, there[1].tolist(), strict=True)]
             use = use & there[1]
         if not bool(use.any()):
-            return no_pose(len(shots), reason), False
+            return no_pose(len(frames), reason), False
         if there is not None:
             self._go_to(there[0])
-        even = [light(shot.picture) for light, shot in zip(self._even, shots, strict=True)]
+        even = [light(shot.picture) for light, shot in zip(self._even, frames, strict=True)]
         if self._before is None:
             R = torch.eye(3, dtype=torch.float64)
             self._grow(even, use, R, self._X)  # the map is this frame
             self._before = time_s, R
-            return self._told(self._settled([even], R[None], use), use, reason), True
+            return self._placed(self._settled([even], R[None], use), use, reason), True
         step_s, before = time_s - self._before[0], self._before[1]
         fit, searched = self._fitted(max(step_s, 0.0), before, even, use)
         if fit is None:
             self._lost, self._rate, self._change = self._lost + 1, *torch.zeros(2, 3, dtype=torch.float64)
-            return no_pose(len(shots), reason, use), True
+            return no_pose(len(frames), reason, use), True
         R = fit.R_lab_body[0]
         rate = so3.log(R @ before.mT) / step_s if step_s > 0 else torch.zeros(3, dtype=torch.float64)
         rate = rate * (not searched)
@@ -202,9 +202,9 @@ class FirstPass:
         self._usual += (score - self._usual) / min(self._count, USUAL_OF)
         self._count += 1
         self._grow(even, use, R, fit.position_lab_mm[0])
-        return self._told(fit, use, reason), searched
+        return self._placed(fit, use, reason), searched
 
-    def _told(self, fit: FittedPoses, use: Tensor, reason: Sequence[Reason]) -> Poses:
+    def _placed(self, fit: FittedPoses, use: Tensor, reason: Sequence[Reason]) -> Poses:
         poses = poses_of(fit, slice(0, 1), use, reason)
         if self._ball.fixed:
             poses.covariance[:, 3:, 3:] = self._place_covariance
@@ -324,14 +324,14 @@ class KeptFrames:
         R = [one.R_lab_body for one in self._rows]
         return sum(float(so3.geodesic_distance(a, b)) for a, b in pairwise(R))
 
-    def add(self, shots: Sequence[Frame], poses: Poses) -> None:
+    def add(self, frames: Sequence[Frame], poses: Poses) -> None:
         """Keep a frame with a pose where the ball has turned since the last one that was kept."""
         R = poses.R_lab_body[0]
         if self._rows and float(so3.geodesic_distance(self._rows[-1].R_lab_body, R)) < self._apart_rad:
             return
         self.count += 1
         X = poses.position_lab_mm[0]
-        crops = cut_out(self._place, [shot.picture for shot in shots], None if self._place.fixed else X)
+        crops = cut_out(self._place, [shot.picture for shot in frames], None if self._place.fixed else X)
         self._rows.append(_Kept(crops, poses.use, R, X))
         if len(self._rows) == 2 * MAPPED:
             self._rows, self._apart_rad = self._rows[::2], 2 * self._apart_rad
@@ -428,9 +428,9 @@ def swept(
 ) -> tuple[list[Poses], KeptFrames]:
     """Follow the first `count` frames; return their poses, and those kept of them."""
     pairs = zip(recording.streams, coarse.whole, strict=True)
-    shots = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
+    rows = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
     kept, found = KeptFrames(coarse.place), list[Poses]()
-    for k, row in enumerate(counted("first pass", shots, count, progress)):
+    for k, row in enumerate(counted("first pass", rows, count, progress)):
         frames = coarse.frames(row)
         there = None if coarse.place.fixed else (coarse.place.position_lab_mm[k], coarse.place.seen[k])
         poses, _ = follower.next(float(recording.timeline.time_s[k]), frames, there)

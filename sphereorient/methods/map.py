@@ -113,8 +113,8 @@ def first_map_of(
             ratio, height = focal_ratio(found), camera.image_size[1]
             given, seen = (field_of_focal(height, float(camera.f_px) * one) for one in (1.0, ratio))
             if ratio != 1.0:
-                told = f"the pictures tell a vertical field of view of about {seen:.3g} degrees, not {given:.3g}"
-                remarks.append(f"{name}: {told}: turns and heading are wrong by it; correct vfov_deg, and learn again")
+                wrong = f"the pictures tell a vertical field of view of about {seen:.3g} degrees, not {given:.3g}"
+                remarks.append(f"{name}: {wrong}: turns and heading are wrong by it; correct vfov_deg, and learn again")
         return found.texture(), remarks
 
 

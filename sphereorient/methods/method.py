@@ -79,26 +79,26 @@ class Learnt:
 
     @classmethod
     def of(
-        cls, study: Appearance, process: ProcessNoise | None = None, acceleration_rad_s2: float | None = None
+        cls, appearance: Appearance, process: ProcessNoise | None = None, acceleration_rad_s2: float | None = None
     ) -> "Learnt":
         """Return what was learnt before the first frame was measured, and the motion of the finished track."""
-        fitter = study.fitter
-        told = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
+        fitter = appearance.fitter
+        finite = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
         return cls(
             scenes={view.name: view.scene for view in fitter.views},
             light=fitter.light,
             limb_px=fitter.limb_px,
-            lasting=study.lasting,
+            lasting=appearance.lasting,
             blur_px=fitter.optics.blur_px,
             limb_blur_px=fitter.optics.limb_blur_px,
-            still_blur_px=study.still.optics.blur_px,
-            still_limb_blur_px=study.still.optics.limb_blur_px,
+            still_blur_px=appearance.still.optics.blur_px,
+            still_limb_blur_px=appearance.still.optics.limb_blur_px,
             instants=fitter.instants,
             most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
-            **{name: getattr(study, name) for name in OF_APPEARANCE},
+            **{name: getattr(appearance, name) for name in OF_APPEARANCE},
             process=process,
-            acceleration_rad_s2=acceleration_rad_s2 if told else None,
+            acceleration_rad_s2=acceleration_rad_s2 if finite else None,
         )
 
     def appearance(self, recording: Recording) -> Appearance:
@@ -126,8 +126,8 @@ class Learnt:
         if self.instants > 1:
             optics = Optics(paint, self.blur_px, widest, self.limb_blur_px)
             fitter = replace(still, optics=optics, instants=self.instants)
-        told = {name: getattr(self, name) for name in OF_APPEARANCE}
-        return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
+        shared = {name: getattr(self, name) for name in OF_APPEARANCE}
+        return Appearance(fitter=fitter, still=still, lasting=self.lasting, **shared)
 
 
 def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:
@@ -174,7 +174,7 @@ class Job:
         return replace(self, recording=self.recording.of(name), given=given)
 
 
-Measured = Mapping[str, list[Poses]]  # of each ball, by name: its poses in the frames of a batch
+Followed = Mapping[str, list[Poses]]  # of each ball, by name: its poses in the frames of a batch
 Joined = tuple[Trajectory, Learnt | None]  # of one ball
 
 
@@ -185,7 +185,7 @@ class Method:
     learn: Callable[[Job, Progress], Follower | None]
     # Instead of learn, with what is known of each ball; None: it learns nothing.
     resume: Callable[[Job, Mapping[str, Learnt]], Follower] | None
-    join: Callable[[Job, Follower | None, Iterable[Measured], Progress], dict[str, Joined]]
+    join: Callable[[Job, Follower | None, Iterable[Followed], Progress], dict[str, Joined]]
 
 
 @contextmanager
@@ -260,11 +260,11 @@ def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
     lasting = Lasting(**{part: torch.from_numpy(file[f"lasting/{part}"][()]) for part in LASTING})
-    told = {name: kind(file.attrs[name]) for name, kind in KINDS.items() if name in file.attrs}
-    told |= {name: torch.from_numpy(file[name][()]) for name in TENSORS if name in file}
+    found = {name: kind(file.attrs[name]) for name, kind in KINDS.items() if name in file.attrs}
+    found |= {name: torch.from_numpy(file[name][()]) for name in TENSORS if name in file}
     process = _process(file["process"]) if "process" in file else None
     return Learnt(
-        scenes=scenes, light=light_of(parts, bool(light.attrs["known"])), lasting=lasting, process=process, **told
+        scenes=scenes, light=light_of(parts, bool(light.attrs["known"])), lasting=lasting, process=process, **found
     )
 
 
@@ -278,7 +278,7 @@ def _process(group: h5py.Group) -> ProcessNoise:
     return ProcessNoise(place=motion("place"), turn=motion("turn"), frame_s=float(group.attrs["frame_s"]))
 
 
-def write_poses(poses: Measured, path: Path) -> None:
+def write_poses(poses: Followed, path: Path) -> None:
     """Write the poses of each ball in one batch as HDF5, atomically; OutputError if the file cannot be written."""
     with whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA_OF_POSES
@@ -292,7 +292,7 @@ def write_poses(poses: Measured, path: Path) -> None:
         file.attrs["sha256"] = digest(file)
 
 
-def read_poses(path: Path) -> Measured | None:
+def read_poses(path: Path) -> Followed | None:
     """Return what `write_poses` wrote; None if the file is not whole."""
     try:
         with h5py.File(path, "r") as file:

@@ -43,7 +43,7 @@ class Paint:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Study:
+class PaintSample:
     """n frames from which the appearance of a paint is estimated."""
 
     first: Initialiser  # of this paint
@@ -107,7 +107,7 @@ def open_paints(job: Job, progress: Progress) -> list[Paint]:
     return paints
 
 
-def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Paint]) -> Iterator[Study]:
+def paint_samples(recording: Recording, refine: RefineSettings, paints: Sequence[Paint]) -> Iterator[PaintSample]:
     """Yield the frames from which the appearance of each paint is estimated.
     Raises ExperimentError: no frame shows a ball that the others mostly leave to all cameras that see it.
     """
@@ -118,7 +118,7 @@ def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Pa
     views = paints[0].first.fitter.views
     frames, places = sample_frames(recording, views, MORE_FRAMES * refine.appearance_frames)
     start = SceneStart(first)
-    found = [start(shots, list(first), {}) for shots in frames]
+    found = [start(frame, list(first), {}) for frame in frames]
     for paint in paints:
         rows = _mostly_seen(paint, first, found)
         # Mixed: light is judged from halves of them, and any half should hold all balls at all times.
@@ -127,7 +127,7 @@ def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Pa
             do = "check the texture and diameter of this ball, and whether it is in view"
             what = f"ball {' or '.join(paint.names)}"
             raise ExperimentError(refusal(what, expected="some frames that show it", got="none", do=do))
-        yield Study(
+        yield PaintSample(
             first=paint.first,
             frames=[frames[k] for k, _ in rows],
             places=[places[k] for k, _ in rows],
@@ -138,22 +138,22 @@ def studies_of(recording: Recording, refine: RefineSettings, paints: Sequence[Pa
         )
 
 
-def _alone(recording: Recording, refine: RefineSettings, paint: Paint) -> Study:
+def _alone(recording: Recording, refine: RefineSettings, paint: Paint) -> PaintSample:
     """Return frames that show an only ball; where no blur is given, the search is for the blur that they have."""
     first = replace(paint.first, score_min=UNPROVEN, known={})
     assert first.known is not None
     views = first.fitter.views
     frames, places = frames_showing(recording, views, refine.appearance_frames, first.disks)
-    shown = {id(shot.picture) for shots in frames for shot in shots}
+    shown = {id(shot.picture) for frame in frames for shot in frame}
     first = replace(first, known={key: one for key, one in first.known.items() if key[0] in shown})
     if refine.blur_px is None:
-        pairs = (pair for shots in frames for pair in zip(shots, first.disks(shots), strict=True))
+        pairs = (pair for frame in frames for pair in zip(frame, first.disks(frame), strict=True))
         blur_px = estimate_blur_px((shot.picture, disk) for shot, disk in pairs if disk is not None)
         # Only blurred pictures need blurred templates; sharp ones share one first guess.
         if defocus_radii(blur_px, paint.search.diameter_px):
             fitter = first_fitter(views, first.fitter.radius_mm, paint.base, blur_px)
             first = paint.search.start(fitter, blur_px, score_min=UNPROVEN, known=first.known)
-    return Study(first=first, frames=frames, places=places)
+    return PaintSample(first=first, frames=frames, places=places)
 
 
 def _mostly_seen(
@@ -176,13 +176,13 @@ def _mostly_seen(
     return rows
 
 
-def following(recording: Recording, study: Study, exposure_s: float) -> Following | None:
+def following(recording: Recording, sample: PaintSample, exposure_s: float) -> Following | None:
     """Return the frames beside those studied, that tell the motion in the exposure, s; None where that is unknown."""
-    clock, places = recording.clock, study.places
+    clock, places = recording.clock, sample.places
     if not exposure_s > 0 or len(clock) < 2:
         return None
     beside = [place + 1 if place + 1 < len(clock) else place - 1 for place in places]
     return Following(
-        shots=lambda rows: frames_at(recording, study.first.fitter.views, [beside[k] for k in rows]),
+        frames=lambda rows: frames_at(recording, sample.first.fitter.views, [beside[k] for k in rows]),
         open_share=exposure_s / (clock[beside] - clock[places]),
     )

@@ -19,7 +19,7 @@ from sphereorient.files.threads import Progress
 from sphereorient.follow.follower import Follower
 from sphereorient.locate import Sightings
 from sphereorient.methods import results
-from sphereorient.methods.method import Job, Joined, Measured, Method
+from sphereorient.methods.method import Followed, Job, Joined, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
 from sphereorient.search import Candidates, Proposer, crop_disk
@@ -27,11 +27,13 @@ from sphereorient.search import Candidates, Proposer, crop_disk
 CHUNK = 64  # frames held at once; a result does not depend on it
 
 
-def learn(job: Job, progress: Progress) -> None:
+def _learn(job: Job, progress: Progress) -> None:
     """Learn nothing: the stages look at the whole movie."""
 
 
-def track(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
+def track_paper(
+    job: Job, follower: Follower | None, measured: Iterable[Followed], progress: Progress
+) -> dict[str, Joined]:
     """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are not used."""
     settings = job.settings
     grid, place = job.recording.gridded()
@@ -122,4 +124,4 @@ def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Cand
     return replace(proposals, R_lab_view=camera.R_cam_lab.mT @ R_cam_view(direction_cam))
 
 
-PAPER = Method(learn=learn, resume=None, join=track)
+PAPER = Method(learn=_learn, resume=None, join=track_paper)

@@ -19,8 +19,8 @@ from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
 from sphereorient.follow.tracker import Tracker
 from sphereorient.methods import results
-from sphereorient.methods.method import Job, Joined, Learnt, Measured, Method
-from sphereorient.methods.paint import alike, following, open_paints, studies_of
+from sphereorient.methods.method import Followed, Job, Joined, Learnt, Method
+from sphereorient.methods.paint import alike, following, open_paints, paint_samples
 from sphereorient.methods.proposers import BlurMatchedSearch
 from sphereorient.pose.poses import PoseTable, exchanged, pose_tables
 from sphereorient.trajectory import Trajectory
@@ -35,9 +35,9 @@ def learn(job: Job, progress: Progress) -> Follower:
     paints = open_paints(job, progress)
     progress("appearance", 0, 1)
     appearances: dict[str, Appearance] = {}
-    for paint, study in zip(paints, studies_of(recording, refine, paints), strict=True):
-        beside = following(recording, study, exposure_s)
-        one = estimate_appearance(study.first, study.frames, paint.base, refine, beside, study.among)
+    for paint, sample in zip(paints, paint_samples(recording, refine, paints), strict=True):
+        beside = following(recording, sample, exposure_s)
+        one = estimate_appearance(sample.first, sample.frames, paint.base, refine, beside, sample.among)
         appearances |= dict.fromkeys(paint.names, one)
     progress("appearance", 1, 1)
     searches = {name: paint.search for paint in paints for name in paint.names}
@@ -89,7 +89,7 @@ def exposure_of(job: Job) -> float:
     return 0.0 if job.settings.refine.blur_px is not None else job.recording.experiment.exposure_s or 0.0
 
 
-def join(job: Job, follower: Follower | None, measured: Iterable[Measured], progress: Progress) -> dict[str, Joined]:
+def join(job: Job, follower: Follower | None, measured: Iterable[Followed], progress: Progress) -> dict[str, Joined]:
     """Choose each ball's path through all frames' candidates and smooth it; return its track and what was learnt.
     Balls of one paint keep their names over the movie.
     """
@@ -99,12 +99,12 @@ def join(job: Job, follower: Follower | None, measured: Iterable[Measured], prog
     for names in alike(job.recording):
         own, sure = _named([tables[name] for name in names], job, follower)
         for name, table, certain in zip(names, own, sure, strict=True):
-            track, learnt = joined(job.of(name), follower.appearances[name], table)
+            track, learnt = join_ball(job.of(name), follower.appearances[name], table)
             found[name] = results.with_identity(track, certain), learnt
     return {name: found[name] for name in follower.appearances}
 
 
-def joined(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Trajectory, Learnt]:
+def join_ball(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Trajectory, Learnt]:
     """Join the poses of one ball, as `join`."""
     clock, settings = job.recording.clock, job.settings
     given = None if job.given is None else job.given[job.recording.experiment.sphere.name]

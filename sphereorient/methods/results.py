@@ -107,12 +107,12 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     """Collect one camera's results at the chosen poses; `place`: its index in the fit, `picked`: `PoseTable.rows`."""
     view = learnt.fitter.views[place]
     frames = len(table)
-    tells = torch.tensor([why[place] in (Reason.OK, Reason.CONTRADICTS) for why in table.reason], dtype=torch.bool)
+    usable = torch.tensor([why[place] in (Reason.OK, Reason.CONTRADICTS) for why in table.reason], dtype=torch.bool)
     position, R = picked["position_lab_mm"] + picked["own_move"][:, place], picked["R_lab_body"]
-    position = torch.where(tells[:, None], position, picked["position_lab_mm"])
+    position = torch.where(usable[:, None], position, picked["position_lab_mm"])
     centre_px, radius_px = view.camera.project(position), view.radius_px(position, learnt.fitter.radius_mm)
     counts = table.mask.sum(-1)
-    shown = tells & torch.isfinite(position[:, 0])
+    shown = usable & torch.isfinite(position[:, 0])
     where = shown[:, None, None]
     reason = [
         Reason.LOW_SCORE if why[place] is Reason.OK and not shown[k] else why[place]
@@ -178,17 +178,17 @@ def precise_track(
     # What all other frames say is far from it.
     flags = flags | torch.where(smoothed.rejected, int(Flag.DOUBTFUL_FIT), 0)
     noticed = ((learnt.second_ball, TWO_BALLS), (learnt.sharper, SHARPER))
-    told: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
+    provenance: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
     responses = {view.name: view.response or LINEAR for view in learnt.fitter.views}
-    told["response"] = ", ".join(f"{name} {found}" for name, found in responses.items())
-    told["remarks"] += [
+    provenance["response"] = ", ".join(f"{name} {found}" for name, found in responses.items())
+    provenance["remarks"] += [
         CODED.format(name=name, found=found)
         for name, found in responses.items()
         if name not in experiment.response and not found.linear
     ]
     if learnt.worn is not None:
-        told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
-        told[UNUSED_PAINT] = worn_text(learnt.worn)
+        provenance["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
+        provenance[UNUSED_PAINT] = worn_text(learnt.worn)
     return replace(
         track,
         position=track.position - move_mm.numpy(),
@@ -198,7 +198,7 @@ def precise_track(
         **datasets_of(smoothed, experiment.length_unit),
         segment=chosen.segment.numpy(),
         flags=track.flags | flags.numpy().astype(np.uint32),
-        provenance=told,
+        provenance=provenance,
         confidence=chosen.probability.numpy(),
     )
 
@@ -251,7 +251,7 @@ def with_identity(track: Trajectory, certain: NDArray[np.float64]) -> Trajectory
 
 def missed_text(track: Trajectory) -> list[str]:
     """Return remarks on cameras that measure the sphere in none of their frames, one for all that miss it alike."""
-    told: dict[str, list[str]] = {}
+    cameras_of: dict[str, list[str]] = {}
     for name, lost in track.summary()["lost"].items():
         pictures = len(track) - lost.pop(Reason.MISSING, 0)
         usual = next(iter(lost), None)
@@ -263,8 +263,8 @@ def missed_text(track: Trajectory) -> list[str]:
         if usual == Reason.LOW_SCORE:
             text = f"no pose of the map explains any of {pictures} frames looked at"
             text += "" if track.valid.any() else f"; {LOOK_ALIKE}"
-        told.setdefault(text, []).append(name)
-    return [f"{', '.join(names)}: {text}" for text, names in told.items()]
+        cameras_of.setdefault(text, []).append(name)
+    return [f"{', '.join(names)}: {text}" for text, names in cameras_of.items()]
 
 
 def map_track(

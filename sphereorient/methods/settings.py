@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.yaml_file import assigned, flow, read_yaml, validated
+from sphereorient.files.yaml_file import flow, parse_override, read_yaml, validated
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.mapping.settings import MapSettings
@@ -168,7 +168,7 @@ def _depths(model: Any) -> set[int]:
 
 def _override(tree: dict[str, Any], text: str, depths: set[int]) -> None:
     """Put `key=value` into a tree; the key begins with its room if there are rooms."""
-    key, value = assigned(text)
+    key, value = parse_override(text)
     *rooms, leaf = key.split(".")
     if len(rooms) + 1 not in depths:
         expected = "key=value" if depths == {1} else "room.key=value"

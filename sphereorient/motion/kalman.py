@@ -137,7 +137,7 @@ def run_filter(chain: StateSpace) -> Filtered:
         "innovation": np.zeros((count, 3)),
         "inverse": np.zeros((count, 3, 3)),
     }
-    code = library()
+    code = kalman_library()
     if code is not None:
         sums = np.zeros(2)
         _run(code, "kalman_filter", chain, **found, sums=sums)
@@ -206,7 +206,7 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
     count, size = filtered.state.shape
     state, mahalanobis = filtered.state.copy(), np.zeros(count)
     covariance = np.empty((count, len(wanted), len(wanted)))
-    code = library()
+    code = kalman_library()
     if code is not None:
         given = {key: array for key, array in vars(filtered).items() if isinstance(array, np.ndarray)}
         found = {"smoothed": state, "spread": covariance, "mahalanobis": mahalanobis}
@@ -239,7 +239,7 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
     return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)
 
 
-def library() -> ctypes.CDLL | None:
+def kalman_library() -> ctypes.CDLL | None:
     """Return the compiled recursions; None where there are none."""
     return compiled(SOURCE, _Chain)
 

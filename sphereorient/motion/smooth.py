@@ -115,14 +115,14 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         rejected[rows] |= at.rejected
     if coupling is not None:
         off, path_cov = out["position_lab_mm"] - X, out["position_cov_mm2"]
-        told = np.flatnonzero(seen_X & seen_R & ~rejected & np.isfinite(off).all(1))
-        told = told[mahalanobis2(off[told], X_cov[told]) < ON_PATH**2]
+        posed = np.flatnonzero(seen_X & seen_R & ~rejected & np.isfinite(off).all(1))
+        posed = posed[mahalanobis2(off[posed], X_cov[posed]) < ON_PATH**2]
         # Paint that shifts in the picture is a turn or a move of the sphere; the limb alone tells them apart, and the
         # path knows the move better than the limb of one frame.
-        gain = coupling[told] @ np.linalg.inv(X_cov[told])
-        R[told] = rotation_of((gain @ off[told, :, None])[..., 0]) @ R[told]
-        R_cov[told] -= gain @ coupling[told].mT
-        by_path[told] = gain @ path_cov[told] @ gain.mT
+        gain = coupling[posed] @ np.linalg.inv(X_cov[posed])
+        R[posed] = rotation_of((gain @ off[posed, :, None])[..., 0]) @ R[posed]
+        R_cov[posed] -= gain @ coupling[posed].mT
+        by_path[posed] = gain @ path_cov[posed] @ gain.mT
     poses = R, R_cov, seen_R
     found, orientation_scale, turn = _estimates(RotationTrack, poses, segments, bands[1], settings, prior[1])
     for rows, at in found:

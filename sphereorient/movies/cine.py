@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.files.picture import luma
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, refused
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, movie_error
 
 FILE_HEADER = struct.Struct("<2s3HiIiI3IQ")
 BITMAP_HEADER = struct.Struct("<IiiHHIIiiII")
@@ -24,7 +24,7 @@ FIRST = 64  # images that determine the usual size
 JPEG, FILTER_ARRAY = 1, 2  # values of `compression`
 PREFIX = 8  # bytes before the pixels at least: size of the annotation, size of the image
 COPY_AGAIN, EXPORT_AGAIN = "copy it from the camera again", "export it again; its header is damaged"
-Rows = NDArray[np.uint8]  # (H, stride), as stored
+_Rows = NDArray[np.uint8]  # (H, stride), as stored
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class CineMovie(Movie):
         found = Counter(_prefix_and_size(content, int(offset)) for offset in self._offsets[:FIRST])
         found.pop((0, 0), None)
         if not found:
-            raise refused(path, "at least one whole image", "none", COPY_AGAIN)
+            raise movie_error(path, "at least one whole image", "none", COPY_AGAIN)
         (prefix, self._image_size), _ = found.most_common(1)[0]
         self._stride, rest = divmod(self._image_size, height)  # rows may be padded
         least = -(-width * layout.bits // 8)
         if rest or self._stride < least:
             expected = f"images of {height} rows of at least {least} bytes"
-            raise refused(path, expected, f"{self._image_size} bytes", EXPORT_AGAIN)
+            raise movie_error(path, expected, f"{self._image_size} bytes", EXPORT_AGAIN)
         there = np.flatnonzero((self._offsets > 0) & (self._offsets <= len(content) - prefix - self._image_size))
         count = int(there[-1]) + 1  # one at least is whole
         used = f" ({self._real_bits} of them used)" if 0 < self._real_bits < layout.bits else ""
@@ -70,10 +70,10 @@ class CineMovie(Movie):
             )
             if kind != b"CI" or header_size < FILE_HEADER.size:
                 do = "name a movie of a Phantom camera"
-                raise refused(path, "a .cine file, which begins with CI", f"{kind!r}", do)
+                raise movie_error(path, "a .cine file, which begins with CI", f"{kind!r}", do)
             _, width, height, _, bits, packing, *_ = _unpack(path, file, at_bitmap, BITMAP_HEADER)
             if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-                raise refused(path, "the size of a picture", f"{width} x {height}", EXPORT_AGAIN)
+                raise movie_error(path, "the size of a picture", f"{width} x {height}", EXPORT_AGAIN)
             rate_16, mark, length = _unpack(path, file, at_setup, SETUP_START)
             if mark != b"ST":  # older than any version whose fields are known
                 length = 0
@@ -149,7 +149,7 @@ def _unpack(path: Path, file: BinaryIO, at: int, layout: struct.Struct) -> tuple
     file.seek(at)
     content = file.read(layout.size)
     if len(content) < layout.size:
-        raise refused(path, "a .cine file with its header", "a cut off or empty one", COPY_AGAIN)
+        raise movie_error(path, "a .cine file with its header", "a cut off or empty one", COPY_AGAIN)
     return layout.unpack(content)
 
 
@@ -173,19 +173,19 @@ def _read_times(file: BinaryIO, at: int, end: int, trigger: int) -> NDArray[np.f
 def _layout(path: Path, compression: int, packing: int, bits: int) -> _Layout:
     if compression == FILTER_ARRAY:
         do = "export it from the camera's software as interpolated colour or grey"
-        raise refused(path, "grey or colour pixels", "raw colours of a filter array, one a pixel", do)
+        raise movie_error(path, "grey or colour pixels", "raw colours of a filter array, one a pixel", do)
     if compression == JPEG:
         do = "export it uncompressed from the camera's software"
-        raise refused(path, "uncompressed or packed images", "JPEG in .cine, which cannot be decoded", do)
+        raise movie_error(path, "uncompressed or packed images", "JPEG in .cine, which cannot be decoded", do)
     layout = LAYOUTS.get((packing, bits))
     if layout is None or compression != 0:
         got = f"{bits} bit, compression {compression}, packing {packing}"
         do = "export it uncompressed from the camera's software, or as grey .avi"
-        raise refused(path, "8 or 16 bit grey, colour, or packed 10 or 12 bit", got, do)
+        raise movie_error(path, "8 or 16 bit grey, colour, or packed 10 or 12 bit", got, do)
     return layout
 
 
-def _grey(rows: Rows, width: int, layout: _Layout) -> NDArray[Any]:
+def _grey(rows: _Rows, width: int, layout: _Layout) -> NDArray[Any]:
     """Return the grey values (H, W) of an image's rows."""
     if layout.packed:  # without gaps, the most significant bits first; each pixel lies in two bytes
         first, offset = np.divmod(layout.bits * np.arange(width), 8)

@@ -11,7 +11,7 @@ import numpy as np
 from sphereorient.errors import error_words
 from sphereorient.files.hdf5 import DAMAGE
 from sphereorient.files.whole_file import LARGEST_RATIO
-from sphereorient.movies.movie import MOST_MISSING, Grey, Movie, flipped, grey_shape, refused
+from sphereorient.movies.movie import MOST_MISSING, Grey, Movie, flipped, grey_shape, movie_error
 from sphereorient.movies.stamps import UNITS, Stamps, unit_in
 
 KIND = "data set (N, H, W) of uint8 or uint16"
@@ -39,7 +39,7 @@ class Hdf5Movie(Movie):
             self._block = 1 if data.chunks is None else data.chunks[0]  # frames in one chunk
             count, self._blocks = _written(path, data, self._file.stat().st_size)
             if count < 1:
-                raise refused(path, "frames", f"{stated} of which none was written", "record it again")
+                raise movie_error(path, "frames", f"{stated} of which none was written", "record it again")
             self.times_s, self.times_unit, remarks = _times(data, stated, count)
             form = f"HDF5, data set {data.name} {data.shape}" + (f", {data.compression}" if data.compression else "")
             super().__init__(path, form, count, (height, width), data.dtype.newbyteorder("="))
@@ -90,7 +90,7 @@ def _opened(path: Path, file: Path) -> Iterator[Any]:
             yield opened
     except DAMAGE as error:
         do = "save it in MATLAB with '-v7.3'" if file.suffix.lower() == ".mat" else "copy or record it again"
-        raise refused(path, "an HDF5 file that is whole", error_words(error), do) from error
+        raise movie_error(path, "an HDF5 file that is whole", error_words(error), do) from error
 
 
 def _data_set(path: Path, file: Any, name: str) -> Any:
@@ -102,20 +102,20 @@ def _data_set(path: Path, file: Any, name: str) -> Any:
         if len(names) != 1:
             others = [f"{_shown(one)} {file[one].shape} of {file[one].dtype}" for one in _data_sets(file)[:SHOWN]]
             got = ", ".join([_shown(one) for one in names[:SHOWN]] or others) or "none"
-            raise refused(path, f"one {KIND}", got, NAME_ONE if names else AS_MOVIE)
+            raise movie_error(path, f"one {KIND}", got, NAME_ONE if names else AS_MOVIE)
         data = file[names[0]]
     if not _is_movie(data):
         got = f"{data.shape} of {data.dtype}" if isinstance(data, h5py.Dataset) else "a group"
-        raise refused(path, f"a {KIND}", got, NAME_ONE if _candidates(file) else AS_MOVIE)
+        raise movie_error(path, f"a {KIND}", got, NAME_ONE if _candidates(file) else AS_MOVIE)
     if data.external or data.is_virtual:
         got, do = "one that lies in other files", "copy the pictures into this file"
-        raise refused(path, "a data set in the file itself", got, do)
+        raise movie_error(path, "a data set in the file itself", got, do)
     plist = data.id.get_create_plist()
     filters = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
     unknown = [code for code in filters if not h5py.h5z.filter_avail(code)]
     if unknown:
         do = "write it with gzip, lzf or without compression"
-        raise refused(path, "a compression that HDF5 has", f"filter {unknown[0]}", do)
+        raise movie_error(path, "a compression that HDF5 has", f"filter {unknown[0]}", do)
     return data
 
 
@@ -126,10 +126,10 @@ def _follow(path: Path, file: Any, name: str) -> Any:
         link = here.get(part, getlink=True) if isinstance(here, h5py.Group) and part else None
         if link is None:
             known = ", ".join(map(_shown, _candidates(file)[:5])) or "no data set (N, H, W)"
-            raise refused(path, "a data set that the file has", f"'{name}'", f"name one of: {known}")
+            raise movie_error(path, "a data set that the file has", f"'{name}'", f"name one of: {known}")
         if not isinstance(link, h5py.HardLink):
             do = "name the data set itself, copied into this file"
-            raise refused(path, "a data set in the file itself", f"a link, '{part}'", do)
+            raise movie_error(path, "a data set in the file itself", f"a link, '{part}'", do)
         here = here[part]
     return here
 
@@ -164,7 +164,7 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
     stated, *frame_shape = (int(size) for size in data.shape)
     frame_bytes = math.prod(frame_shape) * data.dtype.itemsize
     if frame_bytes > LARGEST_RATIO * file_bytes:
-        raise refused(path, "frames that the file can hold", f"{frame_shape} px", "record it again")
+        raise movie_error(path, "frames that the file can hold", f"{frame_shape} px", "record it again")
     if data.chunks is None:
         stored = min(data.id.get_storage_size(), file_bytes)
         return min(stated, stored // frame_bytes), None
@@ -181,7 +181,7 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
     whole = frozenset(place for place, count in there.items() if count == tiles)
     count = min(stated, (max(whole, default=-1) + 1) * block)
     if count > MOST_MISSING * (len(whole) + 1) * block:
-        raise refused(path, "frames", f"{len(whole) * block} among {count} that were never written", "record it again")
+        raise movie_error(path, "frames", f"{len(whole) * block} of {count} that were never written", "record it again")
     return count, whole
 
 

@@ -37,7 +37,7 @@ class Movie:
     def __init__(self, path: Path, form: str, count: int, frame_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         if math.prod(frame_shape) > MOST_PIXELS:
             expected, got = (f"{pixels / 1e6:.3g} million pixels" for pixels in (MOST_PIXELS, math.prod(frame_shape)))
-            raise refused(path, f"at most {expected} a frame", got, "cut out the part where the ball is")
+            raise movie_error(path, f"at most {expected} a frame", got, "cut out the part where the ball is")
         self.path, self.format, self._count = path, form, count
         self.frame_shape, self.dtype = frame_shape, dtype
 
@@ -81,7 +81,7 @@ class Movie:
         asked = [int(index) for index in indices]
         outside = [index for index in asked if not 0 <= index < len(self)]
         if outside:
-            raise refused(self.path, f"frames within 0 .. {len(self) - 1}", str(outside[0]), OTHERS)
+            raise movie_error(self.path, f"frames within 0 .. {len(self) - 1}", str(outside[0]), OTHERS)
         order = sorted(set(asked))
         pictures = np.empty((len(order), *self.frame_shape), self.dtype)
         for place, picture in enumerate(self._read(order)):
@@ -91,12 +91,12 @@ class Movie:
     def _range(self, first: int, last: int | None) -> range:
         last = len(self) if last is None else last
         if not 0 <= first <= last <= len(self):
-            raise refused(self.path, f"frames within 0 .. {len(self)}", f"{first} .. {last}", OTHERS)
+            raise movie_error(self.path, f"frames within 0 .. {len(self)}", f"{first} .. {last}", OTHERS)
         return range(first, last)
 
     def _damage(self, number: int, got: str) -> MovieError:
         do = "export the movie again, or leave the frame out with frames: in the experiment"
-        return refused(f"{self.path}, frame {number}", "a decodable picture", got, do)
+        return movie_error(f"{self.path}, frame {number}", "a decodable picture", got, do)
 
     def _truncated(self, stated: int) -> tuple[str, ...]:
         """Return the remark on a movie whose header states more frames than the file holds."""
@@ -134,7 +134,7 @@ def flipped(movie: Movie, how: str) -> Movie:
     (rows become columns, as in files written by MATLAB).
     """
     if how not in FLIPS:
-        raise refused(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
+        raise movie_error(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
     return movie if how == "none" else FlippedMovie(movie, how)
 
 
@@ -168,6 +168,6 @@ def mapped(
         yield number, values
 
 
-def refused(name: object, expected: str, got: str, do: str) -> MovieError:
+def movie_error(name: object, expected: str, got: str, do: str) -> MovieError:
     """Return the MovieError about a movie file, or a thing in it."""
     return MovieError(refusal(str(name), expected=expected, got=got, do=do))

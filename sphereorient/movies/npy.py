@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import error_words
-from sphereorient.movies.movie import Grey, Movie, grey_shape, mapped, refused
+from sphereorient.movies.movie import Grey, Movie, grey_shape, mapped, movie_error
 
 # numpy parses a header as a Python literal, and old ones as its tokens.
 DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)
@@ -23,11 +23,11 @@ class NpyMovie(Movie):
         sizes = grey_shape(shape)
         if sizes is None or self._stored.kind != "u" or self._stored.itemsize > 2:
             expected, got = "an array (N, H, W) of uint8 or uint16, not empty", f"{shape} of {self._stored}"
-            raise refused(path, expected, got, "save grey frames along the first axis, one channel")
+            raise movie_error(path, expected, got, "save grey frames along the first axis, one channel")
         frame_bytes = math.prod(sizes[1:]) * self._stored.itemsize
         count = min(sizes[0], (path.stat().st_size - self._offset) // frame_bytes)
         if count < 1:
-            raise refused(path, "at least one whole frame", "a cut off file", SAVE_AGAIN)
+            raise movie_error(path, "at least one whole frame", "a cut off file", SAVE_AGAIN)
         super().__init__(path, "numpy array", count, sizes[1:], self._stored.newbyteorder("="))
         self.remarks = self._truncated(sizes[0])
 
@@ -46,8 +46,8 @@ def _header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
         except DAMAGE as error:
             file.seek(0)
             if file.read(2) == ZIP:
-                raise refused(path, "one .npy array", "an archive of arrays", SAVE_AGAIN) from error
-            raise refused(path, "a .npy array without objects", error_words(error), SAVE_AGAIN) from error
+                raise movie_error(path, "one .npy array", "an archive of arrays", SAVE_AGAIN) from error
+            raise movie_error(path, "a .npy array without objects", error_words(error), SAVE_AGAIN) from error
         if fortran_order and len(shape) > 1:
-            raise refused(path, "an array (N, H, W), in rows", "columns first", "save numpy.ascontiguousarray of it")
+            raise movie_error(path, "an array (N, H, W), in rows", "columns first", "save np.ascontiguousarray of it")
         return tuple(int(size) for size in shape), dtype, file.tell()  # a header may say True

@@ -3,7 +3,7 @@ from pathlib import Path
 
 from sphereorient.movies.cine import CineMovie
 from sphereorient.movies.hdf5 import hdf5_movie, split_path
-from sphereorient.movies.movie import Movie, refused
+from sphereorient.movies.movie import Movie, movie_error
 from sphereorient.movies.npy import NpyMovie
 from sphereorient.movies.sequence import PICTURES, SequenceMovie, is_pattern, sequence_files
 from sphereorient.movies.tiff import TiffMovie
@@ -38,13 +38,13 @@ def open_movie(path: Path | str) -> Movie:
         return SequenceMovie(path)
     file = split_path(path)[0]
     if not _is(file, Path.is_file):
-        raise refused(path, "a movie file", "no such file", "correct the path")
+        raise movie_error(path, "a movie file", "no such file", "correct the path")
     suffix = file.suffix.lower()
     reader = READERS.get(suffix, SequenceMovie if suffix in PICTURES else None)
     if reader is None:
         expected = f"a movie of type {' '.join(READERS)} or a folder of pictures"
         do = CONVERT.get(suffix, LOSSLESS.format(suffix)).replace("FILE", file.stem)
-        raise refused(path, expected, f"'{path.suffix}'", do)
+        raise movie_error(path, expected, f"'{path.suffix}'", do)
     return reader(path)
 
 

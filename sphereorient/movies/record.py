@@ -30,12 +30,12 @@ _Ring = tuple[Any, Any, tuple[int, int], "np.dtype[Any]"]
 
 class Recorder:
     """Records frames, alike those of a movie, and their times in a process of its own. The new movie, .mkv or .h5, gets
-    its name once it is whole, also after a kill of this process. `tell` gets a line where frames begin to be lost, and
+    its name once it is whole, also after a kill of this process. `log` gets a line where frames begin to be lost, and
     where the file takes no more: then nothing more is recorded. `wait`: for room, instead of losing frames.
     """
 
     def __init__(
-        self, path: Path, like: Movie, frame_s: float, tell: Callable[[str], object], *, wait: bool = False
+        self, path: Path, like: Movie, frame_s: float, log: Callable[[str], object], *, wait: bool = False
     ) -> None:
         spawn, (height, width), dtype = multiprocessing.get_context("spawn"), like.frame_shape, like.dtype
         size = height * width * dtype.itemsize
@@ -44,7 +44,7 @@ class Recorder:
             spawn.RawValue("Q"),
         )
         self._frames = np.frombuffer(memory, dtype).reshape(-1, height, width)
-        self._path, self._tell, self._wait = path, tell, wait
+        self._path, self._log, self._wait = path, log, wait
         self._sent = self._lost = 0
         self._ended = False
         stamps, self._stamps = spawn.Pipe(duplex=False)
@@ -63,12 +63,12 @@ class Recorder:
         with suppress(EOFError, OSError):
             while True:
                 if line := self._lines.recv_bytes().decode():
-                    self._tell(line)
+                    self._log(line)
         self._ended = True
         self._process.join()
         if code := self._process.exitcode:
             got, do = f"its end ({code})", "begin again; tracking goes on without it"
-            self._tell(refusal(str(self._path), expected="a process that records", got=got, do=do))
+            self._log(refusal(str(self._path), expected="a process that records", got=got, do=do))
 
     def room(self) -> bool:
         """Return whether there is room for a frame, or it is not recorded any more."""
@@ -82,7 +82,7 @@ class Recorder:
         """Take a frame, black for None, where there is room, or count it as lost."""
         if not room:
             if not self._lost:
-                self._tell(f"{self._path}: frames are lost: they come faster than they are written.")
+                self._log(f"{self._path}: frames are lost: they come faster than they are written.")
             self._lost += 1
             return
         self._frames[self._sent % len(self._frames)] = 0 if picture is None else picture

@@ -12,7 +12,7 @@ import numpy as np
 from sphereorient.errors import MovieError
 from sphereorient.files.picture import claimed_pixels, decoded, luma
 from sphereorient.files.whole_file import LARGEST_RATIO
-from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, MOST_MISSING, MOST_PIXELS, Grey, Movie, refused
+from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, MOST_MISSING, MOST_PIXELS, Grey, Movie, movie_error
 from sphereorient.movies.tiff import TiffMovie
 
 TIFF = (".tif", ".tiff")
@@ -35,7 +35,7 @@ class SequenceMovie(Movie):
         count = (numbers[-1] - numbers[0]) // step + 1
         if count > MOST_MISSING * (len(numbers) + 1):
             got = f"{len(numbers)} with numbers from {numbers[0]} to {numbers[-1]}"
-            raise refused(path, "pictures numbered by frame", got, "number them by frame")
+            raise movie_error(path, "pictures numbered by frame", got, "number them by frame")
         self._files = {(number - numbers[0]) // step: numbered[number] for number in numbers}
         picture, colour = _usual_picture(path, list(self._files.values()))
         suffix = self._files[0].suffix.lower()
@@ -71,7 +71,7 @@ def sequence_files(path: Path) -> list[Path]:
     """Return the pictures of a folder or pattern, sorted by name; MovieError without any."""
     folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
     if not folder.is_dir():
-        raise refused(path, "a folder", "no such folder", "correct the path")
+        raise movie_error(path, "a folder", "no such folder", "correct the path")
     pieces = [piece for piece in WILD.split(pattern) if piece]
     fits = re.compile("".join(r"\d+" if p[0] == "%" else ".*" if p == "*" else re.escape(p) for p in pieces))
     files = sorted(
@@ -80,7 +80,7 @@ def sequence_files(path: Path) -> list[Path]:
         if file.suffix.lower() in PICTURES and fits.fullmatch(file.name) and not file.name.startswith(".")
     )
     if not files:
-        raise refused(path, f"pictures ({' '.join(PICTURES)})", "none", "correct the folder or the pattern")
+        raise movie_error(path, f"pictures ({' '.join(PICTURES)})", "none", "correct the folder or the pattern")
     return files
 
 
@@ -91,15 +91,15 @@ def _numbered(path: Path, files: list[Path]) -> dict[int, Path]:
     do = "choose one movie's pictures by a pattern, such as cam1_*.tif"
     other = next((file for file, word in zip(files, words, strict=True) if word != words[0]), None)
     if other is not None:
-        raise refused(path, "names alike but for a number", f"{files[0].name} beside {other.name}", do)
+        raise movie_error(path, "names alike but for a number", f"{files[0].name} beside {other.name}", do)
     numbers = [name[1::2] for name in names]
     varying = [place for place, column in enumerate(zip(*numbers, strict=True)) if len(set(map(int, column))) > 1]
     if len(files) > 1 and len(varying) != 1:
-        raise refused(path, "names alike but for one number", f"{files[0].name} .. {files[-1].name}", do)
+        raise movie_error(path, "names alike but for one number", f"{files[0].name} .. {files[-1].name}", do)
     place = varying[0] if varying else 0
     numbered = {int(number[place]) if number else 0: file for number, file in zip(numbers, files, strict=True)}
     if len(numbered) < len(files):
-        raise refused(path, "one picture of each number", f"{len(files) - len(numbered)} numbers twice", do)
+        raise movie_error(path, "one picture of each number", f"{len(files) - len(numbered)} numbers twice", do)
     return numbered
 
 
@@ -115,7 +115,7 @@ def _usual_picture(path: Path, files: list[Path]) -> tuple[Grey, bool]:
         if len(found) == ENOUGH:
             break
     if not found:
-        raise refused(path, "pictures", "none that can be decoded", "export them again") from last
+        raise movie_error(path, "pictures", "none that can be decoded", "export them again") from last
     (shape, dtype), _ = Counter((picture.shape, picture.dtype) for picture, _ in found).most_common(1)[0]
     return next(one for one in found if (one[0].shape, one[0].dtype) == (shape, dtype))
 
@@ -133,27 +133,27 @@ def _number_remarks(numbers: list[int], step: int, count: int) -> Iterator[str]:
 def _read_picture(path: Path) -> tuple[Grey, bool]:
     """Return a picture (H, W), uint8 or uint16, row 0 on top, and whether it was in colour (else MovieError)."""
     if not path.is_file():
-        raise refused(path, "a picture", "no such file", "find it, or record it as missing")
+        raise movie_error(path, "a picture", "no such file", "find it, or record it as missing")
     if path.suffix.lower() in TIFF:
         movie = TiffMovie(path)
         if len(movie) != 1:
-            raise refused(path, "one picture a file", f"{len(movie)} pages", "name the stack itself as the movie")
+            raise movie_error(path, "one picture a file", f"{len(movie)} pages", "name the stack itself as the movie")
         return movie.sample([0])[0], movie.colour
     if path.stat().st_size > LARGEST_BYTES:
-        raise refused(path, "a picture", "a file as large as a movie", "export it again")
+        raise movie_error(path, "a picture", "a file as large as a movie", "export it again")
     content = path.read_bytes()
     claimed = claimed_pixels(content) or 0
     if claimed > MOST_PIXELS:
         expected, do = f"at most {MOST_PIXELS / 1e6:.3g} million pixels", "cut out the part where the ball is"
-        raise refused(path, expected, f"{claimed / 1e6:.3g} million", do)
+        raise movie_error(path, expected, f"{claimed / 1e6:.3g} million", do)
     if claimed > LARGEST_RATIO * len(content):
-        raise refused(path, "a picture", "a header that claims more than the file can hold", "export it again")
+        raise movie_error(path, "a picture", "a header that claims more than the file can hold", "export it again")
     # As stored: neither rotated by the camera's orientation tag nor reduced to 8 bit.
     picture = decoded(content, cv2.IMREAD_UNCHANGED) if claimed else None
     if picture is None:
-        raise refused(path, "a picture", "none that can be decoded", "export it again")
+        raise movie_error(path, "a picture", "none that can be decoded", "export it again")
     if picture.dtype not in (np.uint8, np.uint16):
-        raise refused(path, "8 or 16 bit", str(picture.dtype), "export it as 8 or 16 bit grey")
+        raise movie_error(path, "8 or 16 bit", str(picture.dtype), "export it as 8 or 16 bit grey")
     if picture.ndim == 2:
         return picture, False
     if picture.shape[2] < 3:  # grey with opacity

@@ -16,7 +16,7 @@ from tifffile import TiffFile, TiffFileError
 from sphereorient.errors import error_words
 from sphereorient.files.picture import luma
 from sphereorient.files.whole_file import LARGEST_RATIO
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, refused
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, movie_error
 
 # What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (
@@ -93,7 +93,7 @@ def _opened(path: Path) -> Iterator[TiffFile]:
     try:
         file = TiffFile(path)
     except DAMAGE as error:
-        raise refused(path, "a TIFF file", error_words(error), "export it again") from error
+        raise movie_error(path, "a TIFF file", error_words(error), "export it again") from error
     with file:
         yield file
 
@@ -105,9 +105,9 @@ def _first_page(path: Path, file: TiffFile) -> Any:
         known = page.photometric in (WHITE_IS_ZERO, BLACK_IS_ZERO, RGB) and page.dtype in (np.uint8, np.uint16)
         _check_claim(page)
     except DAMAGE as error:
-        raise refused(path, "a TIFF file with pages", error_words(error), "export it again") from error
+        raise movie_error(path, "a TIFF file with pages", error_words(error), "export it again") from error
     if not known or page.axes not in ("YX", "YXS", "SYX") or (page.photometric == RGB and len(page.shape) != 3):
-        raise refused(path, "grey or RGB pages of 8 or 16 bit", kind, "export it as 8 or 16 bit grey")
+        raise movie_error(path, "grey or RGB pages of 8 or 16 bit", kind, "export it as 8 or 16 bit grey")
     return page
 
 
@@ -125,7 +125,7 @@ def _stated(path: Path, file: TiffFile) -> int:
             files, images = set(re.findall(r'FileName="([^"]*)"', text)), len(re.findall(r"<(?:\w+:)?Pixels\b", text))
             if len(files) > 1 or images > 1:
                 got = f"{images} movies in {max(len(files), 1)} files"
-                raise refused(path, "one movie in the file", got, "export it as one movie in one file")
+                raise movie_error(path, "one movie in the file", got, "export it as one movie in one file")
             sizes = {axis: int(size) for axis, size in re.findall(r'\bSize([CZT])="(\d{1,9})"', text)}
             axes = [sizes["C"] // page.samplesperpixel, sizes["Z"], sizes["T"]]
             stated = int(math.prod(axes))
@@ -142,7 +142,7 @@ def _stated(path: Path, file: TiffFile) -> int:
         return 0  # without metadata the pages count
     if sum(size > 1 for size in axes) > 1:
         got, do = " x ".join(map(str, axes)) + " pictures", "export one channel and one slice as a stack"
-        raise refused(path, "pictures along one axis, time", got, do)
+        raise movie_error(path, "pictures along one axis, time", got, do)
     return stated
 
 
@@ -152,5 +152,5 @@ def _steps(path: Path, page: Any) -> tuple[int, int]:
     steps = STEPS.get(orientation)
     if steps is None:
         got = f"orientation {orientation}"
-        raise refused(path, "pages that are not turned by 90 degrees", got, "export it upright")
+        raise movie_error(path, "pages that are not turned by 90 degrees", got, "export it upright")
     return steps

@@ -16,7 +16,7 @@ import numpy as np
 from sphereorient.errors import MovieError, error_words
 from sphereorient.files.picture import OnDemand, luma
 from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
-from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, Grey, Movie, refused
+from sphereorient.movies.movie import COLOUR_REMARK, GAMMA_CODED, Grey, Movie, movie_error
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 from sphereorient.movies.stamps import Stamps, rate_of, spacing
 
@@ -40,7 +40,7 @@ class VideoMovie(Movie):
         with _opened(path) as container:
             frame = _first_frame(container)
             if frame is None:
-                raise refused(path, "a movie with frames", "no frame", "record or export it again")
+                raise movie_error(path, "a movie with frames", "no frame", "record or export it again")
             check_format(str(path), frame.format)
             self._pixels = frame.format.name
             codec = container.streams.video[0].codec_context
@@ -202,7 +202,7 @@ class VideoMovie(Movie):
             return grey_values(frame)
         expected = f"pictures of one kind, {self.frame_shape} {self._pixels}"
         got, do = f"{(frame.height, frame.width)} {frame.format.name}", "split the movie where it changes"
-        return refused(f"{self.path}, frame {number}", expected, got, do)
+        return movie_error(f"{self.path}, frame {number}", expected, got, do)
 
 
 def _aligned(numbers: Sequence[int], found: Iterable[tuple[int | None, Found]]) -> Iterator[tuple[int, Found | None]]:
@@ -224,14 +224,14 @@ def _opened(path: Path) -> av.container.InputContainer:
         container = av.open(str(path))
     except (av.FFmpegError, OSError, ValueError) as error:
         do = "check that it plays; export it again if not"
-        raise refused(path, "a readable movie", error_words(error), do) from error
+        raise movie_error(path, "a readable movie", error_words(error), do) from error
     if not container.streams.video:
         container.close()
-        raise refused(path, "a movie with pictures", "no video stream", "name the movie's own file")
+        raise movie_error(path, "a movie with pictures", "no video stream", "name the movie's own file")
     context: Any = container.streams.video[0].codec_context  # None for a codec that FFmpeg does not know
     if context is None:
         container.close()
-        raise refused(path, "a movie that FFmpeg decodes", "an unknown codec", "export it as FFV1 in .mkv")
+        raise movie_error(path, "a movie that FFmpeg decodes", "an unknown codec", "export it as FFV1 in .mkv")
     # Slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame.
     context.thread_type, context.thread_count = "SLICE", 2
     context.options = {"err_detect": "crccheck+explode"}
@@ -316,7 +316,7 @@ def check_format(name: str, pixel_format: av.VideoFormat) -> None:
     colour = (pixel_format.is_rgb or pixel_format.has_palette) and not pixel_format.is_bit_stream
     if not (colour or _has_grey_plane(pixel_format)):
         do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
-        raise refused(name, "grey, planar YUV or RGB pixels", pixel_format.name, do)
+        raise movie_error(name, "grey, planar YUV or RGB pixels", pixel_format.name, do)
 
 
 def grey_values(frame: av.VideoFrame) -> Grey:

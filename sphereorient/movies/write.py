@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sphereorient.files.hdf5 import GuardedFile
 from sphereorient.files.whole_file import put_aside, write_text
-from sphereorient.movies.movie import Grey, refused
+from sphereorient.movies.movie import Grey, movie_error
 
 Times = NDArray[np.float64] | Sequence[float]
 WRITERS = (".mkv", ".h5", ".hdf5")
@@ -35,7 +35,7 @@ def write_movie(
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
-        raise refused(path, " ".join(WRITERS), f"'{path.suffix}'", "end its name in one of these")
+        raise movie_error(path, " ".join(WRITERS), f"'{path.suffix}'", "end its name in one of these")
     if path.suffix.lower() != ".mkv":
         with put_aside(path, also=(RuntimeError,)) as aside:
             return _write_hdf5(aside, path, frames, times_s)
@@ -113,10 +113,10 @@ def _checked(path: Path, frames: Iterable[Grey | None]) -> tuple[int, Grey, Iter
         dead += 1
     else:
         got = f"{dead}, none of which is readable" if dead else "none"
-        raise refused(path, "frames to write", got, "pass at least one")
+        raise movie_error(path, "frames to write", got, "pass at least one")
     if picture.ndim != 2 or picture.dtype not in PIXEL_FORMATS:
         expected, got = "frames (H, W) of uint8 or uint16", f"{picture.shape} of {picture.dtype}"
-        raise refused(f"{path}, frame {dead}", expected, got, "convert them")
+        raise movie_error(f"{path}, frame {dead}", expected, got, "convert them")
     return dead, picture, _alike(path, dead, picture, chain([picture], rest))
 
 
@@ -124,5 +124,5 @@ def _alike(path: Path, number: int, first: Grey, frames: Iterable[Grey | None]) 
     for at, picture in enumerate(frames, start=number):
         if picture is not None and (picture.shape != first.shape or picture.dtype != first.dtype):
             expected, got = f"{first.shape} of {first.dtype}", f"{picture.shape} of {picture.dtype}"
-            raise refused(f"{path}, frame {at}", expected, got, "make them alike")
+            raise movie_error(f"{path}, frame {at}", expected, got, "make them alike")
         yield picture

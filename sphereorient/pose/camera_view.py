@@ -8,17 +8,15 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, holds_disk, perspective_centre_lab_mm, sphere_radius_px
+from sphereorient.experiment.recording import Shown
 from sphereorient.files.picture import OnDemand
 from sphereorient.locate import Background, CameraScene
+from sphereorient.locate.background import Picture
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
-
-Picture = NDArray[np.generic]
-Shown = Picture | OnDemand  # of which fits cut out disks
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
 SIZES = 1.06  # ratio of neighbouring stencil sizes

@@ -39,13 +39,13 @@ _Table, _Task, _Stencil, _Scene, _Shot, Near = (
 )
 _RESULTS = [field[0] for field in _Task._fields_[-len(POSE_PARTS) :]]
 # What `linearise` tells of each place, in this order, with their numbers.
-TOLD = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
-TOLD |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
-TOLD |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
-OF_VIEW, OF_FIT = tuple(TOLD)[:8], ("residual", "model", "variance", "weight")
+COLUMNS = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
+COLUMNS |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
+COLUMNS |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
+OF_VIEW, OF_FIT = tuple(COLUMNS)[:8], ("residual", "model", "variance", "weight")
 
 
-def library() -> ctypes.CDLL | None:
+def refine_library() -> ctypes.CDLL | None:
     """Return the compiled code for this processor; None where there is none."""
     return compiled(SOURCE, Near)
 
@@ -55,14 +55,14 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="refine")
 
 
-def refine(
+def refine_compiled(
     pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4, most_hidden: float = 0.0
 ) -> FittedPoses:
     """Fit poses as `fit.refine`, to less than 0.001 degrees."""
     return _refined(pixels, begin, model, iterations, most_hidden)[0]
 
 
-def kept(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
+def kept_compiled(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
     """Return the places that count, as `fit.kept`."""
     return _refined(pixels, begin, model, 0, most)[1]
 
@@ -79,7 +79,7 @@ def _refined(
     return fit, kept
 
 
-def residuals(
+def residuals_compiled(
     pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
 ) -> Residuals:
     """Linearise pictures as `residuals.residuals`, by compiled code where that is able to; it has no gradients."""
@@ -89,16 +89,16 @@ def residuals(
         return residuals_in_torch.residuals(pixels, X, R, state, model)
     (L, P), counts = pixels.grey.shape, torch.empty_like(pixels.inside)
     task, at = _task_on(pixels, begin, model)
-    told = torch.empty(L, sum(TOLD.values()), P)
+    columns = torch.empty(L, sum(COLUMNS.values()), P)
     coefficients = torch.empty(L, sum(model.shading.counts), dtype=torch.float64)
     deviation = torch.empty(L, dtype=torch.float64)
-    task.kept, task.told = counts.data_ptr(), told.data_ptr()
+    task.kept, task.columns = counts.data_ptr(), columns.data_ptr()
     task.coefficients, task.deviation = coefficients.data_ptr(), deviation.data_ptr()
     if state is not None:
         task.expected, task.weight = at(state[0], torch.float32), at(state[1], torch.float32)
     _run("linearise", task, len(X))
-    each = torch.split(told, list(TOLD.values()), 1)
-    parts = {name: part.squeeze(1) for name, part in zip(TOLD, each, strict=True)}
+    each = torch.split(columns, list(COLUMNS.values()), 1)
+    parts = {name: part.squeeze(1) for name, part in zip(COLUMNS, each, strict=True)}
     distance = (X.repeat_interleave(cameras, 0) - pixels.origin[..., 0].double()).norm(dim=-1)
     blur = model.blur_px * (pixels.pitch_mm + pixels.pitch_rad * distance).float() / model.radius_mm
     hidden = pixels.inside & ~counts
@@ -112,8 +112,8 @@ def residuals(
 
 def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
     """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
-    return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
+    at = residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
+    return residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
 
 
 def _task_on(pixels: Pixels, begin: PoseStart, model: SphereModel) -> tuple[ctypes.Structure, "_Addresses"]:
@@ -150,7 +150,7 @@ def _into(task: ctypes.Structure, use: Tensor) -> FittedPoses:
 
 def _run(name: str, task: ctypes.Structure, poses: int) -> None:
     """Let a function of compiled code do the work of B poses, on all cores."""
-    code = library()
+    code = refine_library()
     assert code is not None  # as `body_of` asked
     work = getattr(code, name)
     threads = max(1, min(poses, cores()))
@@ -164,9 +164,9 @@ def _run(name: str, task: ctypes.Structure, poses: int) -> None:
         raise MemoryError
 
 
-def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
+def disks_compiled(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
     """Return middles (C, B, 2) and radii (C, B), px, of disks, as `fit.disks` to 0.02 px, by lines of sight."""
-    code, at = library(), _Addresses()
+    code, at = refine_library(), _Addresses()
     assert code is not None  # as `body_of` asked
     found = torch.empty(len(views), len(position_lab_mm), 3, dtype=torch.float64)
     X, count = ctypes.c_void_p(at(position_lab_mm, torch.float64)), ctypes.c_int64(len(position_lab_mm))
@@ -179,7 +179,7 @@ def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float
     return found[..., :2], found[..., 2]
 
 
-def settle(
+def settle_compiled(
     disks: FrameDisks, begin: PoseStart, model: SphereModel, instants: int, most_hidden: float, first: bool
 ) -> tuple[FittedPoses, Tensor]:
     """Fit poses to whole frames, as `fit.settle`."""
@@ -215,7 +215,7 @@ def settle_alone(
     radius_mm: float,
 ) -> FittedPoses:
     """Fit one pose to the frames of C cameras by one call, as `Fitter.settled` does."""
-    code, cameras = library(), len(views)
+    code, cameras = refine_library(), len(views)
     assert code is not None  # as `body_of` asked
     near, _alive = _alone(tuple(views), model, stencil, instants, most_hidden, radius_mm)
     near = Near.from_buffer_copy(near)
@@ -365,11 +365,11 @@ class Body(NamedTuple):
 
 
 IN_TORCH = Body(in_torch.disks, in_torch.refine, in_torch.kept, in_torch.settle)
-COMPILED = Body(disks, refine, kept, settle)
+COMPILED = Body(disks_compiled, refine_compiled, kept_compiled, settle_compiled)
 
 
 def body_of(position_lab_mm: Tensor) -> Body:
     """Return the body for spheres there."""
     X = position_lab_mm
-    able = library() is not None and X.device.type == "cpu" and not X.requires_grad
+    able = refine_library() is not None and X.device.type == "cpu" and not X.requires_grad
     return COMPILED if able else IN_TORCH

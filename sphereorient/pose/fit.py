@@ -31,7 +31,7 @@ from sphereorient.pose.residuals import (
 )
 from sphereorient.so3 import inverse_damped, solve_damped
 
-Floats = NDArray[np.float32]
+Singles = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 WINDOW_PX = 5  # over which squared residuals are averaged: noise of single pixels does not reach the limit
@@ -83,7 +83,7 @@ def kept(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> T
     return pixels.inside & ~hidden
 
 
-def _covered(differs: Floats, counted: Floats, down: Indices, right: Indices) -> NDArray[np.bool_]:
+def _covered(differs: Singles, counted: Singles, down: Indices, right: Indices) -> NDArray[np.bool_]:
     """Return which places (P,) of a disk lie near a window that differs."""
     grids = np.zeros((2, down.max() + 1, right.max() + 1), np.float32)
     grids[:, down, right] = differs, counted
@@ -96,8 +96,8 @@ def _covered(differs: Floats, counted: Floats, down: Indices, right: Indices) ->
     return covered
 
 
-def _array(part: Tensor) -> Floats:
-    array: Floats = part.to(torch.float32).cpu().numpy()
+def _array(part: Tensor) -> Singles:
+    array: Singles = part.to(torch.float32).cpu().numpy()
     return array
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
-Residual = Callable[[Tensor, Tensor], Tensor]  # R_lab_body (B, 3, 3), position_lab_mm (B, 3) -> (B, M)
+_Residual = Callable[[Tensor, Tensor], Tensor]  # R_lab_body (B, 3, 3), position_lab_mm (B, 3) -> (B, M)
 
 START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e9  # of Levenberg and Marquardt, relative to the diagonal
 EASE, STIFFEN = 0.2, 5.0  # factors after a good and after a bad step
@@ -32,7 +32,7 @@ class ImplicitPose:
 
 
 def implicit_pose(
-    residual: Residual,
+    residual: _Residual,
     R_start_lab_body: Tensor,
     start_lab_mm: Tensor,
     *,
@@ -99,7 +99,7 @@ def _newton_step(residuals: Callable[[Tensor], Tensor], still: Tensor) -> Tensor
     return step
 
 
-def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+def _levenberg_marquardt(residual: _Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step makes one worse."""
     damping = torch.full_like(X[:, 0], START_DAMPING)
     still = torch.zeros_like(X).repeat(1, 2)

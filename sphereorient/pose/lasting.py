@@ -98,9 +98,9 @@ def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMo
     joined, pulled, ridges = _joined(normal, right, ridge)
     wider = torch.arange(1, len(normal) + 1) * (normal.shape[-1] - 6) + 5
     bread = inverse_damped(joined.sum(0) + ridges)
-    told = use.any(0).double() / bread.diagonal()[wider].clamp_min(1e-30)
+    weight = use.any(0).double() / bread.diagonal()[wider].clamp_min(1e-30)
     found = (bread @ pulled.sum(0))[wider]
-    return -float((told * found).sum() / told.sum().clamp_min(1e-30))
+    return -float((weight * found).sum() / weight.sum().clamp_min(1e-30))
 
 
 def response_exponents(
@@ -210,7 +210,7 @@ def of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
     """Return the covariance (n, n) of a solution by what leaving out each of T parts changes.
     Normal equations (T, n, n), (T, n) of the parts, and a ridge (n, n) of all.
     """
-    told = normal.diagonal(dim1=-2, dim2=-1).any(-1)
+    determined = normal.diagonal(dim1=-2, dim2=-1).any(-1)
     whole, pull = normal.sum(0) + ridge, right.sum(0)
-    moved = solve_damped(whole - normal[told], pull - right[told]) - solve_damped(whole, pull)
+    moved = solve_damped(whole - normal[determined], pull - right[determined]) - solve_damped(whole, pull)
     return (1 - 1 / max(len(moved), 1)) * (moved.mT @ moved)

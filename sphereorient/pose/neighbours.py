@@ -31,7 +31,7 @@ class Neighbours:
         return Neighbours(**parts)
 
 
-def joined(each: Sequence[Neighbours | None]) -> Neighbours | None:
+def joined_neighbours(each: Sequence[Neighbours | None]) -> Neighbours | None:
     """Return the neighbours of all poses; None where none has any."""
     known = [one for one in each if one is not None]
     if not known:

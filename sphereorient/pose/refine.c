@@ -70,7 +70,7 @@ typedef struct {
     /* of `linearise`: expected grey levels and weights of an earlier call, (disks, places), or none; what it tells of
        each place, (disks, FLOATS + 2, places), as `Disk`, then expected and weight; and of each disk */
     const float *expected, *weight;
-    float *told;
+    float *columns;
     double *coefficients, *deviation; /* (disks, n_difference + n_black), (disks) */
     /* results: places that count, (disks, places), and the parts of `FittedPoses` */
     uint8_t *kept;
@@ -1110,10 +1110,10 @@ int linearise(const Task *t, int64_t begin, int64_t end) {
             memcpy(of->weight, t->weight + k * P, sizeof(float) * (size_t)P);
         }
         sum_disk(t, &work.at, of, k);
-        float *told = t->told + k * (FLOATS + 2) * P;
-        for (int64_t c = 0; c < FLOATS; c++) memcpy(told + c * P, work.floats + c * padded, sizeof(float) * (size_t)P);
-        memcpy(told + FLOATS * P, of->expected, sizeof(float) * (size_t)P);
-        memcpy(told + (FLOATS + 1) * P, of->weight, sizeof(float) * (size_t)P);
+        float *columns = t->columns + k * (FLOATS + 2) * P;
+        for (int64_t c = 0; c < FLOATS; c++) memcpy(columns + c * P, work.floats + c * padded, sizeof(float) * (size_t)P);
+        memcpy(columns + FLOATS * P, of->expected, sizeof(float) * (size_t)P);
+        memcpy(columns + (FLOATS + 1) * P, of->weight, sizeof(float) * (size_t)P);
         memcpy(of->kept, work.at.counts, (size_t)P);
         memcpy(t->coefficients + k * own, of->coefficients, sizeof(double) * (size_t)own);
         t->deviation[k] = of->deviation;

@@ -51,7 +51,7 @@ def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereVi
     coverage = mean([view.coverage for view in views])
     counts = [view.coverage + COVER_MIN for view in views]
     whole = mean(counts)
-    told = [view.known for view in views if view.known is not None]
+    masks = [view.known for view in views if view.known is not None]
 
     def painted(name: str) -> Tensor:
         parts: list[Tensor] = [getattr(view, name) for view in views]
@@ -64,7 +64,7 @@ def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereVi
         coverage=coverage,
         outward=torch.nn.functional.normalize(painted("outward"), dim=1),
         coverage_by_position=mean([view.coverage_by_position for view in views]),
-        known=torch.stack(told).all(0) if told else None,
+        known=torch.stack(masks).all(0) if masks else None,
         blur=views[0].blur,
     )
 

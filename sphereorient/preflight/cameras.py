@@ -35,7 +35,7 @@ SEE_BALL = "see the finding on the ball"
 TITLE = "cameras agree"
 
 
-def study(experiment: Experiment, settings: Settings, cameras: tuple[str, ...] | None = None) -> Learnt:
+def learn_appearance(experiment: Experiment, settings: Settings, cameras: tuple[str, ...] | None = None) -> Learnt:
     """Learn light, blur and noise of the movies, None: of all, as `track` does; raise SphereOrientError as it does."""
     with opened(Request(experiment=experiment, settings=settings, cameras=cameras), MemoryStore()) as work:
         assert work.follower is not None  # the precise method follows frames

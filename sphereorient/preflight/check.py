@@ -73,7 +73,7 @@ def preflight(
         refine = settings.refine.model_copy(update=BRIEF)
         planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
         both = image is not None and len(recording.streams) > 1
-        learning = pool.submit(cameras.study, experiment, planned) if both else None
+        learning = pool.submit(cameras.learn_appearance, experiment, planned) if both else None
         sampling = [pool.submit(_sample, recording, one, sizes[one.name], settings) for one in recording.streams]
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
@@ -84,8 +84,8 @@ def preflight(
         closer, scans = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
         matches = tuple(texture_map.match_texture(search.result(), samples) if search else ())
-        doubted = [match.name for match in matches if texture_map.doubts(match)]
-        studies = {name: pool.submit(cameras.study, experiment, planned, (name,)) for name in doubted}
+        doubted = [match.name for match in matches if texture_map.shows_no_map(match)]
+        alone = {name: pool.submit(cameras.learn_appearance, experiment, planned, (name,)) for name in doubted}
         tracked = cameras.NOT_TRACKED
         if learning is not None and closer and any(sample.balls for sample in samples):
             first = int(recording.timeline.number[closer[0][0].frame[0]])
@@ -99,7 +99,7 @@ def preflight(
             texture=image,
             unseen=unseen,
             matches=matches,
-            fitted=tuple(name for name, one in studies.items() if one.exception() is None),
+            fitted=tuple(name for name, one in alone.items() if one.exception() is None),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
             tracked=tracked,
@@ -144,7 +144,7 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
     least_px = min((r for r in radii if not math.isnan(r)), default=seen.samples[0].diameter_px / 2)
-    yield (paint := texture_map.contrast(seen.measures, least_px))
+    yield (paint := texture_map.judge_contrast(seen.measures, least_px))
     if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
     yield texture_map.look_alikes(seen.similar)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.cameras.response import Response
-from sphereorient.experiment.experiment import Experiment, refused
+from sphereorient.experiment.experiment import Experiment, input_error
 from sphereorient.experiment.recording import given_mask, open_recording
 from sphereorient.files.page_server import Json
 from sphereorient.files.threads import silent
@@ -31,7 +31,7 @@ class Clip:
     def __init__(self, experiment: Experiment) -> None:
         if not experiment.alone or not experiment.fixed:
             do = "track it with `sphereorient track`"
-            raise refused(f"{experiment.path}, sphere.fixed", "one ball that stays in its place", "another", do)
+            raise input_error(f"{experiment.path}, sphere.fixed", "one ball that stays in its place", "another", do)
         with open_recording(experiment, textured=False) as recording:
             self._frame_s = recording.timeline.frame_s
             read = {one.name: one.pictures(0, FRAMES) for one in recording.streams}

@@ -16,7 +16,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.cameras.model import focal_of_field
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.experiment import refused
+from sphereorient.experiment.experiment import input_error
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
 from sphereorient.sphere.view import fitted_circle
 from sphereorient.trajectory.rotations import rotations
@@ -37,7 +37,7 @@ SQUARES = {
     "xz": ((0.5, 0, -0.5), (-0.5, 0, -0.5), (-0.5, 0, 0.5), (0.5, 0, 0.5)),
 }
 SURE = 4.5  # half of 3^2: a square's tilt is sure at three sigmas of corners that are right to a pixel
-Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,9 +50,9 @@ class FicTracConfig:
     fisheye: bool  # equidistant: vfov_deg / height is the angle of every pixel
     ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
     circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
-    limb_px: Array  # (n, 2), u, v of the points of the limb
-    ahead_cam: Array | None  # (3,), towards the ball's middle, where the file states it: `roi_c` goes before the limb
-    turn: Array  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
+    limb_px: Floats  # (n, 2), u, v of the points of the limb
+    ahead_cam: Floats | None  # (3,), towards the ball's middle, where the file states it: `roi_c` goes before the limb
+    turn: Floats  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
     plane: str | None  # of the square: xy, yz or xz of the animal; None: `turn` is a rotation
     unread: tuple[str, ...]  # keys of the file that change nothing here
 
@@ -71,7 +71,7 @@ class FicTracConfig:
         height = image_size[1]
         return height / math.radians(self.vfov_deg) if self.fisheye else focal_of_field(height, self.vfov_deg)
 
-    def rays_cam(self, points_px: Array, image_size: tuple[int, int]) -> Array:
+    def rays_cam(self, points_px: Floats, image_size: tuple[int, int]) -> Floats:
         """Return unit rays (n, 3) of points (n, 2), px, by FicTrac's camera, whose axis is in the picture's middle."""
         aside = points_px - np.array(image_size) / 2
         away = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
@@ -90,22 +90,22 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     needed = {"src_fn": "the movie", "vfov": "the camera's field of view, degrees"}
     for name, what in needed.items():
         if not values.get(name):
-            raise refused(f"{path}, {name}", what, "none", DO)
+            raise input_error(f"{path}, {name}", what, "none", DO)
     for name, (usual, what, do) in CHOICES.items():
         if values.get(name, "").lower() not in usual:
-            raise refused(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
+            raise input_error(f"{path}, {name}", what, f"'{values[name][:40]}'", do)
     vfov = _numbers(values["vfov"])
     fisheye = values.get("fisheye", "").lower() in ("y", "1")
     widest = 360 if fisheye else 180
     if len(vfov) != 1 or not 0 < vfov[0] < widest:
-        raise refused(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
+        raise input_error(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
     used, turn, plane = USED, np.array(_numbers(values.get("c2a_r", ""))), None
     if len(turn) != 3:  # FicTrac then takes the corners
         corners = values.get("c2a_src", "")
         turn, plane = np.array(_numbers(values.get(corners, ""))), corners[-2:]
         if len(turn) != 8 or plane not in SQUARES:
             got, do = f"'{values.get('c2a_r', '')[:40]}'", "run FicTrac's configGui; { 0, 0, 0 } is the camera's frame"
-            raise refused(f"{path}, c2a_r", "three numbers, rad, or four corners by c2a_src", got, do)
+            raise input_error(f"{path}, c2a_r", "three numbers, rad, or four corners by c2a_src", got, do)
         turn, used = turn.reshape(4, 2), USED | {"c2a_src", corners}
     rate, limb = _numbers(values.get("src_fps", "")), _points(values.get("roi_circ", ""))
     ahead = np.array(_numbers(values.get("roi_c", "")))
@@ -124,13 +124,13 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     )
 
 
-def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
+def _R_of_square(square: Floats, seen: Floats, pixel_rad: float) -> Tensor:
     """Return the rotation (3, 3) from camera to animal where the corners (4, 3) of a square are seen along unit vectors
     (4, 3). Source: FicTrac's SquareRT: the least sum of squared differences between unit vectors. ExperimentError where
     corners that are off by a pixel could be those of the square's mirror image, tilted the other way.
     """
 
-    def off(pose: Array) -> Array:
+    def off(pose: Floats) -> Floats:
         there = square @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
         return np.asarray(there / np.linalg.norm(there, axis=1, keepdims=True) - seen).ravel()
 
@@ -140,12 +140,12 @@ def _R_of_square(square: Array, seen: Array, pixel_rad: float) -> Tensor:
         starts = (np.concatenate(pose).ravel() for pose in zip(turns, places, strict=True))
         best, other = sorted((least_squares(off, start) for start in starts), key=lambda fit: float(fit.cost))
     except (cv2.error, ValueError):
-        raise refused("config.txt, c2a_src", "the corners of a square", "others", do) from None
+        raise input_error("config.txt, c2a_src", "the corners of a square", "others", do) from None
     R, mirrored = so3.exp(torch.from_numpy(np.stack([best.x[:3], other.x[:3]]))).mT.unbind()
     apart_deg = math.degrees(float(so3.log(R.mT @ mirrored).norm()))
     if apart_deg > 1 and other.cost - best.cost < SURE * pixel_rad**2:
         got = f"corners that fit two rotations {apart_deg:.0f} degrees apart"
-        raise refused("config.txt, c2a_src", "a square whose perspective shows", got, do)
+        raise input_error("config.txt, c2a_src", "a square whose perspective shows", got, do)
     return R
 
 
@@ -163,7 +163,7 @@ def fictrac_axes(camera: Camera, config: Path | None) -> FicTracAxes:
     if ahead is None:
         if len(said.limb_px) < 3:
             got, do = f"{len(said.limb_px)}", "run FicTrac's configGui"
-            raise refused(f"{config}, roi_circ", "three points of the ball's limb or more", got, do)
+            raise input_error(f"{config}, roi_circ", "three points of the ball's limb or more", got, do)
         rays = said.rays_cam(said.limb_px, camera.image_size)
         normal = np.linalg.svd(rays - rays.mean(0))[2][2]  # of the plane through their ends
         ahead = normal * np.sign(normal @ rays.sum(0))
@@ -178,12 +178,12 @@ def _numbers(text: str) -> list[float]:
     return [float(number) for number in re.findall(NUMBER, text)]
 
 
-def _points(text: str) -> Array:
+def _points(text: str) -> Floats:
     """Return numbers as points (n, 2); an odd last one is left out, as FicTrac does."""
     numbers = _numbers(text)
     return np.array(numbers[: len(numbers) // 2 * 2]).reshape(-1, 2)
 
 
-def _polygons(text: str) -> list[Array]:
+def _polygons(text: str) -> list[Floats]:
     """Return the innermost { ... } of a text as polygons (n, 2); those of less than three points hide nothing."""
     return [points for group in re.findall(r"\{([^{}]+)\}", text) if len(points := _points(group)) >= 3]

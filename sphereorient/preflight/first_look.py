@@ -91,12 +91,12 @@ class FirstLook:
         seen = "as given, since the movie shows none surely" if self.given == self.outline.circle else seen
         stays = "sways in its place" if self.sways else f"stays in its place, outline {seen}"
         where = "one picture" if self.photograph else stays if self.stays else f"moves, {seen}"
-        told = f"ball of {self.diameter_px:.{int(bool(self.stays))}f} px, {where}"
+        words = f"ball of {self.diameter_px:.{int(bool(self.stays))}f} px, {where}"
         if self.given is not None and self.given != self.outline.circle:
             u, v, radius = self.given
-            told += f"; the given circle, {2 * radius:.1f} px about ({u:.1f}, {v:.1f}), "
-            told += "differs: the outline found is used" if self.differs else "agrees"
-        return f"{told}; DOUBTFUL: see the picture, draw it with `sphereorient mark`" if self.doubtful else told
+            words += f"; the given circle, {2 * radius:.1f} px about ({u:.1f}, {v:.1f}), "
+            words += "differs: the outline found is used" if self.differs else "agrees"
+        return f"{words}; DOUBTFUL: see the picture, draw it with `sphereorient mark`" if self.doubtful else words
 
 
 def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> FirstLook:

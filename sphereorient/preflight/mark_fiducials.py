@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.calibration.document import Picture, checked_clicks, load_calibration
+from sphereorient.calibration.document import Photo, checked_clicks, load_calibration
 from sphereorient.calibration.dots import Dots, find_dots
 from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.plates import read_plate_picture
@@ -32,7 +32,7 @@ class FiducialMarking(Marking):
             raise self.refused(str(self.path), expected, "other points", do)
         self.plate = self.document.plate
         self.clicked = {it: it.clicked_px for it in self.document.pictures}
-        self.dots: dict[Picture, Dots] = {}
+        self.dots: dict[Photo, Dots] = {}
 
     def shown(self, steps: Sequence[str]) -> Answer:
         """Return the state, a picture, or what is found in it."""
@@ -70,7 +70,7 @@ class FiducialMarking(Marking):
             ],
         }
 
-    def view(self, picture: Picture, clicked: NDArray[np.float64] | None) -> Json:
+    def view(self, picture: Photo, clicked: NDArray[np.float64] | None) -> Json:
         """Return dots, identified points and fiducials of a picture with clicked places, None or (2 or 3, 2) px, as
         JSON.
         """
@@ -90,7 +90,7 @@ class FiducialMarking(Marking):
             "clicked": None if clicked is None else clicked.tolist(),
         }
 
-    def save(self, picture: Picture, points: Any) -> Json:
+    def save(self, picture: Photo, points: Any) -> Json:
         """Write clicked places into the file; return the view with them. Raises CameraError (impossible places, places
         that do not tie the picture, or a file that cannot be changed safely), OutputError (the file cannot be written).
         """
@@ -116,13 +116,13 @@ class FiducialMarking(Marking):
         entries = content.get("pictures") if isinstance(content, dict) else None
         return [entry if isinstance(entry, dict) else {} for entry in entries] if isinstance(entries, list) else []
 
-    def _grey(self, picture: Picture) -> NDArray[Any]:
+    def _grey(self, picture: Photo) -> NDArray[Any]:
         return read_plate_picture(picture.path, self.document.keys.image_size)
 
-    def _checked(self, picture: Picture, points: Any) -> NDArray[np.float64]:
+    def _checked(self, picture: Photo, points: Any) -> NDArray[np.float64]:
         return checked_clicks(points, self.document.keys.image_size, f"{picture.path.name}, clicked")
 
-    def _picture(self, number: str) -> Picture:
+    def _picture(self, number: str) -> Photo:
         if (k := int(number[:9])) >= (count := len(self.document.pictures)):
             raise self.refused(f"picture {k}", f"0 .. {count - 1}", str(k), "choose another")
         return self.document.pictures[k]

@@ -60,9 +60,9 @@ def look_at_scene(
     cameras = next(iter(balls.values())).fitter.views
     frames, places = sample_frames(job.recording, cameras, texture_map.FRAMES)
     start, found, disks = SceneStart(balls), [], []
-    for shots in counted("balls", frames, len(frames), progress):
-        disks.append(_disks(shots, balls))
-        found.append(start(shots, list(balls), {}))
+    for frame in counted("balls", frames, len(frames), progress):
+        disks.append(_disks(frame, balls))
+        found.append(start(frame, list(balls), {}))
     best = max(range(len(frames)), key=lambda k: sum(len(one) > 0 for one in found[k].values()))
     seen = tuple(
         SceneView(
@@ -78,7 +78,7 @@ def look_at_scene(
         if shot.usable
     )
     contrasts = {
-        path.name: texture_map.contrast(texture_map.measure_texture(one.grey), _least_px(balls))
+        path.name: texture_map.judge_contrast(texture_map.measure_texture(one.grey), _least_px(balls))
         for path, one in loaded.items()
     }
     if len(loaded) > 1:
@@ -108,9 +108,9 @@ def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Findi
         yield warning(f"paint of {one} and {other}", measured, do)
 
 
-def _disks(shots: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:
+def _disks(frames: Sequence[Frame], balls: Mapping[str, Initialiser]) -> list[list[Outline]]:
     each, found = list(balls.values()), []
-    for c, shot in enumerate(shots):
+    for c, shot in enumerate(frames):
         sizes = [one.fitter.views[c].diameter_px for one in each]
         background = each[0].fitter.views[c].background
         found.append(find_disks(shot.picture, background, sizes, each[0].locating) if shot.usable else [])

@@ -101,7 +101,7 @@ def _patch_rad(texture: Tensor, mean: float) -> float:
     return 4 * float(angle[k - 1] + share * (angle[k] - angle[k - 1]))
 
 
-def contrast(measures: TextureMeasures, radius_px: float) -> Finding:
+def judge_contrast(measures: TextureMeasures, radius_px: float) -> Finding:
     """Judge contrast, balance and patches of a map, for a ball of this radius in the pictures."""
     patch_deg, patch_px = math.degrees(measures.patch_rad), measures.patch_rad * radius_px
     low, high = float(measures.view_brightness.min()), float(measures.view_brightness.max())
@@ -193,7 +193,7 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
     return TextureMatch(name=sample.name, score=score, mirrored=mirrored)
 
 
-def doubts(match: TextureMatch) -> bool:
+def shows_no_map(match: TextureMatch) -> bool:
     """Return whether neither the pictures nor their mirror images show the map to a search by outlines."""
     return bool(max(np.median(match.score), np.median(match.mirrored)) < POOR)
 

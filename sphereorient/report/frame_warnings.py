@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import Flag, Reason
 from sphereorient.trajectory import Trajectory, runs_of
-from sphereorient.trajectory.rotations import distance_deg
+from sphereorient.trajectory.rotations import Floats, distance_deg
 
 FLAG_WORDS = {
     Flag.POSITION_INTERPOLATED: "position interpolated over a gap",
@@ -50,7 +50,6 @@ MOST_BINS = 20_000  # frames of longer tracks are binned, so that a browser can 
 DIGITS = 4  # of the numbers on the page
 GOOD, NO_BALL, DOUBTFUL, NOT_VALID = range(4)
 STATUS_WORDS = ("good", "no ball", "doubtful", "not valid")
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Ranked = Iterator[tuple[int, str]]  # rows with the reason, worst first
 

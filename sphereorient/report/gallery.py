@@ -21,7 +21,7 @@ from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_page as ink
 from sphereorient.report.overlay import pictures_by_row, prepared
-from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes, draw_outline, draw_pictures
+from sphereorient.report.overlay_page import Canvas, OverlayPage, crop_panel, draw_axes, draw_outline, draw_pictures
 from sphereorient.trajectory import Trajectory
 
 BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
@@ -30,7 +30,7 @@ TILE, GAP, HEAD, TITLE, LINE, LINES = 152, 6, 54, 22, 17, 3  # px; lines of text
 BETWEEN = 18  # px, between frames
 PICTURES = 12  # side by side in a row, at most
 SUFFIXES = (".png", ".pdf", ".jpg")
-Progress = Callable[[int, int], None]
+Advance = Callable[[int, int], None]
 Rows = NDArray[np.int64]
 
 
@@ -64,7 +64,7 @@ class Gallery:
 
 
 def gallery(
-    track: Trajectory, experiment: Experiment, count: int, progress: Progress = lambda done, total: None
+    track: Trajectory, experiment: Experiment, count: int, progress: Advance = lambda done, total: None
 ) -> Gallery:
     """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
     Raise the errors of `overlay.prepared`.
@@ -133,7 +133,7 @@ def worst_frames(
     count: int = 24,
     *,
     cameras: Sequence[str] | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
 ) -> dict[int, tuple[str, ...]]:
     """Draw at most `count` of the worst frames, worst first, into a .png, .pdf or .jpg; return the reasons by row.
     Raise the errors of `overlay.prepared`, and OutputError for another suffix or a file that cannot be written.
@@ -169,12 +169,12 @@ def worst_frames(
     return bad
 
 
-def _pairs_size(page: Page) -> tuple[int, int]:
+def _pairs_size(page: OverlayPage) -> tuple[int, int]:
     return 2 * len(page.cameras) * (TILE + GAP) - GAP, TILE
 
 
 def _draw_pairs(
-    canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Shown | None], corner: tuple[int, int]
+    canvas: Canvas, page: OverlayPage, k: int, pictures: Mapping[str, Shown | None], corner: tuple[int, int]
 ) -> None:
     """Draw crop and re-rendered sphere of each camera; the whole frame if the centre is unknown."""
     (ball,) = page.balls

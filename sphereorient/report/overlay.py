@@ -19,8 +19,8 @@ from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Movie
-from sphereorient.report.overlay_model import MARGIN, Model, crop, fit_light, path_of
-from sphereorient.report.overlay_page import Ball, OverlayView, Page, crop_side
+from sphereorient.report.overlay_model import MARGIN, OverlayModel, crop, fit_light, path_of
+from sphereorient.report.overlay_page import Ball, OverlayPage, OverlayView, crop_side
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.datasets import nearest_rows
@@ -29,7 +29,7 @@ SAMPLE = 16  # frames from which light and brightness are taken
 DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures that are shown black and white
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 Rows = NDArray[np.int64]
-Progress = Callable[[int, int], None]
+Advance = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ def overlay_movie(
     path: Path,
     selection: FrameSelection | None = None,
     fps: float = 25.0,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
 ) -> int:
     """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual, all spheres in the same frames;
     return the number of pictures. Raise the errors of `prepared` and `write_video`, and TrackError if no frame of the
@@ -84,7 +84,7 @@ def prepared(
     experiment: Experiment,
     cameras: Sequence[str] | None,
     opened: ExitStack,
-) -> tuple[Page, dict[str, CameraStream]]:
+) -> tuple[OverlayPage, dict[str, CameraStream]]:
     """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them.
     Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another one.
     """
@@ -102,10 +102,10 @@ def prepared(
         sphere = experiment.of(track.sphere)
         texture = None if sphere.texture_path is None else load_texture(sphere.texture_path)
         where = path_of(track, sphere.radius_mm)
-        models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
+        models = [OverlayModel(camera=experiment.cameras[name], texture=texture, path=where) for name in streams]
         views = [_view(track, *each) for each in zip(models, streams.values(), strict=True)]
         balls.append(Ball(track=track, views=views))
-    return Page(numbers=numbers, balls=balls), streams
+    return OverlayPage(numbers=numbers, balls=balls), streams
 
 
 def streams_of(
@@ -142,7 +142,7 @@ def pictures_by_row(
         yield k, dict(zip(streams, found, strict=True))
 
 
-def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
+def _view(track: Trajectory, model: OverlayModel, stream: CameraStream) -> OverlayView:
     seen = track.cameras[stream.name]
     position = torch.from_numpy(model.path.position_mm)
     radius = seen.radius_px[np.isfinite(seen.radius_px)]

@@ -69,7 +69,7 @@ def axes_px(camera: Camera, path: Path3D, k: int) -> tuple[Floats, NDArray[np.bo
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CropWindow:
-    """A square of a camera's picture; made by `window`, sampled by `crop` and `Model`."""
+    """A square of a camera's picture; made by `window`, sampled by `crop` and `OverlayModel`."""
 
     centre_px: Floats  # (2,)
     half_px: float
@@ -100,7 +100,7 @@ def crop(picture: Shown, window: CropWindow) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenDisk:
-    """Paint and place on the disk in a window, (side, side, ...); made by `Model.look`."""
+    """Paint and place on the disk in a window, (side, side, ...); made by `OverlayModel.look`."""
 
     paint: NDArray[np.float32]  # 0 black .. 1 white; NaN outside the sphere
     across: NDArray[np.float32]  # (side, side, 2), place on the disk along the camera's x and y, radii
@@ -111,7 +111,7 @@ class SeenDisk:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Model:
+class OverlayModel:
     """A camera, the texture map and the poses; renders the expected picture."""
 
     camera: Camera

@@ -17,7 +17,7 @@ from sphereorient.experiment.recording import Shown
 from sphereorient.movies import Grey
 from sphereorient.pose.lights.disk import DiskLight
 from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags, stated_error
-from sphereorient.report.overlay_model import CropWindow, Model, axes_px, contrast, crop, lit_picture, outline_px
+from sphereorient.report.overlay_model import CropWindow, OverlayModel, axes_px, contrast, crop, lit_picture, outline_px
 from sphereorient.trajectory import CameraTrack, Trajectory, runs_of
 
 Colour = tuple[int, int, int]
@@ -135,7 +135,7 @@ class OverlayView:
     """What all pictures of one sphere by one camera share; made by `overlay.prepared`, read by the page."""
 
     name: str
-    model: Model
+    model: OverlayModel
     light: DiskLight | None  # of this camera alone; None: no frame to fit it to
     black: float  # grey level shown black
     white: float
@@ -190,7 +190,7 @@ class Ball:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Page:
+class OverlayPage:
     """Draws each camera's frame of a recording, with crop, re-rendered picture and residual of every sphere."""
 
     numbers: NDArray[np.int64]  # (N,), the experiment's numbers of the frames

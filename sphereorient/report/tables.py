@@ -166,7 +166,7 @@ def _comparisons(summary: Summary) -> Iterator[Row]:
         inputs = f"nu = {flow.viscosity_m2_s:.4g} m^2/s, epsilon = {flow.dissipation_w_kg:.4g} W/kg"
         yield {"name": f"eta, m, of {inputs}", "formula": "(nu^3 / epsilon)^(1/4)", "value": flow.eta_m}
         yield {"name": f"tau_eta, s, of {inputs}", "formula": "(nu / epsilon)^(1/2)", "value": flow.tau_eta_s}
-    yield from ({"name": one.name, "formula": one.formula, "value": one.value} for one in summary.comparisons)
+    yield from ({"name": one.name, "formula": one.formula, "value": one.value} for one in summary.dimensionless_numbers)
 
 
 def _distances(distances: Sequence[CameraDistance]) -> Iterator[Row]:

@@ -16,7 +16,7 @@ from sphereorient.errors import OutputError, TrackError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files, load_experiment
 from sphereorient.files.whole_file import is_forced, write_text, writing
 from sphereorient.follow.follower import Batch
-from sphereorient.methods.method import Learnt, Measured, load_learnt, read_poses, save_learnt, write_poses
+from sphereorient.methods.method import Followed, Learnt, load_learnt, read_poses, save_learnt, write_poses
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 
@@ -105,7 +105,7 @@ class MemoryStore:
     """Keeps a run in this process."""
 
     known: Mapping[str, Learnt] | None = None  # what was learnt of each ball before the first frame
-    _poses: dict[int, Measured] = field(default_factory=dict)
+    _poses: dict[int, Followed] = field(default_factory=dict)
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
@@ -116,11 +116,11 @@ class MemoryStore:
         """Keep what was learnt of each ball."""
         self.known = learnt
 
-    def write(self, batch: Batch, poses: Measured) -> None:
+    def write(self, batch: Batch, poses: Followed) -> None:
         """Keep the poses of each ball in one batch."""
         self._poses[batch.first] = poses
 
-    def read(self, batch: Batch) -> Measured:
+    def read(self, batch: Batch) -> Followed:
         """Return the poses of each ball in one batch."""
         return self._poses.pop(batch.first)
 
@@ -225,12 +225,12 @@ class FolderStore:
         with writing(force=True):  # over a damaged one, too: the folder is of this run
             save_learnt(learnt, self.folder / "learnt.h5")
 
-    def write(self, batch: Batch, poses: Measured) -> None:
+    def write(self, batch: Batch, poses: Followed) -> None:
         """Write the poses of each ball in one batch."""
         with writing(force=True):
             write_poses(poses, self.poses(batch))
 
-    def read(self, batch: Batch) -> Measured:
+    def read(self, batch: Batch) -> Followed:
         """Return the poses of each ball in one batch; raise TrackError and remove the file if it is damaged."""
         path = self.poses(batch)
         poses = read_poses(path) if path.is_file() else None

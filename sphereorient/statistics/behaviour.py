@@ -7,15 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import ShapeError, refusal
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.rotations import rotation_vectors
 from sphereorient.trajectory.walk import arcs, walk_of
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 ABOUT = ("x", "y", "z", "along the rotation")  # the gains
 PER_BLOCK = 10  # frames at least; a block is to be longer than errors are correlated
 FEWEST_BLOCKS, GAIN_BLOCKS, DRIFT_BLOCKS = 8, 40, 30

@@ -51,15 +51,15 @@ class Surroundings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """One dimensionless number, in words and symbols; made by `comparisons`."""
+class DimensionlessNumber:
+    """One dimensionless number, in words and symbols; made by `dimensionless_numbers`."""
 
     name: str
     formula: str
     value: float
 
 
-def comparisons(table: Mapping[str, Moments], around: Surroundings) -> list[Comparison]:
+def dimensionless_numbers(table: Mapping[str, Moments], around: Surroundings) -> list[DimensionlessNumber]:
     """Return the dimensionless numbers that the surroundings allow, from the moments by quantity.
     Rms values are of one component; the sphere's are corrected for noise. Needs a diameter and a moving centre.
     Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
@@ -88,7 +88,7 @@ def comparisons(table: Mapping[str, Moments], around: Surroundings) -> list[Comp
             ("rotation at Kolmogorov's rate", "omega_rms tau_eta", omega * flow.tau_eta_s),
             ("acceleration in Kolmogorov's units", "a_rms / (epsilon^3 / nu)^(1/4)", a / acceleration),
         ]
-    return [Comparison(name=name, formula=formula, value=float(value)) for name, formula, value in rows]
+    return [DimensionlessNumber(name=name, formula=formula, value=float(value)) for name, formula, value in rows]
 
 
 def _component_rms(moments: Moments) -> float:

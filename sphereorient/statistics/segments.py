@@ -98,7 +98,7 @@ def ensemble_of(
     which = "with frames whose errors are not larger than usual (statistics.max_sigma)"
     _refuse_few(int(kept.sum()), name, which, fewest)
     rows = kept[number] & whole["sure"]
-    told = [quantity for quantity in UNITS if quantity not in TRANSLATION or not all(track.held for track in many)]
+    taken = [quantity for quantity in UNITS if quantity not in TRANSLATION or not all(track.held for track in many)]
     return Ensemble(
         time_s=time_s[rows],
         frame=np.rint((time_s - time_s[begin][number]) / step_s).astype(np.int64)[rows],
@@ -107,8 +107,8 @@ def ensemble_of(
         span_s=span_s[kept],
         step_s=step_s,
         R_lab_body=whole["R_lab_body"][rows],
-        values={quantity: whole[quantity][rows] for quantity in told},
-        sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in told},
+        values={quantity: whole[quantity][rows] for quantity in taken},
+        sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in taken},
         length_unit=many[0].length_unit,
         error="added" if many[0].method == "paper" else "removed",
     )

@@ -13,7 +13,7 @@ import numpy as np
 from sphereorient.errors import TrackError
 from sphereorient.statistics import density, isotropy, lags, noise
 from sphereorient.statistics.bootstrap import FEWEST
-from sphereorient.statistics.flow import Comparison, Lift, Surroundings, comparisons, lift
+from sphereorient.statistics.flow import DimensionlessNumber, Lift, Surroundings, dimensionless_numbers, lift
 from sphereorient.statistics.moments import Moments, table_of_moments
 from sphereorient.statistics.segments import UNITS, Durations, Ensemble, durations, ensemble_of
 from sphereorient.statistics.settings import StatisticsSettings
@@ -24,7 +24,7 @@ SHOWN_LAGS = 5  # increments with a density, from one frame to the integral time
 WIDTHS_OF = ("velocity", "acceleration", "alpha_lab")
 STEPS = 10  # of the progress
 
-Progress = Callable[[int, int], None]
+Advance = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,7 +54,7 @@ class Summary:
     ensemble: Ensemble
     table: Mapping[str, Moments]  # Table I; without intervals for one segment
     warnings: Sequence[str]  # of noise, a sentence each
-    comparisons: Sequence[Comparison]
+    dimensionless_numbers: Sequence[DimensionlessNumber]
     distributions: Distributions | None  # None with fewer than two segments
 
     @property
@@ -67,7 +67,7 @@ def summarise(
     tracks: Trajectory | Sequence[Trajectory],
     settings: StatisticsSettings | None = None,
     surroundings: Surroundings | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Advance = lambda done, total: None,
     name: str = "tracks",
 ) -> Summary:
     """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
@@ -101,13 +101,13 @@ def summarise(
         ensemble=ensemble,
         table=table,
         warnings=noise.noise_warnings(table, ensemble.error),
-        comparisons=comparisons(table, around) if ensemble.segments else [],
+        dimensionless_numbers=dimensionless_numbers(table, around) if ensemble.segments else [],
         distributions=more,
     )
 
 
 def _distributions(
-    tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings, progress: Progress
+    tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings, progress: Advance
 ) -> Distributions:
     steps = count(4)
 

@@ -31,8 +31,8 @@ _ACROSS = fine_pixels(1, SUPERSAMPLING).numpy()
 # Weights of a pixel's middle and of a step to the right and down: those of its fine samples, row by row.
 FINE = np.array([(1, right, down) for down in _ACROSS for right in _ACROSS], np.float32)
 
-Doubles = NDArray[np.float64]
-Floats = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Window = tuple[slice, slice]  # rows and columns of a picture
 
 
@@ -57,8 +57,8 @@ class Exposure:
 
     size: tuple[int, int]  # height and width of the whole picture, px
     window: Window
-    light: Floats  # (h, w), grey level of the balls times their coverage
-    cover: Floats  # (h, w), their coverage
+    light: Singles  # (h, w), grey level of the balls times their coverage
+    cover: Singles  # (h, w), their coverage
     blur_px: float = 0.0  # of the optics, that light and cover do not have yet
 
     @classmethod
@@ -67,13 +67,13 @@ class Exposure:
         nothing = np.zeros((0, 0), np.float32)
         return cls(size=size, window=(slice(0, 0), slice(0, 0)), light=nothing, cover=nothing)
 
-    def before(self, behind: Floats | float) -> Floats:
+    def before(self, behind: Singles | float) -> Singles:
         """Return the picture (H, W) of the balls before grey levels (H, W), or one level."""
         picture = np.broadcast_to(np.asarray(behind, np.float32), self.size).copy()
         self.put(picture)
         return picture
 
-    def put(self, picture: Floats) -> None:
+    def put(self, picture: Singles) -> None:
         """Put the balls before the grey levels of a picture (H, W), in place."""
         seen = self.through_optics()
         picture[self.window] *= 1 - seen.cover
@@ -94,7 +94,7 @@ class Exposure:
         return replace(self, window=window, light=light, cover=cover)
 
     @property
-    def covered(self) -> Floats:
+    def covered(self) -> Singles:
         """The coverage of every pixel in the picture, (H, W)."""
         whole = np.zeros(self.size, np.float32)
         whole[self.window] = self.through_optics().cover
@@ -106,8 +106,8 @@ class PixelRays:
     """Rays through the pixels of a window (h, w): origins, mm, and directions, lab; linear within a pixel."""
 
     window: Window
-    exact: Doubles  # (2, 3, h, w)
-    linear: Floats  # (2, 3, 3, h, w), the same with their changes per pixel to the right and down
+    exact: Floats  # (2, 3, h, w)
+    linear: Singles  # (2, 3, 3, h, w), the same with their changes per pixel to the right and down
 
     @classmethod
     def of(cls, camera: Camera, window: Window) -> Self:
@@ -124,7 +124,7 @@ class PixelRays:
         part = (..., *_inside(window, self.window))
         return replace(self, window=window, exact=self.exact[part], linear=self.linear[part])
 
-    def feet(self, centre: Doubles) -> Floats:
+    def feet(self, centre: Floats) -> Singles:
         """Return where the fine samples pass a centre (3,) nearest, seen from it, (3, S, h, w)."""
         start, direction = self.exact[0] - centre[:, None, None], self.exact[1]
         ahead = (start * direction).sum(0)
@@ -138,9 +138,9 @@ class PixelRays:
         return _fine(np.stack([foot, *changes]))
 
 
-def _fine(linear: Floats) -> Floats:
+def _fine(linear: Singles) -> Singles:
     """Return what fine samples have, (3, S, h, w), of values and their changes to the right and down (3, 3, h, w)."""
-    found: Floats = (FINE @ linear.swapaxes(0, 1).reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
+    found: Singles = (FINE @ linear.swapaxes(0, 1).reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
     return found
 
 
@@ -187,7 +187,7 @@ def exposures(
             yield _exposure(balls, blur_px, size)
 
 
-def _exposure(balls: Sequence[tuple[Window, Floats]], blur_px: float, size: tuple[int, int]) -> Exposure:
+def _exposure(balls: Sequence[tuple[Window, Singles]], blur_px: float, size: tuple[int, int]) -> Exposure:
     """Put balls before each other, far ones first: windows and what is seen there, (E, 2, h, w)."""
     if not balls:
         return Exposure.none(size)
@@ -229,7 +229,7 @@ def _wider(window: Window, margin_px: int, size: tuple[int, int]) -> Window:
     return down, right
 
 
-def _seen(scene: RenderedScene, rays: PixelRays, centre: Doubles, R_body_lab: Floats) -> Floats:
+def _seen(scene: RenderedScene, rays: PixelRays, centre: Floats, R_body_lab: Singles) -> Singles:
     """Return shaded paint times coverage, and coverage, (2, h, w), of a ball: as `see_sphere`, where a ray hits."""
     settings, radius_mm = scene.settings, scene.settings.diameter_mm / 2
     normal = rays.feet(centre)
@@ -237,7 +237,7 @@ def _seen(scene: RenderedScene, rays: PixelRays, centre: Doubles, R_body_lab: Fl
     hit, depth = depth2 > 0, torch.from_numpy(depth2).clamp_min_(0).numpy()
     normal -= np.sqrt(depth, out=depth) * _fine(rays.linear[1])
     towards = np.concatenate([R_body_lab, TOWARDS], dtype=np.float32) / np.float32(radius_mm)
-    turned: Floats = np.matmul(towards, normal.reshape(3, -1), dtype=np.float32)
+    turned: Singles = np.matmul(towards, normal.reshape(3, -1), dtype=np.float32)
     grey = _paint(scene.closed, turned[:3])
     grey *= settings.white - settings.black
     grey += settings.black
@@ -246,7 +246,7 @@ def _seen(scene: RenderedScene, rays: PixelRays, centre: Doubles, R_body_lab: Fl
     return np.stack([part.mean(0, dtype=np.float32) for part in (grey.reshape(hit.shape) * hit, hit)])
 
 
-def _paint(closed: Tensor, body: Floats) -> Floats:
+def _paint(closed: Tensor, body: Singles) -> Singles:
     """Return the paint of `sample_closed` (P,) at directions (3, P), in a third of the time."""
     height, (x, y, z) = len(closed) - 2, body
     place = torch.empty(2, len(x))
@@ -258,7 +258,7 @@ def _paint(closed: Tensor, body: Floats) -> Floats:
     return np.asarray(grey.numpy().ravel())
 
 
-def digitise(picture: Floats, settings: SynthSettings, rng: torch.Generator) -> NDArray[np.uint8]:
+def digitise(picture: Singles, settings: SynthSettings, rng: torch.Generator) -> NDArray[np.uint8]:
     """Add camera noise to grey levels (H, W) and round to 8 bits."""
     noise = torch.empty(picture.shape).normal_(generator=rng).numpy()
     sigma = torch.from_numpy(picture).clamp_min(0).numpy()  # with numpy this and the root take three times as long
@@ -275,13 +275,13 @@ def seeded(*what: str | int) -> torch.Generator:
 
 
 def hidden_shares(
-    places: Mapping[str, Doubles], cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
-) -> dict[str, Doubles]:
+    places: Mapping[str, Floats], cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
+) -> dict[str, Floats]:
     """Return for each ball at places (N, 3), lab, mm, the share of its disk (C, N) that nearer disks cover."""
     across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
     grid = torch.cartesian_prod(across, across)
     grid = grid[grid.square().sum(1) < 1]
-    shares: dict[str, list[Doubles]] = {name: [] for name in places}
+    shares: dict[str, list[Floats]] = {name: [] for name in places}
     for camera in cameras.values():
         X = {name: torch.from_numpy(place) for name, place in places.items()}
         disks = {name: sphere_disk_px(camera, place, radii_mm[name]) for name, place in X.items()}

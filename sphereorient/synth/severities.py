@@ -10,7 +10,7 @@ from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.yaml_file import refuse_unknown
 
 LEVELS = (1, 2, 3, 4, 5)
-Values = tuple[float, float, float, float, float]
+_Values = tuple[float, float, float, float, float]
 # scene, map: before filming; picture: constant over the movie, in the background too; frame: drawn per frame;
 # reported: in the inputs of the method only.
 Place = Literal["scene", "map", "picture", "frame", "movie", "reported"]
@@ -24,7 +24,7 @@ class Degradation:
     name: str
     unit: str
     does: str
-    values: Values  # level 1 (mild) .. level 5 (hard)
+    values: _Values  # level 1 (mild) .. level 5 (hard)
     reason: str
     nothing: float | None  # value without effect; None: the base scene's value
     where: Place

@@ -122,8 +122,8 @@ def write_synthetic_experiment(
     write_truth(folder / "truth.h5", movie.truth, cameras)
     path = folder / "experiment.yaml"
     too_large = values.get("radius_error", 0.0) / (settings.diameter_px / 2)  # share, at the rim of the picture
-    told = settings.model_copy(update={"diameter_mm": settings.diameter_mm * (1 + too_large)})
-    write_text(path, yaml.safe_dump(experiment_document(told, cameras), sort_keys=False))
+    stated = settings.model_copy(update={"diameter_mm": settings.diameter_mm * (1 + too_large)})
+    write_text(path, yaml.safe_dump(experiment_document(stated, cameras), sort_keys=False))
     return path
 
 

@@ -79,13 +79,13 @@ def read_journal(file: BinaryIO, track: type[Any], camera: type[Any]) -> dict[st
     found: dict[str, Any] = {}
     for name in about["cameras"]:
         own = table["cameras"][name]
-        parts = nothing(camera, len(table)) | {column: np.ascontiguousarray(own[column]) for column in OF_CAMERA}
+        parts = _nothing(camera, len(table)) | {column: np.ascontiguousarray(own[column]) for column in OF_CAMERA}
         found[name] = camera(reason=reasons_of(own["reason"]), **parts)
-    parts = nothing(track, len(table)) | {name: np.ascontiguousarray(table[name]) for name in OF_FRAME}
+    parts = _nothing(track, len(table)) | {name: np.ascontiguousarray(table[name]) for name in OF_FRAME}
     return fields | parts | {"cameras": found}
 
 
-def nothing(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
+def _nothing(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
     """Return every dataset of a record with nothing measured, without memory for it: read-only."""
     return {
         name: np.broadcast_to(one[:1], (frames + len(one) - 1, *one.shape[1:])) if len(one) else one

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sphereorient.trajectory.datasets import runs_of
-from sphereorient.trajectory.rotations import rotation_vectors
+from sphereorient.trajectory.rotations import Floats, rotation_vectors
 
-Floats = NDArray[np.float64]
 # The columns of FicTrac's table, in order, and how many numbers each has. Source: FicTrac's doc/data_header.txt.
 WIDTHS = {"frame": 1, "turn_cam": 3, "error": 1, "turn_lab": 3, "rotation_cam": 3, "rotation_lab": 3}
 WIDTHS |= {"path": 2, "heading": 1, "direction": 1, "speed": 1, "sums": 2, "time_ms": 1, "sequence": 1}

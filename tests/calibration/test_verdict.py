@@ -16,7 +16,7 @@ from conftest import SHARED
 from sphereorient import cli
 from sphereorient.calibration import plates
 from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubts
-from sphereorient.calibration.document import Picture
+from sphereorient.calibration.document import Photo
 from sphereorient.calibration.plates import calibrate_cameras
 from sphereorient.calibration.targets import seen as seen_points
 from sphereorient.cameras import ParameterCovariance, load_cameras
@@ -29,7 +29,7 @@ def fitted(missed_px, used=None, **lens):
     for row, missed in enumerate(missed_px):
         view = seen_points(PLATE, index, 20.0 * index + 320.0, np.full(len(index), 0.03))
         kept = np.ones(len(index), bool) if used is None else used[row]
-        picture = Picture(camera="cam1", row=row, path=Path(f"{row}.png"))
+        picture = Photo(camera="cam1", row=row, path=Path(f"{row}.png"))
         reports.append(PictureReport(picture=picture, pose=row, view=view, residual_px=missed, used=kept, reason=""))
     return Calibrated(
         cameras={"cam1": replace(cameras()["cam1"], **lens)},
@@ -90,7 +90,7 @@ def test_centre_and_focal_length_beyond_belief_are_told():
 def calibrated(monkeypatch, seen, known):
     """Calibrate from views as if they had been found in pictures."""
     pictures = {
-        Picture(camera=name, row=row, path=known.path.with_name(f"{name}_{row:02}.png")): view
+        Photo(camera=name, row=row, path=known.path.with_name(f"{name}_{row:02}.png")): view
         for name, rows in seen.items()
         for row, view in rows.items()
     }

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sphereorient.errors import ExperimentError, MovieError
 from sphereorient.experiment import load_experiment, open_movies
-from sphereorient.experiment.timeline import NONE, Timeline, paired, timeline
+from sphereorient.experiment.timeline import NONE, Timeline, paired_times, timeline
 
 TABLE = BOTH.replace("frame_rate: 30", "times: times.csv") + "frames: [0, 12]\n"
 STAMPED = BOTH.replace("frame_rate: 30", "times: movies").replace(".npy", ".h5")
@@ -148,7 +148,7 @@ def test_a_movie_without_stamps_is_refused_where_they_are_asked_for(folder):
 )
 def test_pairs_are_those_that_counting_on_a_grid_gives(one, other):
     one, other = sorted(one), sorted(other)
-    pairs = paired(np.array(one) + 0.2, np.array(other, float), 0.5)
+    pairs = paired_times(np.array(one) + 0.2, np.array(other, float), 0.5)
     instants = sorted({*one, *other})
     expected = [[one.index(k) if k in one else NONE, other.index(k) if k in other else NONE] for k in instants]
     assert pairs.tolist() == expected

@@ -254,12 +254,12 @@ def test_judging_counts_right_and_wrong(rng):
 @pytest.mark.slow
 def test_the_network_of_the_checkpoint_is_as_good_as_the_log_says(trained):
     """Loaded anew, on the same validation pictures."""
-    from sphereorient.learn.metrics import joined, predict
+    from sphereorient.learn.metrics import joined_predictions, predict
     from sphereorient.learn.train import TrainingData
 
     loaded = load_checkpoint(trained[1] / "proposer.ckpt")
     network = correlator_of(loaded)
-    predictions = joined([predict(network, batch) for batch in TrainingData(tiny()).validation])
+    predictions = joined_predictions([predict(network, batch) for batch in TrainingData(tiny()).validation])
     found = metrics_of(predictions, network.grid, math.radians(8), loaded.temperature)
     assert found.recall_1 == pytest.approx(loaded.about["validation_recall_1"])
     assert found.ece == pytest.approx(loaded.about["validation_ece"], abs=1e-6)

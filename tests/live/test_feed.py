@@ -226,7 +226,7 @@ def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypat
         yield from arrivals(3)
 
     found = []
-    for arrival in Feed(source(), 10, wait=True, tell=lambda line: (told.append(line), goes_on.set())):
+    for arrival in Feed(source(), 10, wait=True, log=lambda line: (told.append(line), goes_on.set())):
         found.append(arrival.number)
     assert found == [0, 1, 2, 0, 1, 2]
     assert re.fullmatch(r"source: no frame for 0\.\d s; tracking waits\.", told[0])
@@ -243,7 +243,7 @@ def test_a_slow_source_does_not_stall(monkeypatch):
             time.sleep(0.02)
             yield replace(arrival, arrived_s=time.perf_counter())
 
-    list(Feed(source(), 10, wait=True, tell=told.append))
+    list(Feed(source(), 10, wait=True, log=told.append))
     assert len(told) <= 4  # before the second frame nothing is known of the rate
 
 

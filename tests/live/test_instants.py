@@ -10,7 +10,7 @@ import pytest
 
 from sphereorient.errors import MovieError
 from sphereorient.live.feed import Arrival
-from sphereorient.live.instants import Instants, Shot
+from sphereorient.live.instants import Instants, RawPicture
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Rig:
     held_up: float = 0.0  # share that comes 5 to 30 intervals late, with those behind it
     begins: tuple[int, ...] = ()  # trigger at which each camera begins
 
-    def shots(self) -> list[tuple[int, int, Shot]]:
+    def shots(self) -> list[tuple[int, int, RawPicture]]:
         """Return camera, trigger and picture, in order of arrival."""
         random, step_s, found = np.random.default_rng(self.seed), 1 / self.rate_hz, []
         triggers_s = np.cumsum(step_s * (1 + self.uneven * random.uniform(-1, 1, self.count)))
@@ -44,16 +44,18 @@ class Rig:
                 delay = random.exponential(self.jitter) + (random.random() < self.held_up) * random.uniform(5, 30)
                 arrived_s = max(at_s + 0.002 + step_s * delay, arrived_s + 1e-5)
                 stamp_s, picture = zero_s + rate * at_s + 1e-6 * random.normal(), np.full((1, 1), k)
-                found.append((camera, k, Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)))
+                found.append(
+                    (camera, k, RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter))
+                )
                 if random.random() < self.doubled:
                     bounced = random.random() < 0.5
                     counter, stamp_s, arrived_s = counter + bounced, stamp_s + 0.05 * step_s * bounced, arrived_s + 1e-4
-                    again = Shot(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
+                    again = RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
                     found.append((camera, k, again))
         return sorted(found, key=lambda one: one[2].arrived_s)
 
 
-def played(shots: list[tuple[int, int, Shot]], cameras: int, told: list[str]) -> Iterator[Arrival]:
+def played(shots: list[tuple[int, int, RawPicture]], cameras: int, told: list[str]) -> Iterator[Arrival]:
     instants = Instants([f"cam{k + 1}" for k in range(cameras)], told.append)
     for camera, _, shot in shots:
         while instants.due_s < shot.arrived_s:
@@ -120,10 +122,10 @@ def test_what_lacks_is_counted_and_told_in_few_lines():
     assert 0 < counts["cam2 missing"] <= sum(row[1] is None for row in shown)
 
 
-def times(camera: int, stamps: list[float], zero_s: float = 0.0) -> list[tuple[int, int, Shot]]:
+def times(camera: int, stamps: list[float], zero_s: float = 0.0) -> list[tuple[int, int, RawPicture]]:
     """Return pictures that arrive 1 ms after they were taken."""
     shot = [
-        Shot(picture=np.full((1, 1), round(100 * at_s)), arrived_s=at_s + 0.001, stamp_s=at_s + zero_s)
+        RawPicture(picture=np.full((1, 1), round(100 * at_s)), arrived_s=at_s + 0.001, stamp_s=at_s + zero_s)
         for at_s in stamps
     ]
     return [(camera, k, one) for k, one in enumerate(shot)]
@@ -143,7 +145,7 @@ def test_an_instant_waits_one_interval_for_a_late_picture_which_is_not_used_then
     stamps = (0.01 * np.arange(40)).tolist()
     one, other = times(0, stamps), times(1, stamps, -70.0)
     shot = other[30][2]
-    other[30] = (1, 30, Shot(picture=shot.picture, arrived_s=shot.arrived_s + 0.0105, stamp_s=shot.stamp_s))
+    other[30] = (1, 30, RawPicture(picture=shot.picture, arrived_s=shot.arrived_s + 0.0105, stamp_s=shot.stamp_s))
     told: list[str] = []
     instants = Instants(["cam1", "cam2"], told.append)
     for camera, _, each in sorted(one[:31] + other[:30], key=lambda one: one[2].arrived_s):
@@ -195,7 +197,7 @@ def test_after_a_pause_that_clocks_do_not_bridge_cameras_come_into_step_again():
     stamps = (0.01 * np.arange(40)).tolist()
     later = (1000 + 0.01 * np.arange(60)).tolist()
     drifted = [
-        (1, k, Shot(picture=shot.picture, arrived_s=shot.arrived_s, stamp_s=shot.stamp_s + 0.05))
+        (1, k, RawPicture(picture=shot.picture, arrived_s=shot.arrived_s, stamp_s=shot.stamp_s + 0.05))
         for _, k, shot in times(1, later, 3.0)
     ]
     both = times(0, stamps + later) + times(1, stamps, 3.0) + drifted
@@ -210,7 +212,7 @@ def test_the_counter_of_one_camera_tells_what_was_lost_on_the_way():
     found = []
     for counter in (7, 8, 8, 11):
         at_s = 0.01 * counter
-        instants.take(0, Shot(picture=np.zeros((1, 1)), arrived_s=5 + at_s, stamp_s=at_s, counter=counter))
+        instants.take(0, RawPicture(picture=np.zeros((1, 1)), arrived_s=5 + at_s, stamp_s=at_s, counter=counter))
         found += instants.ready(5 + at_s)
     assert [one.number for one in found] == [0, 1, 4]
     assert np.diff([one.time_s for one in found]) == pytest.approx([0.01, 0.03])
@@ -221,14 +223,14 @@ def test_the_counter_of_one_camera_tells_what_was_lost_on_the_way():
 def test_a_picture_that_is_not_whole_is_none_and_its_instant_does_not_wait():
     told: list[str] = []
     instants = Instants(["cam1"], told.append)
-    instants.take(0, Shot(picture=None, arrived_s=1.0, stamp_s=1.0))
+    instants.take(0, RawPicture(picture=None, arrived_s=1.0, stamp_s=1.0))
     (found,) = instants.ready(1.0)
     assert found.pictures == [None]
     assert "cam1 incomplete 1" in told[0]
 
 
 def test_several_cameras_want_clocks():
-    instants, shot = Instants(["cam1", "cam2"], print), Shot(picture=np.zeros((1, 1)), arrived_s=1.0, counter=3)
+    instants, shot = Instants(["cam1", "cam2"], print), RawPicture(picture=np.zeros((1, 1)), arrived_s=1.0, counter=3)
     instants.take(1, shot)
     with pytest.raises(MovieError, match="cam2: expected time stamps"):
         instants.take(1, shot)

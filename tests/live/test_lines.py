@@ -10,7 +10,7 @@ from live_examples import rows
 from overlay_examples import true_track
 
 from sphereorient import so3
-from sphereorient.live.lines import FicTracLines, Quantities, Told
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import Measured
 from sphereorient.report.export import fictrac_table
 from sphereorient.trajectory import Flag, Trajectory
@@ -31,7 +31,7 @@ def test_lines_are_the_rows_of_the_exported_table(track):
     R_cam_own, R_own_lab = so3.exp(torch.tensor([[0.7, -0.1, 0.4], [0.2, 0.1, -0.3]], dtype=torch.float64)).numpy()
     axes = FicTracAxes(R_own_lab=R_own_lab, R_cam_own=R_cam_own)
     table, lines = fictrac_table(track, axes), FicTracLines(axes)
-    texts = [Told(now, lines, Quantities(fixed=True)).fictrac for now in rows(track)]
+    texts = [Forms(now, lines, Quantities(fixed=True)).fictrac for now in rows(track)]
     found = np.array([[float(part) for part in text.split(", ")] for text in texts])
     assert found.shape == (len(track), 25)
     rest = [k for k in range(25) if k != 4]  # the stated error is another one here
@@ -46,9 +46,9 @@ def test_json_has_null_for_what_is_not_known(track):
     assert (lost["valid"], lost["quaternion_wxyz"], lost["reason"]) == (False, [None] * 4, ["not_found"])
 
 
-def forms(frames: Iterable[Measured], known: Quantities) -> list[Told]:
+def forms(frames: Iterable[Measured], known: Quantities) -> list[Forms]:
     table = FicTracLines(FicTracAxes.of_lab(np.eye(3)))
-    return [Told(now, table, known) for now in frames]
+    return [Forms(now, table, known) for now in frames]
 
 
 def told(frames: Iterable[Measured], fixed: bool, unit: str = "mm") -> list[dict]:

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.live.lines import FicTracLines, Quantities, Told
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import REMARK, TrackBlocks
 from sphereorient.live.outputs import TrackOutput
 from sphereorient.live.sources import movie_frames
@@ -57,7 +57,7 @@ def test_a_frame_of_one_camera_is_flagged_at_once_and_doubtful_if_the_other_shou
     expected = [0, 0, 0, 0, 0, Flag.ONE_CAMERA, 0, Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT, 0]
     assert [now.flags for now in found] == expected
     lines = [
-        json.loads(Told(now, FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(fixed=False)).json)
+        json.loads(Forms(now, FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(fixed=False)).json)
         for now in found
     ]
     assert [sum(Flag[name] for name in line["flags"]) for line in lines] == expected

@@ -13,12 +13,12 @@ from live_examples import LIMIT_S, rows, until
 from overlay_examples import true_track
 
 from sphereorient.errors import MovieError, OutputError
-from sphereorient.live.lines import FicTracLines, Quantities, Told
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.outputs import open_output
 from sphereorient.live.shared import POSES, shared_poses
 from sphereorient.trajectory.walk import FicTracAxes
 
-NAMES = list(Told(next(rows(true_track())), FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(True)).numbers)
+NAMES = list(Forms(next(rows(true_track())), FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(True)).numbers)
 READER = """
 import sys
 from pathlib import Path

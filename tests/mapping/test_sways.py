@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.bench.ball import SCENES, measured, write_ball_scene
+from sphereorient.bench.ball import SCENES, measure_scene, write_ball_scene
 from sphereorient.errors import ExperimentError, PaintError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
@@ -85,7 +85,7 @@ def test_places_and_turns_are_adjusted_in_each_frame(scene):
 
 @pytest.mark.slow
 def test_it_is_tracked_from_nothing(scene):
-    row = measured(scene.path, SETTINGS, True)
+    row = measure_scene(scene.path, SETTINGS, True)
     assert row.refined is not None
     assert row.refined.found == FRAMES
     assert np.median(row.refined.step_deg) < 0.03

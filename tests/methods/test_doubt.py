@@ -19,13 +19,13 @@ TURNED = 20  # frame
 
 def tracked(monkeypatch, change, **known):
     """The excerpt, with its measured poses changed before they are joined, and what is known of its pictures."""
-    joined = precise.joined
+    joined = precise.join_ball
 
     def changed(job, appearance, table):
         change(table)
         return joined(job, replace(appearance, **known), table)
 
-    monkeypatch.setattr(precise, "joined", changed)
+    monkeypatch.setattr(precise, "join_ball", changed)
     return run(Request(experiment=EXCERPT, settings=load_settings(None, SHORT)), MemoryStore())
 
 

@@ -60,8 +60,8 @@ def test_a_band_is_where_signal_and_noise_are_equally_strong() -> None:
 def body(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Both forms of the recursions."""
     if request.param == "numpy":
-        monkeypatch.setattr(kalman, "library", lambda: None)
-    elif kalman.library() is None:
+        monkeypatch.setattr(kalman, "kalman_library", lambda: None)
+    elif kalman.kalman_library() is None:
         pytest.skip("needs compiled code: `make setup` with a compiler")
     return str(request.param)
 
@@ -146,7 +146,7 @@ def test_the_linear_problem_of_turns_has_the_derivatives_of_the_true_one() -> No
     np.testing.assert_allclose(rotvec_between(still[None], moved[None])[0], F[:3] @ small, atol=1e-9)
 
 
-@pytest.mark.skipif(kalman.library() is None, reason="needs compiled code: `make setup` with a compiler")
+@pytest.mark.skipif(kalman.kalman_library() is None, reason="needs compiled code: `make setup` with a compiler")
 def test_compiled_recursions_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(2)
     count = 3 * kalman.EVERY + 7
@@ -162,7 +162,7 @@ def test_compiled_recursions_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch)
     compiled = run_filter(chain)
     behind = smooth(chain, compiled, wanted)
     with monkeypatch.context() as patch:
-        patch.setattr(kalman, "library", lambda: None)
+        patch.setattr(kalman, "kalman_library", lambda: None)
         plain = run_filter(chain)
         expected = smooth(chain, plain, wanted)
     assert compiled.misfit == pytest.approx(plain.misfit, rel=1e-9)

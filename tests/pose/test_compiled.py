@@ -20,7 +20,8 @@ from refine_examples import (
 
 from sphereorient import so3
 from sphereorient.files.compiled import built_for
-from sphereorient.pose import compiled, fit, residuals
+from sphereorient.pose import compiled, residuals
+from sphereorient.pose.compiled import COMPILED, IN_TORCH
 from sphereorient.pose.lights.lab import lab_light
 from sphereorient.pose.model import FIRST, LATER, SphereModel
 from sphereorient.pose.pixels import Pixels
@@ -31,7 +32,7 @@ from sphereorient.sphere.texture_table import texture_table
 RIG, SIGMA = rig_of(), 3.0
 X, R = balls(10, 4)
 pytestmark = pytest.mark.skipif(
-    compiled.library() is None, reason="needs the compiled fit: `make setup` with a compiler"
+    compiled.refine_library() is None, reason="needs the compiled fit: `make setup` with a compiler"
 )
 
 
@@ -62,7 +63,7 @@ def unseen_model(pixels) -> SphereModel:
 
 def learnt(pixels, *, lab: bool = False) -> SphereModel:
     model = model_of()
-    given = pixels, compiled.refine(pixels, begin(), model, 6), torch.ones(10, 2, dtype=torch.bool), model
+    given = pixels, COMPILED.refine(pixels, begin(), model, 6), torch.ones(10, 2, dtype=torch.bool), model
     light = lab_light(*given) if lab else model.light.learnt(*given)
     stray = torch.tensor([[3.0, 1, -1, 0.5, 0, 0, 0, 0.2, 0], [0.0] * 9])
     return model_of(light=replace(light, stray=stray), shading=LATER, limb_px=torch.tensor([0.02, -0.01]))
@@ -92,7 +93,7 @@ def assert_same(found, expected, nll=1e-3):
 
 
 def assert_as_torch(pixels, model, iterations=4, most_hidden=0.0, nll=1e-3):
-    found, expected = (body.refine(pixels, begin(), model, iterations, most_hidden) for body in (compiled, fit))
+    found, expected = (body.refine(pixels, begin(), model, iterations, most_hidden) for body in (COMPILED, IN_TORCH))
     assert_same(found, expected, nll)
 
 
@@ -123,7 +124,7 @@ def test_residuals_and_what_they_consist_of_are_those_of_torch(case):
     given = pixels, start.position_lab_mm, start.R_lab_body
     first = residuals.residuals(*given, None, model)
     for state in (None, (first.model, first.weight)):
-        found, expected = (body(*given, state, model) for body in (compiled.residuals, residuals.residuals))
+        found, expected = (body(*given, state, model) for body in (compiled.residuals_compiled, residuals.residuals))
         counts = expected.inside & (expected.view.coverage > 1e-3)
         assert float((found.inside != expected.inside).float().mean()) < 1e-3  # at the threshold rounding decides
         assert (found.view.known is None) == (expected.view.known is None)
@@ -149,30 +150,30 @@ def test_occluders_are_those_of_torch(pixels, kind):
     covered[1, :] = covered[1].flip(0)  # so much differs that nothing is taken for an occluder
     hidden, model = replace(pixels, grey=covered), MODELS[kind](pixels)
     for most in (0.4, 1e-4):
-        inside = compiled.kept(hidden, begin(), model, most)
-        other = inside != fit.kept(hidden, begin(), model, most)
+        inside = COMPILED.kept(hidden, begin(), model, most)
+        other = inside != IN_TORCH.kept(hidden, begin(), model, most)
         assert int(other.sum()) <= 1e-3 * int((pixels.inside & ~inside).sum())  # at the threshold rounding decides
         assert bool((pixels.inside & ~inside)[0, near].any()) == (most == 0.4)
         assert torch.equal(inside[1], pixels.inside[1])
         assert_as_torch(hidden, model, 2, most, nll=5e-3)
-        past = compiled.refine(hidden, begin(), model, 2, most)
-        without = compiled.refine(replace(hidden, inside=inside), begin(), model, 2)
+        past = COMPILED.refine(hidden, begin(), model, 2, most)
+        without = COMPILED.refine(replace(hidden, inside=inside), begin(), model, 2)
         for name in POSE_PARTS:
             assert torch.equal(getattr(past, name), getattr(without, name)), name
 
 
 def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels, monkeypatch):
     model, start = learnt(pixels), begin()
-    whole = compiled.refine(pixels, start, model, most_hidden=0.4)
-    some = compiled.refine(pixels.where(torch.arange(6, 10)), start.of(torch.tensor([3, 4])), model, most_hidden=0.4)
+    whole = COMPILED.refine(pixels, start, model, most_hidden=0.4)
+    some = COMPILED.refine(pixels.where(torch.arange(6, 10)), start.of(torch.tensor([3, 4])), model, most_hidden=0.4)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
-    threaded = compiled.refine(pixels, start, model, most_hidden=0.4)
+    threaded = COMPILED.refine(pixels, start, model, most_hidden=0.4)
     torch.set_num_threads(threads)
     plain = built_for(compiled.SOURCE, compiled.Near, "default")
     assert plain is not None
-    monkeypatch.setattr(compiled, "library", lambda: plain)
-    narrow = compiled.refine(pixels, start, model, most_hidden=0.4)
+    monkeypatch.setattr(compiled, "refine_library", lambda: plain)
+    narrow = COMPILED.refine(pixels, start, model, most_hidden=0.4)
     for name in POSE_PARTS:
         assert torch.equal(getattr(whole, name), getattr(threaded, name)), name
         assert torch.equal(getattr(whole, name), getattr(narrow, name)), name

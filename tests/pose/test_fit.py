@@ -247,7 +247,7 @@ def test_saturated_pixels_tell_only_that_their_grey_level_is_at_least_that_one()
 @pytest.mark.parametrize("body", ["compiled", "torch"])
 def test_a_picture_that_is_white_all_over_is_not_explained_by_paint(body, monkeypatch):
     if body == "torch":
-        monkeypatch.setattr(compiled, "library", lambda: None)
+        monkeypatch.setattr(compiled, "refine_library", lambda: None)
     X, R = truth()
     white = cut(rig(), torch.full_like(pictures(), 255.0), X, full_scale=255.0)
     assert float(fitted(rig(), "patches", white, X, R, SIGMA).score.max()) < 0.1

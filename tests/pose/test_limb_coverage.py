@@ -20,7 +20,7 @@ from refine_examples import (
 )
 from torch import Tensor
 
-from sphereorient.pose import compiled, fit
+from sphereorient.pose.compiled import COMPILED, IN_TORCH, refine_library
 from sphereorient.pose.pixels import LinesOfSight, Pixels
 from sphereorient.pose.poses import PoseStart
 from sphereorient.sphere.renderer import rim_directions
@@ -28,8 +28,8 @@ from sphereorient.sphere.renderer import rim_directions
 RIG, COUNT = rig_of(48.0), 4
 RIGHT_TO = 0.03
 BODIES = [
-    pytest.param(compiled, marks=pytest.mark.skipif(compiled.library() is None, reason="needs the compiled fit")),
-    fit,
+    pytest.param(COMPILED, marks=pytest.mark.skipif(refine_library() is None, reason="needs the compiled fit")),
+    IN_TORCH,
 ]
 
 

@@ -119,6 +119,6 @@ def test_fits_look_past_the_other_ball_compiled_or_not_and_without_one_keep_thei
     assert float(off[1][:-1].max()) < 0.7 * float(off[0][:-1].max())
     assert torch.equal(past.R_lab_body[-1], plain.R_lab_body[-1])
     assert torch.equal(past.covariance[-1], plain.covariance[-1])
-    monkeypatch.setattr(compiled, "library", lambda: None)
+    monkeypatch.setattr(compiled, "refine_library", lambda: None)
     slow = fitter.settled(frames, replace(begin, among=others))
     assert float(torch.rad2deg(so3.geodesic_distance(slow.R_lab_body, past.R_lab_body)).max()) < 2e-3

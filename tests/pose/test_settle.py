@@ -34,7 +34,7 @@ from sphereorient.pose.poses import POSE_PARTS, PoseStart
 
 RIG, COUNT = rig_of(), 6
 pytestmark = pytest.mark.skipif(
-    compiled.library() is None, reason="needs the compiled fit: `make setup` with a compiler"
+    compiled.refine_library() is None, reason="needs the compiled fit: `make setup` with a compiler"
 )
 KINDS = [np.uint8, np.uint16, np.float32, np.float64]
 
@@ -89,7 +89,7 @@ def test_poses_are_those_of_torch(scene, kind, held, monkeypatch):
     fitter, pictures, X, R = scene
     frames, begin = [list(row) for row in pictures.astype(kind)], start(X, R, held=held)
     found = fitter.settled(frames, begin)
-    monkeypatch.setattr(compiled, "library", lambda: None)
+    monkeypatch.setattr(compiled, "refine_library", lambda: None)
     expected = fitter.settled(frames, begin)
     assert_same(found, expected)
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body, R)).max()) < 0.5
@@ -102,7 +102,7 @@ def test_disks_lie_where_cameras_of_all_models_project_them(name):
     still = scene_of(np.zeros((height, width), np.float32))
     view = CameraView(name=name, camera=camera, background=still, diameter_px=40.0, sight=LinesOfSight(camera))
     spread = torch.randn(300, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    middles, radii = compiled.disks([view], 30.0 * spread, 5.0)
+    middles, radii = compiled.disks_compiled([view], 30.0 * spread, 5.0)
     expected, radii_px = sphere_disk_px(camera, 30.0 * spread, 5.0)
     within = ((expected > 20.0) & (expected < expected.new_tensor([width - 20.0, height - 20.0]))).all(-1)
     assert int(within.sum()) > 200
@@ -110,7 +110,7 @@ def test_disks_lie_where_cameras_of_all_models_project_them(name):
     assert float((radii[0] - radii_px)[within].abs().max()) < 0.02
     if name not in ("telecentric", "fisheye", "port"):
         behind = 2 * centre_lab_mm(camera) - 30.0 * spread
-        assert bool(compiled.disks([view], behind, 5.0)[0].isnan().all())
+        assert bool(compiled.disks_compiled([view], behind, 5.0)[0].isnan().all())
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
@@ -163,7 +163,7 @@ def test_the_shutter_is_open_while_the_ball_moves(scene, monkeypatch):
     frames, begin = [list(row) for row in pictures], start(X, R)
     found = replace(fitter, instants=3).settled(frames, begin)
     assert not torch.equal(found.R_lab_body, fitter.settled(frames, begin).R_lab_body)
-    monkeypatch.setattr(compiled, "library", lambda: None)
+    monkeypatch.setattr(compiled, "refine_library", lambda: None)
     assert_same(found, replace(fitter, instants=3).settled(frames, begin))
 
 
@@ -178,7 +178,7 @@ def test_lines_of_sight_may_start_at_different_places(scene, monkeypatch):
     views[1] = replace(views[1], sight=ported)
     behind_a_wall, frames = replace(fitter, views=views), [list(row) for row in pictures]
     found = behind_a_wall.settled(frames, start(X, R))
-    monkeypatch.setattr(compiled, "library", lambda: None)
+    monkeypatch.setattr(compiled, "refine_library", lambda: None)
     assert_same(found, behind_a_wall.settled(frames, start(X, R)))
 
 
@@ -199,7 +199,7 @@ def test_each_disk_may_have_axes_of_its_own(scene, monkeypatch):
     beside = replace(fitter, views=views, light=replace(fitter.light, black=uneven))
     frames = [list(row) for row in pictures]
     found = beside.settled(frames, start(X, R, held=True))
-    monkeypatch.setattr(compiled, "library", lambda: None)
+    monkeypatch.setattr(compiled, "refine_library", lambda: None)
     assert_same(found, beside.settled(frames, start(X, R, held=True)))
 
 

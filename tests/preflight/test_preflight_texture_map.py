@@ -12,7 +12,7 @@ from sphereorient.errors import TextureError
 from sphereorient.preflight import Severity
 from sphereorient.preflight.texture_map import (
     ViewPair,
-    contrast,
+    judge_contrast,
     look_alikes,
     measure_texture,
     most_similar_views,
@@ -55,7 +55,7 @@ def test_patches_are_as_wide_as_the_stripes_painted(count):
 
 @pytest.mark.parametrize("kind", ["blobs", "patches", "dots"])
 def test_the_random_paints_are_good(kind):
-    assert contrast(measure_texture(random_texture(kind, 1, 256)), RADIUS_PX).severity is OK
+    assert judge_contrast(measure_texture(random_texture(kind, 1, 256)), RADIUS_PX).severity is OK
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_the_random_paints_are_good(kind):
     ],
 )
 def test_what_is_wrong_with_a_paint_is_named(good, spoil, radius_px, words):
-    found = contrast(measure_texture(spoil(good)), radius_px)
+    found = judge_contrast(measure_texture(spoil(good)), radius_px)
     assert found.severity is (FAULT if words == "one colour" else WARNING)
     assert words in found.advice
 

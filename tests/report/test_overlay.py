@@ -17,7 +17,7 @@ from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, frame_w
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
 from sphereorient.report.overlay_model import (
     LIMB,
-    Model,
+    OverlayModel,
     SeenDisk,
     axes_px,
     contrast,
@@ -94,7 +94,7 @@ def relative_residual(ready, name: str, R_lab_body=None) -> float:
         turned = path.R_lab_body.copy()
         turned[K] = R_lab_body
         path = replace(path, R_lab_body=turned)
-    model = Model(camera=view.model.camera, texture=view.model.texture, path=path)
+    model = OverlayModel(camera=view.model.camera, texture=view.model.texture, path=path)
     window = model.window(K, view.half_px, 100)
     filmed = crop(pictures[name], window)
     left = filmed - lit_picture(view.light, model.look(K, window), filmed)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from statistics_examples import ensemble, holds
 
-from sphereorient.statistics.flow import FlowScales, Surroundings, comparisons, lift
+from sphereorient.statistics.flow import FlowScales, Surroundings, dimensionless_numbers, lift
 from sphereorient.statistics.moments import table_of_moments
 from sphereorient.statistics.settings import BootstrapSettings
 
@@ -25,12 +25,12 @@ def test_dimensionless_numbers_that_a_person_works_out_by_hand():
     }
     table = table_of_moments(ensemble([100] * 10, **values), FEW)
     flow = {"viscosity_m2_s": 8e-6, "dissipation_w_kg": 1.7, "u_rms_m_s": 0.6, "integral_length_m": 0.03}
-    found = {row.formula: row.value for row in comparisons(table, Surroundings(diameter_mm=18.0, **flow))}
+    found = {row.formula: row.value for row in dimensionless_numbers(table, Surroundings(diameter_mm=18.0, **flow))}
     assert found["u_rms / D"] == pytest.approx(33.333, rel=1e-3)
     assert found["omega_rms D / u_rms"] == pytest.approx(0.24, rel=1e-2)
     assert found["D / eta"] == pytest.approx(136.7, rel=1e-2)
     assert found["D / L"] == pytest.approx(0.6)
-    assert "u_rms / D" not in {row.formula for row in comparisons(table, Surroundings(diameter_mm=18.0))}
+    assert "u_rms / D" not in {row.formula for row in dimensionless_numbers(table, Surroundings(diameter_mm=18.0))}
 
 
 def test_a_planted_lift_is_found_with_its_coefficient():

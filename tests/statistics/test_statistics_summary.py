@@ -57,11 +57,11 @@ def test_an_integral_time_that_is_given_is_not_measured(planted):
 
 @pytest.mark.slow
 def test_the_surroundings_make_the_dimensionless_numbers(whole):
-    numbers = {one.formula: one.value for one in whole.comparisons}
+    numbers = {one.formula: one.value for one in whole.dimensionless_numbers}
     v, omega = (np.sqrt(np.square(whole.table[q].corrected_rms.value[:3]).mean()) for q in ("velocity", "omega_lab"))
     assert numbers["omega_rms D / v_rms"] == pytest.approx(omega * 0.018 / v)
     assert numbers["D / eta"] == pytest.approx(0.018 / (8e-6**3 / 1.7) ** 0.25)
-    assert not summarise(track([60, 60]), FEW).comparisons
+    assert not summarise(track([60, 60]), FEW).dimensionless_numbers
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_without_a_segment_that_counts_the_numbers_are_nan(frames):
     assert found.table.keys() == UNITS.keys()
     assert all(np.isnan(part.rms.value).all() and np.isnan(part.rms.low).all() for part in found.table.values())
     assert not found.warnings
-    assert not found.comparisons
+    assert not found.dimensionless_numbers
     assert found.distributions is None
 
 

@@ -46,7 +46,7 @@ RECTIFIED = {"p", "projectionmatrix"}  # beside one of them ROS' R turns the rec
 COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
 COLMAP |= {"SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8}
 
-Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
 Tree = dict[str, Any]  # a file, or a part of it
 Said = dict[str, tuple[str, Any]]  # key and value in a file, by what the key means
 Part = tuple[str, Said, list[str]]  # a camera's name, what the file says of it, and the keys that are not used
@@ -209,7 +209,7 @@ def _camera(said: Said, image_size: tuple[int, int] | None) -> Camera:
     return BrownCamera(k=coefficients[[0, 1, 4]], p=coefficients[[2, 3]], **lens)
 
 
-def _numbers(name: str, value: Any, expected: str, *counts: int) -> Array:
+def _numbers(name: str, value: Any, expected: str, *counts: int) -> Floats:
     """Return numbers in lists, or in OpenCV's rows, cols and data, as one row; CameraError for other counts."""
     try:
         if isinstance(value, dict):
@@ -232,7 +232,7 @@ def _is_fisheye(said: Said) -> bool:
     return FISHEYE[str(model)] or bool(_numbers(*said.get("fisheye_model", ("", 0)), "0 or 1", 1)[0])
 
 
-def _coefficients(said: Said, fisheye: bool) -> Array:
+def _coefficients(said: Said, fisheye: bool) -> Floats:
     if "distortion_coefficients" not in said:
         do = "add distortion_coefficients to the file: k1, k2, p1, p2, k3; zeros for a lens without distortion"
         raise camera_error("distortion_coefficients", "the lens' coefficients", "none under a known name", do)

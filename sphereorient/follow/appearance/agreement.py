@@ -13,7 +13,7 @@ from sphereorient.calibration.comparison import Seen, limits_of
 from sphereorient.calibration.contradictions import compare_cameras, majority
 from sphereorient.cameras import perspective_centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, Reason, refusal
-from sphereorient.follow.appearance.presence import nothing, proven, seldom
+from sphereorient.follow.appearance.presence import no_sphere_error, proven, seldom
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Frame
 from sphereorient.pose.camera_view import Picture, widest_px
@@ -68,7 +68,7 @@ def proven_poses(found: Sequence[Poses]) -> ProvenPoses:
     """
     rows = proven(found)
     if not rows:
-        raise nothing(found)
+        raise no_sphere_error(found)
     return ProvenPoses(found=found, frame=rows, poses=best_poses([found[k] for k in rows]))
 
 
@@ -81,7 +81,7 @@ def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found
     """
     fitter = search.fitter
     if len(fitter.views) == 1 and not proven(found):
-        raise nothing(found)
+        raise no_sphere_error(found)
     gain, gap_px = _apart(fitter, [[shot.picture for shot in frame] for frame in frames], found)
     if gain <= APART_GAIN and gap_px <= APART_PX and not (len(fitter.views) > 1 and seldom(found)):
         return proven_poses(found)
@@ -90,7 +90,7 @@ def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found
     _check_cameras(fitter, each)
     seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in proven(of_camera)]
     if not seen or not proven(found):
-        raise nothing(found)
+        raise no_sphere_error(found)
     frame, camera = (list(one) for one in zip(*seen, strict=True))
     X, R, _ = best_poses([each[c][k] for k, c in seen])
     use = torch.nn.functional.one_hot(torch.tensor(camera), len(each)).bool()
@@ -149,11 +149,11 @@ def limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
     """
     found = torch.zeros(len(fitter.views), dtype=torch.float64)
     for k, view in enumerate(fitter.views):
-        told = use[:, k] & (use.sum(1) > 1)
+        shared = use[:, k] & (use.sum(1) > 1)
         to_centre = fit.position_lab_mm - perspective_centre_lab_mm(view.camera, fit.position_lab_mm)
         nearer = -(fit.own_move[:, k] * to_centre).sum(-1) / to_centre.square().sum(-1)
-        if int(told.sum()) >= FEWEST_BOTH:
-            found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[told].median()
+        if int(shared.sum()) >= FEWEST_BOTH:
+            found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[shared].median()
     return found
 
 
@@ -196,8 +196,8 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     others_px = []
     for k, m in combinations(range(cameras), 2):
         turn = so3.geodesic_distance(alone[k][2], alone[m][2])
-        told = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
-        others_px.append(turn * told * radius_px)
+        apart = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
+        others_px.append(turn * apart * radius_px)
     for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
         centre = perspective_centre_lab_mm(one_camera, X)
         sight = torch.nn.functional.normalize(X - centre, dim=-1)

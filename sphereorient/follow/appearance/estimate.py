@@ -113,8 +113,8 @@ def _chosen(
     sure, few, log_odds = proven(found), len(frames) <= FEW, None
     if few or seldom(found):
         posed = [k for k, poses in enumerate(found) if len(poses)]
-        told = range(len(frames)) if few else (sure or posed)[:FEW]
-        odds = map_odds(search, [frames[k] for k in told], [found[k] for k in told], only=among is None)
+        some = range(len(frames)) if few else (sure or posed)[:FEW]
+        odds = map_odds(search, [frames[k] for k in some], [found[k] for k in some], only=among is None)
         odds.check([view.name for view in search.fitter.views], found=bool(sure))
         log_odds = float(odds.log_odds.sum()) if few else None
     sample = agreeing_poses(search, frames, found) if among is None else proven_poses(found)

@@ -50,13 +50,13 @@ def _exposed(
     search = replace(search, fitter=fitter)
 
     def measured(some: Tensor) -> Tensor:
-        shots = following.shots([rows[k] for k in some.tolist()])
-        usable = torch.tensor([[shot.usable for shot in frame] for frame in shots])
+        frames = following.frames([rows[k] for k in some.tolist()])
+        usable = torch.tensor([[shot.usable for shot in frame] for frame in frames])
         before, seen = fit.of(some), use[some]
         share = following.open_share[[rows[k] for k in some.tolist()]]
 
         def from_poses(these: Tensor, X: Tensor, R: Tensor) -> Tensor:
-            pictures = [[shot.picture for shot in shots[k]] for k in these.tolist()]
+            pictures = [[shot.picture for shot in frames[k]] for k in these.tolist()]
             known, shown, was = seen[these], usable[these], before.of(these)
             beside = None if others is None else others.of(some[these])
             there = fitter.fit_through(fitter.optics.steps, pictures, PoseStart(X, R, known & shown, among=beside))
@@ -68,7 +68,7 @@ def _exposed(
         way = from_poses(torch.arange(len(some)), before.position_lab_mm, before.R_lab_body)
         # Of a ball that turns far between frames the next pose has to be searched for.
         lost = [k for k in torch.nonzero(way.isnan().any(1))[:, 0].tolist() if others is None and bool(usable[k].all())]
-        found = dict(zip(lost, search.all_poses([shots[k] for k in lost]), strict=True))
+        found = dict(zip(lost, search.all_poses([frames[k] for k in lost]), strict=True))
         again = torch.tensor([k for k in lost if len(found[k])], dtype=torch.int64)
         if len(again):
             X, R, _ = best_poses([found[k] for k in again.tolist()])

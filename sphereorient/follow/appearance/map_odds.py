@@ -50,12 +50,12 @@ class MapOdds:
             f"{one} of {name}, {other} of its mirror image" for name, one, other in both
         )
         if wrong := [name for name, one in zip(cameras, odds.tolist(), strict=True) if one < -math.log(SURE_ODDS)]:
-            got += f": odds of {_told(-odds.min())} that it is mirrored"
+            got += f": odds of {_odds_words(-odds.min())} that it is mirrored"
             flip = ", ".join(f"{name}: horizontal" for name in wrong)
             do = f"write flip: {{{flip}}}, remove one that is there, or correct a map that is mirrored or upside down"
             raise ExperimentError(refusal("movies", expected="pictures that are not mirrored", got=got, do=do))
         if found and float(odds.sum()) < math.log(LEAST_ODDS):
-            got += f": odds of {_told(odds.sum())} against chance"
+            got += f": odds of {_odds_words(odds.sum())} against chance"
             expected = f"a map with odds of {LEAST_ODDS:.0f} to 1"
             raise ExperimentError(refusal("movies", expected=expected, got=got, do=LOOK_ALIKE))
 
@@ -81,10 +81,10 @@ def map_odds(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequ
     views, radius_mm = search.fitter.views, search.fitter.radius_mm
     alone = [replace(search, fitter=search.fitter.of(k), known=None, least=0.0) for k in range(len(views))]
 
-    def compared(shots: Sequence[Frame], poses: Poses, k: int) -> tuple[float, float]:
-        if not shots[k].usable:
+    def compared(frame: Sequence[Frame], poses: Poses, k: int) -> tuple[float, float]:
+        if not frame[k].usable:
             return math.nan, math.nan
-        view, picture = views[k], shots[k].picture
+        view, picture = views[k], frame[k].picture
         posed, several = len(poses) > 0 and bool(poses.use[k]), len(views) > 1
         disk = search.outline(picture, view)[0] if not posed or (only and several) else None
         if posed and disk is None:
@@ -126,7 +126,7 @@ def _percent(score: Tensor) -> list[str]:
     return [f"{100 * one:.0f} %" for one in median.tolist()]
 
 
-def _told(log_odds: Tensor) -> str:
+def _odds_words(log_odds: Tensor) -> str:
     odds = math.exp(min(float(log_odds), MOST))
     if odds < LEAST_ODDS:
         return f"{odds:.1f} to 1"

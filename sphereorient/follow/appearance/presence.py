@@ -81,7 +81,7 @@ def _times_better(found: Sequence[Poses], clear: Sequence[int]) -> float:
     return float((left[:, 1] / left[:, 0]).median())
 
 
-def nothing(found: Sequence[Poses]) -> ExperimentError:
+def no_sphere_error(found: Sequence[Poses]) -> ExperimentError:
     """Return the error of a movie without the sphere, or without a pose that fits."""
     reasons = {str(why) for poses in found for why in poses.reason} - {Reason.OK}
     why = f" ({', '.join(sorted(reasons))})" if reasons else ""
@@ -118,15 +118,15 @@ def _poses_of_all(search: Initialiser, frames: Sequence[Sequence[Frame]]) -> lis
     return [_seen_by_all(search.fitter, *one) for one in zip(frames, search.all_poses(frames), strict=True)]
 
 
-def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:
+def _seen_by_all(fitter: Fitter, frames: Sequence[Frame], poses: Poses) -> Poses:
     """Let cameras without an outline count too where one pose explains all pictures: black paint may hide a rim."""
-    usable = torch.tensor([shot.usable for shot in shots])
+    usable = torch.tensor([shot.usable for shot in frames])
     if not len(poses) or bool((poses.use == usable).all()):
         return poses
-    pictures = [[shot.picture for shot in shots]] * len(poses)
+    pictures = [[shot.picture for shot in frames]] * len(poses)
     X, R, use = poses.position_lab_mm, poses.R_lab_body, usable.expand(len(poses), -1)
     fit = fitter.fit_through(fitter.optics.steps, pictures, PoseStart(X, R, use))
     order = fit.nll.argsort(stable=True)
     if float(fit.score[order[0], usable].min()) < clear_of(float(poses.score[0, poses.use].min())):
         return poses
-    return poses_of(fit, order, usable, [Reason.OK if shot.usable else shot.reason for shot in shots])
+    return poses_of(fit, order, usable, [Reason.OK if shot.usable else shot.reason for shot in frames])

@@ -80,7 +80,7 @@ class Appearance:
 class Following:
     """Frames beside those studied, from which the motion while the shutter is open is measured."""
 
-    shots: Callable[[Sequence[int]], Sequence[Sequence[Frame]]]  # by index of the studied frame
+    frames: Callable[[Sequence[int]], Sequence[Sequence[Frame]]]  # by index of the studied frame
     open_share: Tensor  # (n,), exposure over the time from each studied frame to that beside it; negative: it is before
 
 

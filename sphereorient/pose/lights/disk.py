@@ -194,9 +194,9 @@ def _drawn(weight: Tensor, pull: Tensor, glint: Tensor) -> Tensor:
     whole = weight.sum(0).clamp_min(1e-30)
     mean, number = pull.sum(0) / whole, (weight > 0).sum(0)
     error2 = (pull - weight * mean).square().sum(0) / whole.square() * number / (number - 1)
-    told = number > 1
-    signal2 = torch.where(told, glint.square() - error2, 0.0).sum(1) / told.sum(1).clamp_min(1)
-    drawn = torch.where(told, whole * error2 / signal2.clamp_min(1e-12)[:, None], math.inf)
+    known = number > 1
+    signal2 = torch.where(known, glint.square() - error2, 0.0).sum(1) / known.sum(1).clamp_min(1)
+    drawn = torch.where(known, whole * error2 / signal2.clamp_min(1e-12)[:, None], math.inf)
     return drawn.nan_to_num(posinf=1e30)
 
 

@@ -11,7 +11,7 @@ from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.files.threads import side_by_side
-from sphereorient.pose.compiled import residuals
+from sphereorient.pose.compiled import residuals_compiled
 from sphereorient.pose.model import (
     LATER,
     Light,
@@ -190,14 +190,14 @@ def lab_light(
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
     used = use.reshape(-1, 1)
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
+    at = residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
     bases = _bases(at.view, pixels)
     light, rounds = (_flat(model.light, at.view, pixels, use), ROUNDS) if first is None else (first, AGAIN)
     light = replace(light, stray=learn_stray(at, pixels, use, light.stray))
     for _ in range(rounds):
         light = _better(light, at, pixels, used, bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
-        at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
+        at = residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, state, model)
     counted = at.inside & ~pixels.clipped & used
     light = replace(light, noise=noise_curves(at.model, at.residual, counted, use.shape[1]))
     return light.with_lean(at.view, pixels, use)
@@ -305,9 +305,9 @@ def _sums(
         return some, left_over, taken[:, :count:tints]
 
     # A few poses at a time: the columns of all would fill the memory.
-    told = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
+    blocks = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
     whole, factor = torch.zeros(width, width).double(), torch.zeros(len(used), width).double()
-    for some, sums, own_part in side_by_side(of_poses, [part.tolist() for part in told]):
+    for some, sums, own_part in side_by_side(of_poses, [part.tolist() for part in blocks]):
         by_pose(factor, cameras)[some] = own_part
         whole += sums
     return whole, factor

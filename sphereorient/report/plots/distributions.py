@@ -26,7 +26,7 @@ SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or l
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
 
 
-def figures(of: look.Reported) -> Iterator[look.Plan]:
+def distribution_figures(of: look.Reported) -> Iterator[look.Plan]:
     """Yield the figures of this file in a report."""
     summary, _, _ = of
     if (more := summary.distributions) is None:

@@ -25,7 +25,7 @@ NOISE_WORDS = {"added": "noise in the variance (%)", "removed": "variance smooth
 WIDTHS_OF = ("acceleration", "alpha_lab")
 
 
-def figures(of: look.Reported) -> Iterator[look.Plan]:
+def quality_figures(of: look.Reported) -> Iterator[look.Plan]:
     """Yield the figures of this file in a report."""
     summary, _, distances = of
     if any(len(one.distance_rad) for one in distances):

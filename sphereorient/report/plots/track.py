@@ -16,9 +16,7 @@ from sphereorient.experiment.recording import spread_frames
 from sphereorient.report.plots import style as look
 from sphereorient.trajectory import Trajectory, runs_of
 from sphereorient.trajectory.datasets import in_length
-from sphereorient.trajectory.rotations import tait_bryan, tait_bryan_sigma
-
-Floats = NDArray[np.float64]
+from sphereorient.trajectory.rotations import Floats, tait_bryan, tait_bryan_sigma
 
 MOST_FRAMES = 2000  # more are not distinguishable on a page
 GAP = 1.5  # typical steps: a longer one is a gap
@@ -34,7 +32,7 @@ RATES = {
 }
 
 
-def figures(of: look.Reported) -> Iterator[look.Plan]:
+def track_figures(of: look.Reported) -> Iterator[look.Plan]:
     """Yield the tracks of the recording with most valid frames, and their path."""
     _, tracks, _ = of
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))

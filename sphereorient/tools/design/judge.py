@@ -97,7 +97,7 @@ def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Ju
     settings = DesignSettings() if settings is None else settings
     direction = patterns.view_directions(settings.views)
     R = patterns.facing(direction)
-    alike, two = most_similar_views(texture, R, settings.apart_deg)
+    alike, two = greatest_similarity(texture, R, settings.apart_deg)
     return Judgement(
         settings=settings,
         direction_body=direction,
@@ -110,7 +110,7 @@ def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Ju
     )
 
 
-def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
+def greatest_similarity(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
     """Return the greatest similarity, <= 1, of two views at least `apart_deg` apart, and these, (2, 3, 3) float64.
     Views (V, 3, 3) of a map (H, 2 H) are compared with all of SO(3).
     """

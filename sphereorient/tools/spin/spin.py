@@ -37,7 +37,7 @@ class SpinSettings(BaseModel, frozen=True, extra="forbid"):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SpinFound:
+class SpinEstimate:
     """A spin from F photographs, with K - 1 aliases; view frame: x right, y down, z from the camera to the ball."""
 
     spins: Spins  # those that the pictures do not distinguish first, by rate; then by evidence
@@ -57,7 +57,7 @@ def spin_of(
     texture: Tensor | DotTable,
     settings: SpinSettings | None = None,
     progress: Progress = silent,
-) -> SpinFound:
+) -> SpinEstimate:
     """Find the uniform spin of a ball of known texture from photographs of a far, uncalibrated camera.
     Times at multiples of one step allow several spins, whole turns per step apart: all below the limit are returned.
     `texture` is the map (H, 2 H), 0 black .. 1 white, or a table of dots. Raise PaintError for no ball, no spin better
@@ -87,7 +87,7 @@ def spin_of(
     predicted = spins.R_view_body(time_s)[0]
     apart = so3.geodesic_distance(own, predicted)
     followed = apart < FOLLOWED_RAD
-    return SpinFound(
+    return SpinEstimate(
         spins=spins,
         ambiguous=int(close.sum()),
         evidence=fit.evidence_of(seen, spins),
@@ -138,7 +138,7 @@ def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int)
 
 
 @in_style
-def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequence[str]) -> Figure:
+def spin_figure(found: SpinEstimate, texture: Tensor, time_s: Tensor, names: Sequence[str]) -> Figure:
     """Draw photographs and the map (H, 2 H) at the first spin's orientations, in order of the times (F,), s."""
     chosen = time_s.argsort()[:MOST_DRAWN].tolist()
     size, rows = found.disks.shape[-1], math.ceil(len(chosen) / COLUMNS)

@@ -19,7 +19,7 @@ from sphereorient.sphere import Sampling, load_texture, sample_texture
 from sphereorient.sphere.texture import map_directions
 from sphereorient.tools.design.bound import cramer_rao_bound
 from sphereorient.tools.design.gores import Gores, gores_figure, instructions
-from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture, most_similar_views
+from sphereorient.tools.design.judge import DesignSettings, design_texture, greatest_similarity, judge_texture
 from sphereorient.tools.design.patterns import (
     PATTERNS,
     border_length,
@@ -105,11 +105,11 @@ def test_the_two_faces_of_a_ball_painted_twice_alike_are_found():  # planted
     texture = patterned_texture("blobs", 25.0, 1, 128)
     twice = torch.cat([texture[:, :128], texture[:, :128]], dim=1)  # half a turn about z changes nothing
     R = facing(view_directions(12))
-    alike, two = most_similar_views(twice, R, 20.0)
+    alike, two = greatest_similarity(twice, R, 20.0)
     assert alike > 0.98
     half_turn = so3.exp(torch.tensor([0.0, 0.0, math.pi], dtype=torch.float64))
     assert math.degrees(float(so3.geodesic_distance(two[0] @ half_turn, two[1]))) < 4
-    assert most_similar_views(texture, R, 20.0)[0] < 0.95
+    assert greatest_similarity(texture, R, 20.0)[0] < 0.95
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_views_that_are_near_each_other_are_not_counted_as_alike():
     texture = patterned_texture("patches", 20.0, 2, 128)
     R = facing(view_directions(12))
     for apart in (20.0, 60.0):
-        _, two = most_similar_views(texture, R, apart)
+        _, two = greatest_similarity(texture, R, apart)
         assert math.degrees(float(so3.geodesic_distance(two[0], two[1]))) > apart - 0.01
 
 
