@@ -357,7 +357,7 @@ def test_without_a_map_outline_and_axes_are_shown(tmp_path):
     assert page.balls[0].views[0].light is None
     drawn = page.draw(K, pictures)
     assert (np.abs(drawn.astype(int) - OUTLINE) < 40).all(-1).sum() > 300
-    assert page.balls[0].views[0].why_unlit == "no map of the paint"
+    assert page.balls[0].views[0].why_unlit == "no texture map"
 
 
 @pytest.mark.slow

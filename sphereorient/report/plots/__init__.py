@@ -1,4 +1,4 @@
-"""The figures of the paper's section IV; a file's `figures` are those on the page of a report."""
+"""The figures of the paper's section IV; `figures` of each file yields those of a report."""
 
 from collections.abc import Iterator
 
@@ -21,6 +21,6 @@ from sphereorient.report.plots.track import path_figure, track_figure
 
 
 def report_figures(of: Reported) -> Iterator[Plan]:
-    """Yield the figures of a report in its order."""
+    """Yield the figures of a report in order."""
     for file in (track, quality, distributions):
         yield from file.figures(of)
