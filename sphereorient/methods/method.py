@@ -109,7 +109,7 @@ class Learnt:
             other = {name: shape for name, shape in used.items() if known.get(name) != shape} or used
             expected, got = (", ".join(f"{name} {shape}" for name, shape in each.items()) for each in (other, known))
             do = "pass a file of the same cameras"
-            raise TrackError(refusal("learnt", expected=f"a file of {expected}", got=got, do=do))
+            raise TrackError(refusal("learnt", expected=f"learnt results of {expected}", got=got, do=do))
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
         base = finest_table(recording.texture, widest, recording.unseen)
