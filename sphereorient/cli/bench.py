@@ -150,7 +150,7 @@ def print_errors(errors_deg: "Floats", ball: str, word: str = "error") -> None:
 def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table:
     """Return gain, drift, heading and path against a reference as a table."""
     of, against = f" of ball {ball}" if ball else "", "the exact truth" if exact else "another tracker"
-    title = f"Behaviour{of} against {against}, {found.pairs} turns from frame to frame"
+    title = f"Behaviour{of} against {against}, {found.pairs} rotations between frames"
     table = Table("quantity", "x", "y", "z", "along the rotation", title=title)
 
     def gains(name: str, gain: "Interval") -> None:

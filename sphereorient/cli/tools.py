@@ -111,8 +111,8 @@ def _print_spin(result: dict[str, Any]) -> None:
         ambiguous = result["ambiguous"] > 1 and not one["distinguished"]
         words = "; alias that the times do not exclude" if ambiguous and k else "" if not k else "; less likely"
         typer.echo(
-            f"omega ({omega}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} rad/s = {rate / (2 * math.pi):.2f} turns/s, "
-            f"evidence {one['evidence']:.0f}{words}"
+            f"omega ({omega}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} rad/s = {rate / (2 * math.pi):.2f} revolutions/s"
+            f", evidence {one['evidence']:.0f}{words}"
         )
     followed = [one["residual_deg"] for one in result["photographs"] if one["residual_deg"] is not None]
     typer.echo(

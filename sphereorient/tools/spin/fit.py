@@ -143,7 +143,7 @@ def evidence_of(seen: PictureCandidates, spins: Spins) -> Tensor:
 
 
 def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Return spins through two candidates of neighbouring pictures, with any number of whole turns between them."""
+    """Return spins through two candidates of neighbouring pictures, with any number of revolutions between them."""
     order = seen.time_s.argsort(stable=True)
     gap = seen.time_s[order].diff()
     usable = torch.nonzero(gap > 0)[:, 0]
@@ -176,7 +176,7 @@ def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
 
 
 def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Return a spin with whole turns per step added, in both directions, up to the limit."""
+    """Return a spin with whole revolutions per step added, in both directions, up to the limit."""
     # Move R0 to the time of a picture, where all aliases agree.
     nearest = (seen.time_s - best.time0_s).abs().argmin()[None]
     best = replace(best, R0_view_body=best.R_view_body(seen.time_s)[:, nearest[0]], time0_s=seen.time_s[nearest])
