@@ -35,7 +35,7 @@ class _TrackOptions(CameraOptions):
     jobs: Annotated[int, Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1
     cluster: Annotated[str | None, Option(help="Dask cluster: address or file of its scheduler, or local.")] = None
     resume: Resume = False
-    learnt: Annotated[Path | None, Option(help="File that another run of these cameras wrote (--save-learnt).")] = None
+    learnt: Annotated[Path | None, Option(help="Use a file that --save-learnt wrote for these cameras.")] = None
     save_learnt: Annotated[Path | None, Option(help="Write what is learnt: empty scenes, light, scores, noise.")] = None
     proposer: Annotated[str | None, Option(help="Proposer's checkpoint, or default (docs/proposer.md).")] = None
     no_learn_paint: Annotated[bool, Option("--no-learn-paint", help="Use the map even where paint differs.")] = False
@@ -176,7 +176,7 @@ class _LiveOptions(CameraOptions):
     experiment: ExperimentPath
     source: Annotated[
         str,
-        Option(help="movie, at its rate; movie-fast; - (stdin); shared:FILE; camera:0; genicam:X.cti#A; pylon:A,B"),
+        Option(help="movie; movie-fast; - (stdin); shared:FILE; camera:0; genicam:X.cti#A; pylon:A,B; vimba:A"),
     ] = "movie"
     to: Annotated[
         list[str] | None,
