@@ -71,7 +71,7 @@ def _learning(
 
     if not experiment.fixed:
         got, do = "one that moves, and no map", "learn the map from a movie with `sphereorient track`"
-        raise ExperimentError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
+        raise ExperimentError(refusal("sphere.fixed", expected="a fixed ball", got=got, do=do))
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         tracker = LearningTracker(held_place(recording, settings.paint, settings.locate))
 

@@ -173,7 +173,7 @@ def _scene(recording: Recording, stream: CameraStream, settings: MapSettings, lo
     wander = 0.0 if circle else wander_px(pictures, scene, locating)
     if wander:
         got, do = f"one that moves by {wander:.1f} px in {stream.name}", "set `fixed: sways`"
-        raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
+        raise PaintError(refusal("sphere.fixed", expected="a fixed ball", got=got, do=do))
     return scene
 
 

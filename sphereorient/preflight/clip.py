@@ -31,7 +31,7 @@ class Clip:
     def __init__(self, experiment: Experiment) -> None:
         if not experiment.alone or not experiment.fixed:
             do = "track it with `sphereorient track`"
-            raise refused(f"{experiment.path}, sphere.fixed", "one ball that stays in its place", "another", do)
+            raise refused(f"{experiment.path}, sphere.fixed", "one fixed ball", "another", do)
         with open_recording(experiment, textured=False) as recording:
             self._frame_s = recording.timeline.frame_s
             read = {one.name: one.pictures(0, FRAMES) for one in recording.streams}

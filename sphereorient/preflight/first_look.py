@@ -87,7 +87,7 @@ class FirstLook:
         seen = f"found in {self.found} of {self.looked} {'parts of the movie' if self.together else 'frames'}"
         seen += f", {self.apart_px:.1f} px apart" if math.isfinite(self.apart_px) else ""
         seen = "as given, as the movie shows none clearly" if self.given == self.outline.circle else seen
-        stays = "sways in its place" if self.sways else f"stays in its place, outline {seen}"
+        stays = "sways in its place" if self.sways else f"fixed, outline {seen}"
         where = "one picture" if self.photograph else stays if self.stays else f"moves, {seen}"
         told = f"ball of {self.diameter_px:.{int(bool(self.stays))}f} px, {where}"
         if self.given is not None and self.given != self.outline.circle:
