@@ -251,11 +251,11 @@ def missed_text(track: Trajectory) -> list[str]:
         usual = next(iter(lost), None)
         if usual not in (*MISSED, Reason.RUNAWAY) or sum(lost.values()) < pictures:
             continue
-        text = f"no ball found in {pictures} examined frames"
+        text = f"no ball found in {pictures} frames examined"
         if usual == Reason.RUNAWAY:
             text = RUNAWAY.format(pictures=pictures)
         if usual == Reason.LOW_SCORE:
-            text = f"no pose of the map explains any of {pictures} examined frames"
+            text = f"no pose of the map explains any of {pictures} frames examined"
             text += "" if track.valid.any() else f"; {LOOK_ALIKE}"
         told.setdefault(text, []).append(name)
     return [f"{', '.join(names)}: {text}" for text, names in told.items()]
