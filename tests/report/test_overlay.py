@@ -229,7 +229,7 @@ def test_frames_of_doubt_are_marked(ready):
     assert (doubtful.draw(K, pictures)[corner] == DOUBT).all()
     assert (lost.draw(K, pictures)[corner] == LOST).all()
     assert not (plain[corner] == DOUBT).all()
-    assert "doubt: picture explained less well" in doubtful.balls[0].state(K)[0]
+    assert "doubt: fit worse than usual" in doubtful.balls[0].state(K)[0]
     assert "not valid" in lost.balls[0].state(K)[0]
 
 
