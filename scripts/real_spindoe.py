@@ -87,7 +87,7 @@ def spins(found: SpinEstimate, rate_reference: float) -> None:
         told = ", ".join(f"{each:.1f}" for each in omega)
         sigma = float(found.spins.rate_sigma()[k])
         print(
-            f"omega ({told}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} = {rate / (2 * math.pi):.1f} turns/s{off}: "
+            f"omega ({told}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} = {rate / (2 * math.pi):.1f} revolutions/s{off}: "
             f"{which}, evidence {float(found.spins.evidence[k]):.0f}"
         )
     print(f"mirrored table: evidence {found.mirrored_evidence:.0f}")

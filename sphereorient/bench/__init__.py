@@ -1,4 +1,4 @@
-"""Benchmarks on synthetic movies with truth: scores, robustness, several balls, and the delay of live tracking."""
+"""Benchmarks on synthetic movies with truth: scores, robustness, several balls, and the latency of live tracking."""
 
 from sphereorient.bench.results import Results, SceneResult, compare_runs, load_results
 from sphereorient.bench.run import run_benchmark, run_benchmarks

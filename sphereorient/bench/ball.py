@@ -1,5 +1,5 @@
-"""A ball under an animal, filmed by one camera, of which nothing is known: scenes with the numbers of spintrack's
-benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of results and families.py); pictures and motions are drawn anew.
+"""A ball under an animal, filmed by one camera, without prior knowledge: scenes with the parameters of spintrack's
+benchmark (NeLy-EPFL/spintrack, Apache-2.0, page of results and families.py), but own pictures and motions.
 """
 
 import math
@@ -50,11 +50,11 @@ Floats = NDArray[np.float64]
 RATE_HZ = 100.0
 RADIUS_MM = 5.0
 ROWS = 512  # of the paint
-SAMPLES = 2  # of a pixel and axis
-EXPOSURES = 4  # instants of an exposure
-SWAY_FRAMES = 8  # over which a ball that sways moves smoothly
-BEHIND, BEHIND_NOISE = 55.0, 3.0  # grey levels: a pattern that stays
-AWAY_DEG = 30.0  # by which the camera looks down at the ball
+SAMPLES = 2  # per pixel and axis
+EXPOSURES = 4  # instants per exposure
+SWAY_FRAMES = 8  # correlation time of the sway
+BEHIND, BEHIND_NOISE = 55.0, 3.0  # grey levels of the static background
+AWAY_DEG = 30.0  # downward tilt of the camera
 GREY_BODY, GREY_LEG = 28.0, 22.0
 
 
@@ -71,9 +71,9 @@ class Caps:
 
 @dataclass(frozen=True, kw_only=True)
 class BallScene:
-    """One scene; what peers print of theirs: median and 95 % of the steps, degrees, and drift, degrees a minute."""
+    """One scene; `fictrac`, `spintrack`: published median and 95 % of the steps, degrees, and drift, degrees/min."""
 
-    motion: str = "walk"  # or saccades: a third of the way, the same turns
+    motion: str = "walk"  # or saccades: a third of the forward motion, same rotations
     paint: Caps = field(default_factory=Caps)
     size: tuple[int, int] = (640, 480)  # px
     field_deg: float = 30.0  # vertical field of view
@@ -90,10 +90,10 @@ class BallScene:
     exposure: float = 0.0  # share of the time between frames
     legs: int = 0
     dust: int = 0
-    sway_px: float = 0.0  # by which the ball sways in its holder, rms
-    sway_share: float = 0.0  # of its distance, rms, along the line of sight
-    sink_px: float = 0.0  # by which it sinks over the movie
-    fictrac: tuple[float, float, float] = (math.nan,) * 3  # as printed
+    sway_px: float = 0.0  # sway of the ball in its holder, rms
+    sway_share: float = 0.0  # of the distance, rms, along the line of sight
+    sink_px: float = 0.0  # over the movie
+    fictrac: tuple[float, float, float] = (math.nan,) * 3  # as published
     spintrack: tuple[float, float, float] = (math.nan,) * 3
 
 
@@ -151,7 +151,7 @@ SCENES: Mapping[str, BallScene] = {
 
 
 def painted(paint: Caps, rng: np.random.Generator) -> Singles:
-    """Return a map (H, 2 H) of caps that do not touch, over a ball with twelve large faint ones."""
+    """Return a map (H, 2 H) of separate caps over twelve large faint ones."""
     directions = map_directions(ROWS).float().numpy()
     grey = np.full(directions.shape[:2], paint.base, np.float32)
 
@@ -188,7 +188,7 @@ def _wandering(rng: np.random.Generator, count: int, sigma: float, frames: float
 
 
 def walked(count: int, rng: np.random.Generator, forward_share: float = 1.0) -> NDArray[np.float64]:
-    """Return the turns (N, 3), rad, lab, of a ball under a fly that walks and stops, as spintrack publishes them."""
+    """Return the rotations (N, 3), rad, lab, of a ball under a fly that walks and stops, after spintrack."""
     walks, k, on = np.zeros(count, bool), 0, True
     speed = np.zeros(count)
     while k < count:
@@ -213,7 +213,7 @@ def walked(count: int, rng: np.random.Generator, forward_share: float = 1.0) -> 
 
 
 def _camera(scene: BallScene) -> PinholeCamera:
-    """Return the camera, behind the animal and looking down; lab: forward, right, down about its own place."""
+    """Return the camera, behind the animal and tilted down; lab: forward, right, down, origin at the camera."""
     c, s = math.cos(math.radians(AWAY_DEG)), math.sin(math.radians(AWAY_DEG))
     return PinholeCamera(
         image_size=scene.size,
@@ -251,7 +251,7 @@ class _Film:
         self.scene, self._camera, self._paint, self._rng = scene, camera, paint, rng
         (u, v), (width, height) = camera.project(X).tolist(), scene.size
         self.radius_px, self.middle = float(camera.f_px) * math.tan(math.radians(scene.half_deg)), (u, v)
-        self._X = torch.full_like(X, torch.nan)  # nowhere yet
+        self._X = torch.full_like(X, torch.nan)  # not set yet
         self._put(X)
         rows, columns = np.mgrid[:height, :width]
         away = (columns - width / 2) ** 2 + (rows - height / 2) ** 2
@@ -265,7 +265,7 @@ class _Film:
             self._gain *= (1 - 0.5 * spot).astype(np.float32)
 
     def _put(self, X: Tensor) -> None:
-        """Put the ball at a place (3,), mm, lab."""
+        """Move the ball to a position (3,), mm, lab."""
         if torch.equal(self._X, X):
             return
         scene, camera, self._X = self.scene, self._camera, X
@@ -302,7 +302,7 @@ class _Film:
         )
 
     def frame(self, k: int, count: int, X: Tensor, R: Tensor, turns: tuple[Tensor, Tensor]) -> NDArray[np.uint8]:
-        """Return the picture of frame k, X and R in the middle of the exposure; `turns` (3,): to it, to the next."""
+        """Return the picture of frame k, with X and R at mid-exposure; `turns` (3,): rotation to it, to the next."""
         self._put(X)
         scene, share = self.scene, np.zeros(1)
         if scene.exposure:
@@ -322,7 +322,7 @@ class _Film:
         return np.asarray(noisy.round().clip(0, 255), np.uint8)
 
     def body(self) -> NDArray[np.uint8]:
-        """Return the mask of the animal's body: black where it hides the ball."""
+        """Return the mask of the animal's body, black where it hides the ball."""
         mask = np.full(self._behind.shape, 255, np.uint8)
         if self.scene.legs:
             self._ellipse(mask, 0.0, 1.1)
@@ -350,7 +350,7 @@ class _Film:
 
 
 def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, progress: Progress = silent) -> Path:
-    """Render a scene with exact truth and return its experiment.yaml, which names no map and no diameter."""
+    """Render a scene with exact truth; return its experiment.yaml, without map and diameter."""
     rng, camera = np.random.default_rng(seed), _camera(scene)
     X = _places(scene, camera, frames, rng)
     film = _Film(scene, camera, X[0], painted(scene.paint, rng), rng)
@@ -388,17 +388,17 @@ def write_ball_scene(folder: Path, scene: BallScene, frames: int, seed: int, pro
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BallErrors:
-    """Errors of one way of N frames of a scene, degrees; a constant turn of body and lab is taken off."""
+    """Errors of N frames of a scene, degrees, without constant rotations of body and lab."""
 
     found: int  # frames with an orientation
-    step_deg: NDArray[np.float64]  # of the turn from each frame to the next, where both have one
+    step_deg: NDArray[np.float64]  # of the rotation between neighbouring frames, if both have one
     orientation_deg: NDArray[np.float64]
-    over_sigma: float  # what varies from frame to frame over its stated sigma, rms of each axis
+    over_sigma: float  # error of the step over its stated sigma, rms per axis
     behaviour: Behaviour
 
     @classmethod
     def of(cls, time_s: Floats, ours: Floats, covariance: Floats, true: Floats) -> "BallErrors":
-        """Compare orientations (N, 3, 3), NaN: none, with true ones; covariances (N, 3, 3), lab, of what varies."""
+        """Compare orientations (N, 3, 3), NaN: none, with true ones; covariances (N, 3, 3), lab: independent part."""
         known: NDArray[np.bool_] = np.asarray(np.isfinite(ours).all((1, 2)))
         linked = known[1:] & known[:-1]
         turns = [rotation_vectors(one[1:] @ one[:-1].mT) for one in (ours, true)]
@@ -418,11 +418,11 @@ class BallErrors:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BallRow:
-    """What was measured of a scene."""
+    """The results of a scene."""
 
     first: BallErrors  # of the first pass
-    refined: BallErrors | None  # of the precise method by its map; None: left out
-    cpu_ms: float  # of a frame of the first pass, decoded
+    refined: BallErrors | None  # of the precise method by its map; None: not run
+    cpu_ms: float  # per frame of the first pass, with decoding
     radius_px: float
 
     def numbers(self) -> dict[str, Any]:
@@ -444,11 +444,11 @@ class BallRow:
 
 
 def measure_scene(path: Path, settings: Settings, refine: bool, progress: Progress = silent) -> BallRow:
-    """Track a scene from nothing; `refine`: by the precise method as well, with the map of the first pass."""
+    """Track a scene without a map; `refine`: then by the precise method, with the map of the first pass."""
     with h5py.File(path.with_name("truth.h5")) as file:
         R_true = file["orientation"][()]
     with open_recording(path, None, textured=False) as recording, one_thread():
-        count = len(recording.timeline)  # all frames are followed
+        count = len(recording.timeline)  # track all frames
         place = held_place(recording, settings.paint, settings.locate, progress, count)
         adjustment = first_adjustment(recording, place, progress)
         begun = time.process_time()

@@ -1,4 +1,4 @@
-"""What this machine can do: whether a fit is right here, how long it takes, and which rates `live` can hold."""
+"""Test of this machine: correctness and time of a fit, and frame rates that `live` can hold."""
 
 import time
 from dataclasses import replace
@@ -35,21 +35,21 @@ from sphereorient.pose.lasting import Lasting
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.trajectory.rotations import distance_deg
 
-LIMITS_DEG = {40.0: 0.3, 90.0: 0.1, 160.0: 0.1}  # by the ball's diameter, px: error that no right pose has
-FRAMES, FIRST = 40, 10  # of a ball; those that do not count: caches fill
+LIMITS_DEG = {40.0: 0.3, 90.0: 0.1, 160.0: 0.1}  # by the ball's diameter, px: limit of the error of a right pose
+FRAMES, FIRST = 40, 10  # of a ball; first ones left out, while caches fill
 STILL: dict[str, Any] = {"volume_mm": 1.0, "velocity_rms": 0.0, "exposure": 0.0, "exposure_samples": 1}
 TURNS = STILL | {"omega_rms": 3.0, "frame_rate": 200.0, "periodic": True}
-BUSY = 0.7  # share of the time in which the loop can compute: the rest is for lines and for what comes between
+BUSY = 0.7  # share of the time available to fits; the rest is for output and interruptions
 
 
 def machine() -> tuple[dict[str, Any], list[str]]:
-    """Return what is here and what it can do, by name, ready for JSON; and what is broken, a line each."""
+    """Return properties and performance of the machine, by name, for JSON; and faults, a line each."""
     free_cores = cores() * (1 - psutil.cpu_percent(0.5) / 100)
     parts, faults = compiled_parts()
     fits = []
     for px, limit_deg in LIMITS_DEG.items():
         name, expected = f"fit of a ball of {px:g} px", f"poses right to {limit_deg:g} degrees"
-        do = f"run it with {WITHOUT}=1: if that is right, compile anew"
+        do = f"run it with {WITHOUT}=1; if that is right, compile again"
         try:
             fits.append(fit_speed(px))
         except (SphereOrientError, RuntimeError, OSError) as error:
@@ -78,16 +78,16 @@ def machine() -> tuple[dict[str, Any], list[str]]:
 
 def _torch_is_right() -> bool:
     A, turn = torch.linspace(-1, 2, 9).reshape(3, 3).double(), torch.tensor([0.3, -0.2, 0.5]).double()
-    A, turn = A @ A.mT + torch.eye(3), turn.requires_grad_()  # with a gradient: no compiled code
+    A, turn = A @ A.mT + torch.eye(3), turn.requires_grad_()  # with a gradient, without compiled code
     (slope,) = torch.autograd.grad((back := so3.log(so3.exp(turn))).sum(), turn)
     pairs = (torch.linalg.inv(A), np.linalg.inv(A.numpy())), (back.detach(), turn.detach()), (slope, torch.ones(3))
     return all(np.allclose(one, other) for one, other in pairs)
 
 
 def fit_speed(diameter_px: float) -> dict[str, float]:
-    """Render a moving ball at known poses for one camera, and measure it as `live` does. Return the largest error of
-    the orientation (NaN: a frame without a pose), the time of a frame by this process and by the clock, and the rates
-    that can be held: by a free core, by a shared one, and now.
+    """Render a moving ball at known poses for one camera, and measure it as `live` does. Return the largest orientation
+    error (NaN: a frame without a pose), CPU and wall time per frame, and the rates that can be held on a free core, on
+    a shared one, and now.
     """
     side = 2 * round(0.8 * diameter_px)
     scene = SynthSettings(frames=FRAMES, cameras=1, diameter_px=diameter_px, image_size=(side, side), **TURNS)
@@ -114,7 +114,7 @@ def fit_speed(diameter_px: float) -> dict[str, float]:
 
 
 def _appearance(path: Path, scene: SynthSettings) -> Appearance:
-    """Return what `track` would learn of the pictures; their poses are known."""
+    """Return the appearance that `track` would learn, from known poses."""
     with open_recording(path) as recording, h5py.File(path.parent / "truth.h5") as truth:
         (stream,) = recording.streams
         pictures = [[picture] for picture, _ in stream.pictures() if picture is not None][::FIRST]

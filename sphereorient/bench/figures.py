@@ -22,7 +22,7 @@ LEAST_DEG, MOST_DEG = 3e-3, 180.0
 
 
 def robustness_figure(results: Results) -> Figure:
-    """Draw errors and bad frames (above 10 degrees, or lost) against severity, a panel for each degradation."""
+    """Draw errors and bad frames (above 10 degrees, or lost) against severity, a panel per degradation."""
     lines = summaries(results)
     kinds = worst_first(lines, results.methods)
     rows = math.ceil(len(kinds) / COLUMNS)
@@ -77,7 +77,7 @@ def _plain_axes(*panels: Any) -> None:
 
 
 def density_figure(runs: Sequence[Results]) -> Figure:
-    """Draw errors and shares of frames against the number density of balls, a curve for each number of cameras."""
+    """Draw errors and shares of frames against the number density of balls, a curve per number of cameras."""
     figure = new_figure(3 * PANEL[0] + 1.0, PANEL[1] + 0.9)
     turn, place, shares = figure.subplots(1, 3)
     for k, cameras in enumerate(sorted({run.settings.cameras for run in runs})):

@@ -1,4 +1,4 @@
-"""Delay and error of live tracking: from a picture in memory to the line on a socket, through two programs."""
+"""Latency and error of live tracking, from a picture in memory to the line on a socket, between two programs."""
 
 import os
 import socket
@@ -26,13 +26,13 @@ from sphereorient.live.sources import movie_frames
 from sphereorient.trajectory.rotations import distance_deg, rotations
 from sphereorient.trajectory.walk import FICTRAC
 
-BEGIN_S = 120.0  # until the tracker's first line
-QUIET_S = 2.0  # without a line: the end
-FIRST = 50  # lines that do not count: caches fill
-RIGHT_DEG = 1.0  # of a rotation that is right
-EVERY = 1000  # lines from one look at the memory to the next
-DARK_EVERY_S, DARK_S, STALL_S = 5.0, 0.5, 1.0  # of faults: pictures without light, and the tracker stopped once
-# Blurs and compresses pictures on one core until its parent ends, as a program that records another camera does.
+BEGIN_S = 120.0  # for the tracker's first line
+QUIET_S = 2.0  # without a line, until the end
+FIRST = 50  # lines left out, while caches fill
+RIGHT_DEG = 1.0  # largest error of a right rotation
+EVERY = 1000  # lines between measurements of memory
+DARK_EVERY_S, DARK_S, STALL_S = 5.0, 0.5, 1.0  # of faults: black pictures, and one stop of the tracker
+# Blurs and compresses pictures on one core until its parent ends, like a program that records another camera.
 NEIGHBOUR = """
 import os, sys, cv2, numpy
 cv2.setNumThreads(1)
@@ -44,19 +44,19 @@ while os.getppid() == int(sys.argv[1]):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveTiming:
-    """How long and at which rate pictures are written, and what `live` is told."""
+    """Rate and duration of the pictures, and options of `live`."""
 
     experiment: Path
     rate_hz: float
     seconds: float
     options: Sequence[str] = ()
     cameras: Sequence[str] | None = None
-    loop: bool = False  # the movie is shown from its begin again: it has no seam; else there and back again
-    faults: bool = False  # every 5 s half a second without light, and in the middle the tracker is stopped for a second
+    loop: bool = False  # restart the movie at its end; else play it forwards and backwards
+    faults: bool = False  # half a second of black pictures every 5 s, and one stop of the tracker for a second
 
     @property
     def frames(self) -> int:
-        """Number of frames that count."""
+        """Number of frames in use."""
         return round(self.seconds * self.rate_hz)
 
     def dark(self, number: int) -> bool:
@@ -72,23 +72,23 @@ class LiveTiming:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delays:
-    """What came of the frames that were written."""
+    """Results of the written frames."""
 
     written: int
-    delay_s: Floats  # (n,), of the lines that came, in order
-    lost: int  # of these, lines without a pose
-    error_deg: Floats  # (n,), of the rotation since the stretch began; NaN without pose or truth
-    memory_mb: Floats  # of the tracker, every so often
-    back_s: Floats  # (m,), from the end of each fault to the first pose that is right; inf: none came
-    wrong: int  # poses that are not right
+    delay_s: Floats  # (n,), of the received lines, in order
+    lost: int  # lines without a pose
+    error_deg: Floats  # (n,), of the rotation since the start of the stretch; NaN without pose or truth
+    memory_mb: Floats  # of the tracker, each `EVERY` lines
+    back_s: Floats  # (m,), from the end of each fault to the first right pose; inf: none
+    wrong: int  # wrong poses
 
     def delays_ms(self) -> list[str]:
-        """Return the delays that half of the lines keep, 99 and 99.9 % of them, ms, in words."""
+        """Return the 50, 99 and 99.9 % quantiles of the latency, ms, as text."""
         shares = (0.5, 0.99, 0.999)
         return [f"{1e3 * np.quantile(self.delay_s, share):.1f}" if len(self.delay_s) else "nan" for share in shares]
 
     def row(self) -> list[str]:
-        """Return what `COLUMNS` names."""
+        """Return the values of `COLUMNS`."""
         counts = [self.written, self.written - len(self.delay_s), self.lost]
         known = np.isfinite(self.error_deg).any()
         error = f"{np.nanmedian(self.error_deg):.3f}, {np.nanmax(self.error_deg):.3f}" if known else ""
@@ -96,7 +96,7 @@ class Delays:
         return [*map(str, counts), *self.delays_ms(), error, memory]
 
     def summary(self) -> list[str]:
-        """Return all of it in words."""
+        """Return the results as text."""
         came = len(self.delay_s)
         middle, slow, slowest = self.delays_ms()
         words = [f"{came} lines of {self.written} frames, {self.written - came} dropped, {self.lost} without a pose"]
@@ -135,7 +135,7 @@ def neighbours(count: int) -> Iterator[None]:
 
 
 class _Writer(Thread):
-    """Writes pictures into a ring at a rate, again and again, until the time is over since the first line came."""
+    """Writes pictures repeatedly into a ring at a rate, until a time after the first line."""
 
     def __init__(self, ring: SharedFrames, pictures: Sequence[Sequence[NDArray[np.generic]]], timing: LiveTiming):
         super().__init__(daemon=True)
@@ -150,7 +150,7 @@ class _Writer(Thread):
         while left > 0 and not self.ended.is_set():
             self.written_s.append(time.perf_counter())
             shown = self._black if self._timing.dark(number) else pictures[number % len(pictures)]
-            # The time as a camera's clock tells it; this program may be late.
+            # The time by an ideal camera's clock; this program may be late.
             self._ring.write(first_s + number / rate_hz, shown)
             number, left = number + 1, left - self.begun.is_set()
             time.sleep(max(0.0, first_s + number / rate_hz - time.perf_counter()))
@@ -158,7 +158,7 @@ class _Writer(Thread):
 
 def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
     """Write an experiment's pictures into memory at a rate, and time the lines of `live`; errors by a truth.h5 beside
-    it. Raises SphereOrientError: the tracker ends before its first line; or as `open_recording` does.
+    it. Raises SphereOrientError: the tracker ends before its first line; or as `open_recording`.
     """
     with open_recording(timing.experiment, timing.cameras) as recording:
         pictures = [[part for part in one.pictures if part is not None] for one in movie_frames(recording, paced=False)]
@@ -194,7 +194,7 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
         if tracker.wait(BEGIN_S) and not len(table):
             said = (tracker.stderr.read() if tracker.stderr else "").strip().splitlines()
             got = said[-1] if said else f"status {tracker.returncode}"
-            raise SphereOrientError(refusal("live", expected="a line a frame", got=got, do="correct that"))
+            raise SphereOrientError(refusal("live", expected="a line per frame", got=got, do="correct that"))
     error_deg = _errors_deg(table, order, R_cam_lab, timing.experiment.parent / "truth.h5")[FIRST:]
     number, came_s, *_ = table = table[FIRST:].T
     at, written_s = number.astype(int), np.array(writer.written_s)
@@ -214,7 +214,7 @@ def delays(timing: LiveTiming, progress: Progress = silent) -> Delays:
 
 
 def _stall(tracker: psutil.Process, ends_s: list[float]) -> None:
-    """Stop a process for a while, as a machine that does other things, and note the end."""
+    """Stop a process for a while, as a busy machine does, and record the end."""
     tracker.suspend()
     time.sleep(STALL_S)
     ends_s.append(time.perf_counter())
@@ -222,8 +222,8 @@ def _stall(tracker: psutil.Process, ends_s: list[float]) -> None:
 
 
 def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Callable[[int], None]) -> Floats:
-    """Return (n, 6) of the lines: number, time (s), rotation since the stretch began (3), rad, camera axes; place in
-    it.
+    """Return (n, 6) of the lines: number, time (s), rotation (3) since the start of a stretch, rad, camera axes; index
+    in the stretch.
     """
     found: list[tuple[float, ...]] = []
     begin = time.monotonic()
@@ -241,7 +241,7 @@ def _received(lines: socket.socket, tracker: "subprocess.Popen[str]", saw: Calla
 
 
 def _errors_deg(table: Floats, order: Sequence[int], R_cam_lab: Floats, truth: Path) -> Floats:
-    """Return the error of the rotation since the stretch began, (n,), degrees; NaN where it is not known."""
+    """Return the error of the rotation since the start of the stretch, (n,), degrees; NaN: unknown."""
     if not truth.is_file() or not len(table):
         return np.full(len(table), np.nan)
     R = orientations_at(truth, np.array(order)[table[:, 0].astype(int) % len(order)])

@@ -14,14 +14,14 @@ from sphereorient.files.hdf5 import UNNAMED
 from sphereorient.files.whole_file import write_text
 
 SCHEMA = "sphereorient-robustness/1"
-WRONG_DEG = 10.0  # an error beyond is another orientation: the fit does not converge from there
+WRONG_DEG = 10.0  # a larger error is a wrong orientation, from which the fit does not converge
 FIRST = (1, 3, 10)  # numbers of candidates for the recall
 SIGMAS = 3.0  # a smaller difference, in its own standard deviations, is no change
 LEAST_RATIO = 1.1  # of the median errors; less is no change
 LEAST_FRAMES = 0.02  # of wrong or lost frames; less is no change
 BLOCK = 4  # frames: errors of neighbours are correlated
 DRAWS, SEED = 400, 2011
-MORE_OR_FEWER = {"levels", "seeds", "together"}  # settings by which scenes of one name do not differ
+MORE_OR_FEWER = {"levels", "seeds", "together"}  # settings without effect on scenes of one name
 Floats = NDArray[np.float64]
 _Key = tuple[str, int, str]  # kind, level, method
 
@@ -47,11 +47,11 @@ class SceneResult:
     stated: int  # frames with a covariance of the orientation
     inside: int  # of these, with the truth inside the 95 % region
     seconds: float
-    over_stated: float | None = None  # rms of these frames' errors over their stated sigmas; None: of an older version
-    ball: str = UNNAMED  # its name
-    given: int = 0  # frames in which its position is that of another ball
-    exchanges: int = 0  # how often the ball changes whose position it is
-    hidden: float = 0.0  # share of its pictures that nearer balls hide by more than half
+    over_stated: float | None = None  # rms of these errors over their stated sigmas; None: older version
+    ball: str = UNNAMED  # name
+    given: int = 0  # frames with the position of another ball
+    exchanges: int = 0  # number of such changes
+    hidden: float = 0.0  # share of its pictures more than half hidden by nearer balls
 
     @property
     def key(self) -> _Key:
@@ -124,7 +124,7 @@ def summaries(results: Results) -> list[ResultSummary]:
 
 
 def summarised(group: Sequence[SceneResult]) -> ResultSummary:
-    """Sum up the scenes of one kind, level and method."""
+    """Summarise the scenes of one kind, level and method."""
     errors = np.concatenate([one.errors_deg for one in group])
     distances_mm = np.array([x for one in group for x in one.position_mm if x is not None])
     frames, looks, stated = (sum(getattr(one, key) for one in group) for key in ("frames", "looks", "stated"))
@@ -219,7 +219,7 @@ class Change:
 
 
 def compare_runs(now: Results, baseline: Results) -> list[Change]:
-    """Compare the scenes and methods that two runs have in common; raise BenchError if there are none."""
+    """Compare the common scenes and methods of two runs. Raises BenchError if there are none."""
     plans = [run.settings.model_dump(exclude=MORE_OR_FEWER) for run in (now, baseline)]
     same = plans[0] == plans[1]
     known = {(one.scene, one.ball, one.method): one for one in baseline.outcomes if same}

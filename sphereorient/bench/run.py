@@ -74,7 +74,7 @@ def run_benchmark(
     chosen = trackers_of(DEFAULT) if trackers is None else trackers
     _prepare(folder, settings)
     scenes = scenes_of(settings)
-    # The hardest first, which take longest: no process waits for another's last one.
+    # The hardest first, as they take longest, so that processes end together.
     missing = sorted((scene for scene in scenes if _missing(folder, scene, chosen)), key=lambda scene: -scene.level)
     tasks = [partial(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
     run_all(tasks, folder / CACHE, jobs, lambda left: progress(len(scenes) - left, len(scenes)))
@@ -88,10 +88,10 @@ def run_benchmark(
 def run_all(
     tasks: Sequence[Callable[[], None]], cache: Path, jobs: int, progress: Callable[[int], None] = lambda left: None
 ) -> None:
-    """Run tasks in `jobs` processes of one thread each, see `limit_threads`; `progress` gets how many are left."""
+    """Run tasks in `jobs` processes of one thread each, see `limit_threads`; `progress` gets the number left."""
     progress(len(tasks))
     context = multiprocessing.get_context("spawn")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # inherited by workers, and read when torch is imported
     with ProcessPoolExecutor(jobs, context, limit_threads, (cache,)) as pool:
         running = [pool.submit(task) for task in tasks]
         try:
@@ -111,7 +111,7 @@ def run_benchmarks(
     jobs: int = 1,
     progress: Advance = lambda done, total: None,
 ) -> list[Results]:
-    """Run plans one after the other, each in a folder of its name; `progress` gets the scenes of all."""
+    """Run plans in turn, each in a folder of its name; `progress` counts the scenes of all."""
     counts = [len(scenes_of(plan)) for plan in plans.values()]
     found = []
     for before, (name, plan) in zip(accumulate(counts, initial=0), plans.items(), strict=False):
@@ -124,7 +124,7 @@ def run_benchmarks(
 
 
 def limit_threads(cache: Path) -> None:
-    """Limit a worker to one thread; what depends on the maps, which scenes share, is kept in a folder of the run."""
+    """Limit a worker to one thread; tables of the maps, shared by scenes, are cached in a folder of the run."""
     os.environ[FOLDER] = str(cache)
     torch.set_num_threads(1)
     limit_cores(1)
@@ -132,7 +132,7 @@ def limit_threads(cache: Path) -> None:
 
 def _prepare(folder: Path, settings: BenchSettings) -> None:
     plan: dict[str, Any] = {"schema": SCHEMA, "settings": settings.model_dump(mode="json")}
-    path, name, do = folder / PLAN, f"--out {folder}", "choose a new --out, or the same settings to go on"
+    path, name, do = folder / PLAN, f"--out {folder}", "choose a new --out, or the same settings to continue"
     make_folder(folder / KEPT, name)
     try:
         known = json.loads(path.read_text("utf-8")) if path.exists() else None
@@ -162,7 +162,7 @@ def kept_results(path: Path) -> list[SceneResult]:
 
 
 def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, _Tracker]) -> None:
-    """Render a scene, track it, keep the results; the movies are not kept."""
+    """Render a scene, track it, keep the results but not the movies."""
     with tempfile.TemporaryDirectory(prefix="scene") as rendered:
         experiment = write_scene(Path(rendered), scene)
         for name, tracker in trackers.items():
@@ -171,7 +171,7 @@ def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, _Track
 
 
 def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: _Tracker) -> list[SceneResult]:
-    """Track a scene and measure the track of each ball; a refusal of the method is a result too."""
+    """Track a scene and measure the track of each ball; a refusal of the method is also a result."""
     begin = time.perf_counter()
     balls, truth_path = scene.base.worn, experiment.parent / "truth.h5"
     try:

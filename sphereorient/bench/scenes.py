@@ -16,12 +16,12 @@ from sphereorient.synth.severities import DEGRADATIONS, LEVELS, degradation
 from sphereorient.synth.write import CleanMovie, clean_movie
 
 CLEAN, TOGETHER = "clean", "together"
-SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of an only ball's volume: small, for speed
-OF_MOVIES = {"frames", "cameras", "balls", "paints", "volume_mm", "velocity_time"}  # settings that `synth` has too
+SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of a single ball's volume; small, for speed
+OF_MOVIES = {"frames", "cameras", "balls", "paints", "volume_mm", "velocity_time"}  # settings of `synth`
 
 
 class BenchSettings(BaseModel, frozen=True, extra="forbid"):
-    """The list of scenes, part of the results: these are compared scene by scene."""
+    """The list of scenes, part of the results, which are compared scene by scene."""
 
     degradations: tuple[str, ...] = Field(
         tuple(DEGRADATIONS), description="one at a time; names of docs/degradations.md"
@@ -51,10 +51,10 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
                 expected, do = f"levels {LEVELS[0]} .. {LEVELS[-1]}", "choose among these"
                 raise SettingsError(refusal("levels", expected=expected, got=str(level), do=do))
         if self.balls > 1 and (wrong := [name for name in self.degradations if name in OF_ONE_BALL]):
-            expected, do = "those that several balls can have", "leave these out"
+            expected, do = "degradations for several balls", "leave these out"
             raise SettingsError(refusal("degradations", expected=expected, got=", ".join(wrong), do=do))
         if not self.levels or not self.seeds:
-            raise SettingsError(refusal("levels and seeds", expected="one at least", got="none", do="name some"))
+            raise SettingsError(refusal("levels and seeds", expected="at least one", got="none", do="name some"))
         return self
 
 
@@ -115,6 +115,6 @@ def write_scene(folder: Path, scene: BenchmarkScene) -> Path:
     return write_degraded(folder, scene.base, scene.degradations, clean)
 
 
-@lru_cache(maxsize=2)  # most scenes of a seed share their motion: what is seen is rendered once
+@lru_cache(maxsize=2)  # scenes of a seed share their motion: render it once
 def _rendered(settings: SynthSettings, paint_wear: float) -> CleanMovie:
     return clean_movie(settings, paint_wear).kept()

@@ -25,8 +25,8 @@ RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "al
 ALIGNMENTS = ("none", "body", "both")
 AXES = 3
 ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
-STILL_MM = 1e-6  # a true position that moves less stays in its place
-FICTRAC_COLUMNS = 23  # at least; newer versions have more
+STILL_MM = 1e-6  # a true position that moves less is fixed
+FICTRAC_COLUMNS = 23  # at least
 DO = "pass the truth.h5 of this synthetic experiment"
 
 
@@ -39,7 +39,7 @@ class Score:
     orientation_deg: Floats  # (N,), geodesic distance to the true orientation
     camera_orientation_deg: dict[str, Floats]  # (N,) each, of each camera alone
     position_mm: Floats  # (N,), distance
-    orientation_sigmas: Floats  # (N,), the same error over what its covariance states (Mahalanobis distance)
+    orientation_sigmas: Floats  # (N,), the same error over its stated covariance (Mahalanobis distance)
     position_sigmas: Floats  # (N,)
     relative_rms: dict[str, float]  # of velocity, acceleration, omega, alpha: rms error over the truth's rms
     coverage: dict[str, float]  # of the same: share of the frames with a value
@@ -57,7 +57,7 @@ class Score:
         return _rms_per_axis(self.orientation_sigmas[self.valid]), _rms_per_axis(self.position_sigmas[self.valid])
 
     def inside(self, share: float = 0.95) -> tuple[int, int]:
-        """Return in how many valid frames the true orientation lies in the stated region, and how many state one."""
+        """Return the valid frames with the true orientation in the stated region, and those that state one."""
         stated = self.orientation_sigmas[self.valid & np.isfinite(self.orientation_sigmas)]
         return int((stated**2 <= chi2.ppf(share, AXES)).sum()), len(stated)
 
@@ -74,7 +74,7 @@ def _percentiles(values: Floats) -> Floats:
 
 def score_track(track: Trajectory, truth_path: str | Path, align: str = "none") -> Score:
     """Compare a track with the truth (docs/data-format.md) by time to half a frame; raise TrackError on a mismatch.
-    `align`: "none", or "body": the body axes of the truth are turned to those of the track first, by a constant turn.
+    `align`: "none", or "body": first rotate the body axes of the truth to those of the track, by a constant rotation.
     """
     truth = _read_truth(truth_path, "position", sphere=track.sphere, also=RATES)
     row = _rows(truth["time"], track.time, truth_path)
@@ -105,8 +105,8 @@ def score_track(track: Trajectory, truth_path: str | Path, align: str = "none") 
 
 
 def named_as_true(tracks: Tracks, truth_path: str | Path, alike: Sequence[str]) -> Tracks:
-    """Return the tracks with the names of spheres that look alike exchanged, all over, as they fit the truth best: with
-    the least sum of the median errors of position. Raise TrackError for a name without a track.
+    """Return the tracks with the names of spheres that look alike permuted for the least sum of median position errors.
+    Raises TrackError: a name without a track.
     """
     for name in alike:
         tracks.picked(name)
@@ -121,9 +121,7 @@ def named_as_true(tracks: Tracks, truth_path: str | Path, alike: Sequence[str]) 
 
 
 def given_to_others(tracks: Tracks, truth_path: str | Path) -> dict[str, tuple[int, int]]:
-    """Return for each sphere in how many valid frames it is nearest to the truth of another, and how often that
-    changes.
-    """
+    """Return for each sphere the valid frames nearest to the truth of another one, and the number of such changes."""
     found = {}
     for k, (name, away_mm) in enumerate(_distances(tracks, truth_path).items()):
         nearest = away_mm.argmin(axis=1)
@@ -169,7 +167,7 @@ def orientations_at(path: Path, frame: Frames) -> Floats:
 
 
 def _truth_at(path: Path, frame: Frames) -> tuple[Floats, Floats]:
-    """Return times (N,), s, and the same."""
+    """Return times (N,), s, and orientations as `orientations_at`."""
     truth = _read_truth(path)
     count = len(truth["time"])
     if len(frame) and (frame.min() < 0 or frame.max() >= count):
@@ -179,10 +177,10 @@ def _truth_at(path: Path, frame: Frames) -> tuple[Floats, Floats]:
 
 
 def _read_truth(path: str | Path, *names: str, sphere: str = UNNAMED, also: Sequence[str] = ()) -> dict[str, Floats]:
-    """Read what is true of a sphere; `also`: where the file has it."""
+    """Read datasets of a sphere's truth; `also`: if the file has them."""
     try:
         with h5py.File(path) as file:
-            schema = str(file.attrs.get("schema", ""))  # old truths have none
+            schema = str(file.attrs.get("schema", ""))  # old files have none
             if "spheres" in file and not sphere and not schema.startswith("sphereorient-track"):
                 got, do = f"that of {', '.join(file['spheres'])}"[:200], "score the track of all of them"
                 raise TrackError(refusal(f"truth {path}", expected="the truth of one ball", got=got, do=do))
@@ -204,7 +202,7 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     """Read the reference of a track: truth.h5 or another track.h5, by time, or FicTrac's .dat, by the frame number.
     Raise TrackError (of another kind, or no time in common) or BenchError (no FicTrac file).
     """
-    R, start, held = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool), True  # FicTrac knows no other
+    R, start, held = np.full((len(track), 3, 3), np.nan), np.zeros(len(track), bool), True  # for FicTrac always
     if path.suffix.lower() == ".dat":
         frame, orientation, begins = read_fictrac(path)
         row, there = nearest_rows(frame.astype(np.float64), track.time * track.frame_rate)
@@ -231,8 +229,8 @@ def against(reference: Reference, track: Trajectory, align: str = "none") -> tup
 
 
 def another_result(path: Path, truth_path: Path) -> Trajectory:
-    """Return the orientations of a FicTrac .dat, of a ball in its place, as a track at the times of a truth; raise
-    TrackError if the truth has too few frames, BenchError for another file.
+    """Return the orientations of a FicTrac .dat (fixed ball) as a track at the times of a truth. Raises TrackError: the
+    truth has too few frames; BenchError: another file.
     """
     frame, R, _ = read_fictrac(path)
     time_s, _ = _truth_at(truth_path, frame)
@@ -245,12 +243,12 @@ def _is_track(path: Path) -> bool:
     try:
         with h5py.File(path) as file:
             return str(file.attrs.get("schema", "")).startswith("sphereorient-track")
-    except OSError:  # who reads it says so
+    except OSError:  # the reader reports it
         return False
 
 
 def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
-    """Return the rows of the truth at the nearest times; refuse times further than half a frame."""
+    """Return the rows of the truth at the nearest times; refuse times more than half a frame away."""
     row, there = nearest_rows(known_s, time_s)
     if not there.all():
         got = f"{time_s[0]:.6g} .. {time_s[-1]:.6g} s"
@@ -259,9 +257,8 @@ def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
 
 
 def read_fictrac(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
-    """Read frames (N,), from 0, orientations (N, 3, 3), body to camera axes, and whether the sequence counter begins
-    anew (N,), of a FicTrac 2 .dat file. Orientations are relative to its first frame, in axes of its own: align with
-    "both". Raise BenchError for other files.
+    """Read frames (N,), from 0, orientations (N, 3, 3), body to camera axes, and restarts of the sequence counter (N,)
+    of a FicTrac 2 .dat file. Orientations are relative to the first frame: align with "both". Raises BenchError.
     """
     do = "pass FicTrac's .dat file"
     try:
@@ -273,7 +270,7 @@ def read_fictrac(path: Path) -> tuple[Frames, Floats, NDArray[np.bool_]]:
         got = f"{rows.shape[0]} lines of {rows.shape[1]}"
         raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
     sequence = rows[:, FICTRAC["sequence"]].ravel()
-    begins = np.append(False, np.diff(sequence) < (1 if sequence.any() else 0))  # without a counter it is 0
+    begins = np.append(False, np.diff(sequence) < (1 if sequence.any() else 0))  # 0: no counter
     return rows[:, 0].astype(np.int64), rotations(rows[:, FICTRAC["rotation_cam"]]), begins
 
 

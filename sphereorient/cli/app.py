@@ -1,4 +1,4 @@
-"""The application of the command line, the helpers of its commands, `settings`, `doctor`, and the end of errors."""
+"""The command-line application: helpers of its commands, `settings`, `doctor`, and exit codes of errors."""
 
 import inspect
 import json
@@ -50,12 +50,12 @@ class Commands(typer.Typer):
     """Commands; those that write take --force, and replace none of their inputs."""
 
     def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
-        """Register a command as `typer.Typer.command`. Its options may be the fields of a dataclass, its argument."""
+        """Register a command like `typer.Typer.command`. A dataclass as its only argument gives an option per field."""
         return lambda function: super(Commands, self).command(name, **more)(_guarded(function, name != "map"))
 
 
 def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., None]:
-    """Give a command its record of options, and --force if it writes; `textured`: its experiment's map is an input."""
+    """Add the options of a command's record, and --force if it writes; `textured`: the experiment's map is an input."""
     record = next((one.annotation for one in inspect.signature(function).parameters.values()), None)
     record = record if isinstance(record, type) and is_dataclass(record) else None
     options = list(inspect.signature(record or function).parameters.values())
@@ -80,13 +80,13 @@ def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., Non
 
 
 def _read(path: Path, textured: bool) -> Iterator[Path]:
-    """Yield a file that is read and those that it names, if it is YAML; movies with all their pictures."""
+    """Yield an input file and, if it is YAML, the files named in it; of movies all pictures."""
     yield path
     if path.suffix.lower() in (".yaml", ".yml"):
         from sphereorient.files.yaml_file import read_yaml
         from sphereorient.movies import movie_files
 
-        with suppress(SphereOrientError):  # the command tells what is wrong
+        with suppress(SphereOrientError):  # the command reports the error
             for text in _texts(read_yaml(path, SettingsError), textured):
                 with suppress(SphereOrientError, OSError, ValueError):
                     yield from movie_files(path.parent / text)
@@ -110,8 +110,8 @@ app = Commands(
     rich_markup_mode=None,
 )
 
-LINE_S = 60.0  # from one line of a stage to its next, without a terminal
-SLOWEST = 0.05  # units per second: slower rates are told by the time left
+LINE_S = 60.0  # between progress lines of a stage, without a terminal
+SLOWEST = 0.05  # units per second; of slower stages only the time left is printed
 EXIT_REFUSED = 2  # an error that the user can correct
 NO_MEMORY = re.compile("(not enough|out of|insufficient|n't allocate|not allocate|to allocate) memory|bad_alloc", re.I)
 EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
@@ -128,7 +128,7 @@ def common(
 
 
 def check_writable(out: Path, *, folder_made: bool = False) -> None:
-    """Check before hours of work that a file can be written and replaces none of the user's; or a folder be made."""
+    """Check before the work that a file can be written and replaces no file of the user, or that a folder can be."""
     check_folder(out, f"--out {out}")
     if not folder_made:
         check_target(out)
@@ -146,11 +146,10 @@ def echo_lines(lines: Iterable[str]) -> None:
 
 
 def print_table(table: Any) -> None:
-    """Print a table of rich; where there is no terminal, wide enough for whole words."""
+    """Print a table of rich; without a terminal, at least 140 characters wide."""
     from rich.console import Console
 
     console = Console()
-    # Characters, of a table without a terminal.
     console.width = console.width if console.is_terminal else max(console.width, 140)
     console.print(table)
 
@@ -161,7 +160,7 @@ Progress = Callable[[str, int, int], None]
 @contextmanager
 def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Progress]:
     """Show a line of progress for each stage, with units per second and the time left; nothing if `quiet`.
-    Where there is no terminal: print a line as a stage begins, each minute, and at the end of one of over a second.
+    Without a terminal: print a line when a stage begins, each minute, and when a stage of over a second ends.
     """
     if quiet:
         yield lambda stage, done, total: None
@@ -190,7 +189,7 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Progress
 
 
 def _rate(done: int, total: int, elapsed_s: float, unit: str) -> str:
-    """Return how much is done, how fast, and the time left, in words; a stage of one step has nothing to count."""
+    """Return progress, rate and time left as text; empty for a stage of one step."""
     if total == 1 or (not done and not total):
         return ""
     words = [f"{done} of {total}" if total else f"{done}"]
@@ -202,7 +201,7 @@ def _rate(done: int, total: int, elapsed_s: float, unit: str) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Return a duration as people say it: 40 s, 3 min, 2.5 h."""
+    """Return a duration as text: 40 s, 3 min, 2.5 h."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
@@ -230,7 +229,7 @@ def settings(
     out: Annotated[Path | None, Option("--out", "-o", help="File to write; the screen without it.")] = None,
     method: Annotated[str | None, Option(help="precise, paper, map or report; all without it.")] = None,
 ) -> None:
-    """Write all settings of the methods, or those that one reads, with defaults and explanations."""
+    """Write the settings of all methods, or of one, with defaults and explanations."""
     from sphereorient.methods.settings import METHODS, settings_yaml
 
     if method not in (None, *METHODS):
@@ -244,13 +243,13 @@ def settings(
 
 
 @app.command()
-def doctor(as_json: Annotated[bool, Option("--json", help="Print all of it as one JSON object.")] = False) -> None:
-    """Tell what is installed, how fast a fit is here, which rates `live` can hold. Exit code 1: something is broken."""
+def doctor(as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False) -> None:
+    """Print what is installed, the speed of a fit, the rates that `live` can hold. Exit code 1: something is broken."""
     from sphereorient.files.provenance import lacking, package_faults, versions, without_nan
 
     faults = package_faults()
     found: dict[str, Any] = {**versions(), "not_installed": lacking()}
-    if not faults:  # else the rest could not be trusted, or not even be imported
+    if not faults:  # else the rest is unreliable, or its import fails
         from sphereorient.bench.doctor import machine
 
         here, faults = machine()
@@ -272,11 +271,11 @@ def _print_findings(found: dict[str, Any]) -> None:
         for words in lines or ["none"]:
             typer.echo(f"{name.replace('_', ' '):24} {words}")
     if fits:
-        table = Table(*fits[0], title="live, one camera: time of a frame, and the rates that can be held")
+        table = Table(*fits[0], title="live, one camera: time per frame, and the rates that it can hold")
         for fit in fits:
             table.add_row(*(f"{number:.3g}" for number in fit.values()))
         print_table(table)
-        typer.echo(f"now: as busy as the machine is, {found['free_cores']} of {found['cores']} cores free.")
+        typer.echo(f"Measured with {found['free_cores']} of {found['cores']} cores free.")
 
 
 def _words(value: Any) -> str:
@@ -285,13 +284,12 @@ def _words(value: Any) -> str:
 
 def main() -> None:
     """Run the command line; errors that a user can correct become one line and a non-zero exit code."""
-    # Without it torch's threads spin while another program has their core: 136 s instead of 9 s for the excerpt beside
-    # two busy processes. OpenMP reads it when torch is imported.
+    # Else torch's waiting threads keep the cores busy: 136 s instead of 9 s beside two busy processes. Read at import.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     warnings.formatwarning = lambda message, *_: f"sphereorient: {message}\n"
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_INTERRUPTED))
     try:
-        # Without its standalone mode the parser returns exit codes, also that of Ctrl-C.
+        # Without standalone mode the parser returns exit codes, also for Ctrl-C.
         code = app(standalone_mode=False) or 0
     except SphereOrientError as error:
         typer.echo(f"sphereorient: {error}", err=True)

@@ -1,4 +1,4 @@
-"""`sphereorient init` and `mark`: the first files of an experiment, and what people mark in its pictures."""
+"""`sphereorient init` and `mark`: the first files of an experiment, and marks in its pictures."""
 
 import sys
 from collections.abc import Sequence
@@ -28,25 +28,25 @@ HEAD = "Made by `sphereorient init`. Remove # before the keys to use; paths are 
 @dataclass(frozen=True, kw_only=True)
 class _InitOptions:
     movies: Annotated[
-        list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies or photographs, one a camera.")
+        list[Path] | None, Argument(metavar="[MOVIE]...", help="Movies or photographs, one per camera.")
     ] = None
     out: Annotated[Path | None, Option("--out", "-o", help="Default: experiment.yaml, or calibration.yaml.")] = None
     plate: Annotated[Path | None, Option(help="Folder of plate pictures: write calibration.yaml.")] = None
-    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: view, masks, movie or the given.")] = None
+    from_fictrac: Annotated[Path | None, Option(help="FicTrac's config.txt: view, masks; movie, if not named.")] = None
     set_: Annotated[
         list[str] | None,
-        Option("--set", help="A key's value, e.g. --set sphere.diameter=18; else it is asked for at a terminal."),
+        Option("--set", help="Value of a key, e.g. --set sphere.diameter=18; a terminal prompts for missing ones."),
     ] = None
     vfov: Annotated[
         float | None, Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees.")
     ] = None
-    sphere_map: Annotated[Path | None, Option(help="The ball's texture map, where there is one.")] = None
+    sphere_map: Annotated[Path | None, Option(help="Texture map of the ball, if there is one.")] = None
     quiet: Quiet = False
 
 
 @app.command()
 def init(given: _InitOptions) -> None:
-    """Look at movies or plate pictures, and write the first file: all keys explained, what can be measured measured."""
+    """Examine movies or plate pictures and write the first file: keys explained, measurable values filled in."""
     chosen = [source for source in (given.movies, given.plate, given.from_fictrac) if source]
     if len(chosen) != 1 and not (given.from_fictrac and given.movies and not given.plate):
         got, do = f"{len(chosen)} of them", "name movies, or --plate FOLDER, or --from-fictrac config.txt"
@@ -76,7 +76,7 @@ def mark(
     port: Annotated[int, Option(min=0, max=65535, help="0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT.")] = 0,
     browser: Annotated[bool, Option(help="Open the page in the browser.")] = True,
 ) -> None:
-    """Mark in the browser the ball and what hides it, or the fiducials where `calibrate` does not find them."""
+    """Mark in the browser the ball and what hides it, or fiducials that `calibrate` does not find."""
     from sphereorient.preflight.mark import serve
     from sphereorient.preflight.mark_fiducials import FiducialMarking
     from sphereorient.preflight.mark_masks import MaskMarking
@@ -99,7 +99,7 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
     from sphereorient.preflight.first_look import camera_keys, field_key
 
     if len(movies) > MAX_CAMERAS:
-        do = "name those of one ball; track others as experiments of their own"
+        do = "name the movies of one ball; track other balls as separate experiments"
         raise SettingsError(refusal("MOVIE", expected=f"one to {MAX_CAMERAS} movies", got=f"{len(movies)}", do=do))
     cameras = target.parent / "cameras.yaml"
     drafted = has_mark(cameras) and HEAD in read_text(cameras, TEXT_BYTES, "cameras", CameraError, "remove it")
@@ -114,7 +114,7 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
         return
     echo_lines(line for look in looks for line in _found(look))
     if len({len(look.movie) for look in looks}) > 1:
-        typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
+        typer.echo("The movies differ in length; `sphereorient check` measures whether they began together.")
     _end(target, missing, _next(target, cameras, looks), [cameras] if alone else [])
 
 
@@ -143,7 +143,7 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
     if hidden:
         write_picture(mask, shown.astype("uint8") * 255)
         made.append(mask)
-    rate_hz = None if look.rate_hz else said.rate_hz or look.movie.played_hz  # its cameras are ordinary ones
+    rate_hz = None if look.rate_hz else said.rate_hz or look.movie.played_hz  # ordinary cameras film at the played rate
     known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
     missing = _write_experiment([look], target, [*known, *changes], {look.name: mask.name} if hidden else None)
     model = "fisheye" if said.fisheye else "pinhole"
@@ -152,9 +152,7 @@ def _fictrac(config: Path, movies: Sequence[Path], target: Path, changes: list[s
         echo_lines(_found(look))
         if not said.rate_hz and not any(one.startswith("frame_rate=") for one in changes):
             rate = f"{rate_hz:g} Hz, as players show it" if rate_hz else "its time stamps"
-            typer.echo(
-                f"src_fps gives no rate, so that of the movie is taken, {rate}: correct it if it is not the camera's"
-            )
+            typer.echo(f"src_fps gives no rate; the movie's is used ({rate}). Correct it if the camera's differs.")
         if said.unread:
             typer.echo(f"{config}, not read: {', '.join(said.unread)}")
         live = [] if isinstance(said.source, Path) else [f"sphereorient live {target} --source camera:{said.source}"]
@@ -185,7 +183,7 @@ def _looked(
     shown: "NDArray[np.bool_] | None" = None,
     circle: tuple[float, float, float] | None = None,
 ) -> "list[FirstLook]":
-    """Look at movies, and draw what was found beside the file to write; `shown` (as `look_at`), `circle`: FicTrac's."""
+    """Examine movies, draw the findings beside the file to write; `shown` (as `look_at`), `circle`: FicTrac's."""
     picture = target.with_suffix(".png")
     check_writable(picture)
     from sphereorient.preflight.first_look import look_at, with_circle
@@ -193,7 +191,7 @@ def _looked(
 
     with progress_bar(quiet, unit="movies") as advance:
         looks = look_at(movies, advance, shown)
-    if shown is not None:  # FicTrac follows no balls that move
+    if shown is not None:  # FicTrac's balls are fixed
         looks = [with_circle(look, circle) for look in looks]
     first_look_figure(looks, picture)
     return looks
@@ -202,7 +200,7 @@ def _looked(
 def _write_experiment(
     looks: "Sequence[FirstLook]", target: Path, changes: list[str], masks: dict[str, str] | None = None
 ) -> list[DraftKey]:
-    """Write experiment.yaml; return the keys that are left to the user."""
+    """Write experiment.yaml; return the keys that the user must fill in."""
     from sphereorient.experiment.experiment import SCHEMA
     from sphereorient.preflight.first_look import experiment_keys
 
@@ -219,7 +217,7 @@ def _write_cameras(path: Path, keys: list[DraftKey]) -> None:
 
 
 def _asked(keys: list[DraftKey]) -> list[DraftKey]:
-    """Ask for the open keys at a terminal, each once; Enter leaves one open."""
+    """Prompt for each open key at a terminal; Enter leaves it open."""
     if not sys.stdin.isatty():
         return keys
     for key in open_keys(keys):
@@ -235,7 +233,7 @@ def _asked(keys: list[DraftKey]) -> list[DraftKey]:
 
 
 def _found(look: "FirstLook") -> list[str]:
-    """Return what a movie shows, in a line, and the remarks of its reader."""
+    """Return a line on a movie and its ball, and the remarks of its reader."""
     remarks = [f"{look.name}: {remark}" for remark in look.movie.remarks]
     height, width = look.movie.frame_shape
     rate = f", {look.rate_hz:.6g} Hz" if look.rate_hz else ""

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 APART_DEG = 1.0  # angle between axes that is worth a remark
-EXPLAINED = 0.5  # of the median error, left after a constant turn of the body axes that is worth one
+EXPLAINED = 0.5  # share of the median error; a constant rotation that leaves less is worth one
 
 bench = Commands(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -83,7 +83,7 @@ def score(
     align: Align = "none",
     as_json: Annotated[bool, Option("--json", help="Print orientation errors and behaviour as JSON.")] = False,
 ) -> None:
-    """Print the errors of a track against exact truth, and gain, drift and walk against truth or another tracker.
+    """Print errors of a track against exact truth; gain, drift and walk against truth or another tracker.
     FicTrac's .dat in place of a track is compared with the truth.
     """
     import numpy as np
@@ -110,13 +110,13 @@ def score(
         print_table(behaviour_table(behaviour, name, exact=of.exact))
         if align != "both" and behaviour.apart_deg > APART_DEG:
             typer.echo(
-                f"The lab axes are {behaviour.apart_deg:.1f} degrees apart: --align both takes that off.", err=True
+                f"The lab axes are {behaviour.apart_deg:.1f} degrees apart: --align both removes that.", err=True
             )
         if align == "none" and np.isfinite(errors).any():
             usual, left = (float(np.nanmedian(part)) for part in (errors, against(of, one, "body")[0]))
             if usual > APART_DEG and left < EXPLAINED * usual:
-                words = f"A constant turn of the body axes explains most: {usual:.2f} degrees are {left:.3g} without it"
-                typer.echo(f"{words}; --align body takes it off. A learnt map has axes of its own.", err=True)
+                words = f"--align body removes a constant rotation: the median falls from {usual:.2f}° to {left:.3g}°"
+                typer.echo(f"{words}. A learnt map has its own body axes.", err=True)
         given = given or (given_to_others(tracks, reference) if of.exact and len(tracks) > 1 else {})
         if name in given:
             wrong, changes = given[name]
@@ -150,7 +150,7 @@ def print_errors(errors_deg: "Floats", ball: str, word: str = "error") -> None:
 def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table:
     """Return gain, drift, heading and path against a reference as a table."""
     of, against = f" of ball {ball}" if ball else "", "the exact truth" if exact else "another tracker"
-    title = f"Behaviour{of} against {against}, {found.pairs} turns from frame to frame"
+    title = f"Behaviour{of} against {against}, {found.pairs} rotations between frames"
     table = Table("quantity", "x", "y", "z", "along the rotation", title=title)
 
     def gains(name: str, gain: "Interval") -> None:
@@ -166,10 +166,10 @@ def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table
     table.add_row("drift (degrees a minute)", *(f"{value:.3f} \u00b1 {sigma:.3f}" for value, sigma in drifts))
     table.add_section()
     if found.length_ratio == found.length_ratio:
-        table.add_row("heading at the end, difference (rad)", f"{found.heading_rad:.4f}")
-        table.add_row("length of the path, ratio", f"{found.length_ratio:.4f}")
-        table.add_row("ends of the paths apart, of the length", f"{100 * found.end_share:.3f} %")
-    table.add_row("lab axes apart (degrees)", f"{found.apart_deg:.3f}")
+        table.add_row("difference of final heading (rad)", f"{found.heading_rad:.4f}")
+        table.add_row("ratio of path lengths", f"{found.length_ratio:.4f}")
+        table.add_row("distance of path ends, of the length", f"{100 * found.end_share:.3f} %")
+    table.add_row("angle between lab axes (degrees)", f"{found.apart_deg:.3f}")
     table.caption = found.reason and f"no gain, no drift: {found.reason}"
     return table
 
@@ -197,7 +197,7 @@ def error_table(found: "Score", ball: str | None = None) -> Table:
     return table
 
 
-RunFolder = Annotated[Path, Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
+RunFolder = Annotated[Path, Option("--out", "-o", help="Folder of the run; continues an unfinished one.")]
 Jobs = Annotated[int, Option("--jobs", "-j", min=1, help="Processes.")]
 
 
@@ -214,13 +214,13 @@ class _SceneOptions:
     degradations: Annotated[str | None, Option(help="Some of docs/degradations.md: defocus,spin; else all.")] = None
     levels: Annotated[str | None, Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")] = None
     seeds: Annotated[int | None, Option(min=1, max=100, help="Movies of each degradation and severity.")] = None
-    frames: Annotated[int | None, Option(min=12, help="Of each movie.")] = None
-    full: Annotated[bool, Option("--full", help="All severities, three movies of 60 frames each: hours.")] = False
-    settings: Annotated[Path | None, Option(help="YAML with keys of configs/robustness.yaml; options win.")] = None
+    frames: Annotated[int | None, Option(min=12, help="Frames of each movie.")] = None
+    full: Annotated[bool, Option("--full", help="All severities, three movies of 60 frames each (hours).")] = False
+    settings: Annotated[Path | None, Option(help="YAML with keys of configs/robustness.yaml.")] = None
     quiet: Quiet = False
 
     def plan(self) -> "BenchSettings":
-        """Return the settings: of the file, or the defaults, changed by the full run and then by the options."""
+        """Return the settings: file or defaults, then --full, then the options."""
         from sphereorient.bench.scenes import FULL, BenchSettings
         from sphereorient.methods.settings import read_model
 
@@ -245,7 +245,7 @@ class _RobustnessOptions(_SceneOptions):
 
 @bench.command()
 def robustness(given: _RobustnessOptions) -> None:
-    """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
+    """Measure the effect of noise, blur, dirt, wrong cameras and more on a track (minutes by default)."""
     check_writable(given.out, folder_made=True)
     chosen = given.plan()
     from sphereorient.bench import load_results, run_benchmark
@@ -257,7 +257,7 @@ def robustness(given: _RobustnessOptions) -> None:
     older = None if given.baseline is None else load_results(given.baseline)
     with progress_bar(given.quiet, unit="") as advance:
         found = run_benchmark(given.out, chosen, trackers, jobs=given.jobs, progress=partial(advance, "scenes"))
-    with writing(force=True):  # its plan says that the folder is of this run
+    with writing(force=True):  # its plan proves that this run made the folder
         write_table([found], given.out / "results.csv")
         write_figure(robustness_figure(found), given.out / "robustness")
     if not given.quiet:
@@ -271,11 +271,11 @@ def robustness(given: _RobustnessOptions) -> None:
 class _BallsOptions:
     out: RunFolder
     balls: Annotated[str, Option(help="Numbers of balls, 1 to 8, all in one volume.")] = "1,2,4,8"
-    cameras: Annotated[str, Option(help="Numbers of cameras, 1 to 4: a curve each.")] = "2,3"
-    paints: Annotated[int, Option(min=1, max=8, help="Fewer than balls: some look alike.")] = 2
+    cameras: Annotated[str, Option(help="Numbers of cameras, 1 to 4: one curve each.")] = "2,3"
+    paints: Annotated[int, Option(min=1, max=8, help="Different paints; with fewer than balls some look alike.")] = 2
     volume: Annotated[float, Option(help="Balls stay within about this distance of the origin, mm.")] = 45.0
     seeds: Annotated[int, Option(min=1, max=100, help="Movies of each point of a curve.")] = 1
-    frames: Annotated[int, Option(min=12, help="Of each movie.")] = 48
+    frames: Annotated[int, Option(min=12, help="Frames of each movie.")] = 48
     jobs: Jobs = 2
     quiet: Quiet = False
 
@@ -291,7 +291,7 @@ def balls_curve(given: _BallsOptions) -> None:
     from sphereorient.report.plots.style import write_figure
 
     plain: dict[str, Any] = {"degradations": (), "seeds": tuple(range(given.seeds)), "frames": given.frames}
-    # Correlation time of the velocity: balls pass before each other in a short movie.
+    # A short correlation time of the velocity: balls hide each other in a short movie.
     plain |= {"paints": given.paints, "volume_mm": given.volume, "velocity_time": 0.03}
     plans = {
         f"{b}-balls-{c}-cameras": read_model(BenchSettings, **plain, balls=b, cameras=c)
@@ -301,7 +301,7 @@ def balls_curve(given: _BallsOptions) -> None:
     with progress_bar(given.quiet, unit="") as advance:
         trackers = trackers_of(["precise"])
         runs = run_benchmarks(given.out, plans, trackers, jobs=given.jobs, progress=partial(advance, "scenes"))
-    with writing(force=True):  # its plans say that the folder is of this run
+    with writing(force=True):  # its plans prove that this run made the folder
         write_table(runs, given.out / "results.csv")
         write_figure(density_figure(runs), given.out / "density")
     if not given.quiet:
@@ -312,16 +312,16 @@ def balls_curve(given: _BallsOptions) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _BallOptions:
     out: RunFolder
-    scenes: Annotated[str | None, Option(help="Some of them: clean_fly,noisy; else all.")] = None
-    frames: Annotated[int, Option(min=300, help="Of each movie, 100 a second; 6000 show the drift.")] = 1000
-    seed: Annotated[int, Option(min=0, help="Another one: other paint and motion.")] = 0
-    first: Annotated[bool, Option("--first", help="The first pass alone, without the precise method after it.")] = False
+    scenes: Annotated[str | None, Option(help="Scenes, e.g. clean_fly,noisy; default: all.")] = None
+    frames: Annotated[int, Option(min=300, help="Frames of each movie, 100 Hz; 6000 show the drift.")] = 1000
+    seed: Annotated[int, Option(min=0, help="Seed of paint and motion.")] = 0
+    first: Annotated[bool, Option("--first", help="Only the first pass, not the precise method.")] = False
     quiet: Quiet = False
 
 
 @bench.command("ball")
 def ball_scenes(given: _BallOptions) -> None:
-    """Track a ball under an animal of which nothing is known, in scenes as another program publishes its own."""
+    """Track a ball under an animal without prior knowledge, in scenes like those published for spintrack."""
     check_writable(given.out, folder_made=True)
     from sphereorient.bench.ball import SCENES, measure_scene, write_ball_scene
     from sphereorient.methods.settings import Settings
@@ -348,7 +348,7 @@ def ball_scenes(given: _BallOptions) -> None:
 def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
     from sphereorient.bench.ball import SCENES
 
-    title = "Nothing known before; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack prints its own"
+    title = "No prior knowledge; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack publishes them"
     columns = ("scene", "found", "first pass: step", "orientation", "refined: step", "orientation")
     more = ("gain, axes", "drift/min", "step / sigma", "CPU ms", "FicTrac", "spintrack")
     table = Table(*columns, *more, title=title)
@@ -382,19 +382,19 @@ def _errors_of(of: dict[str, Any]) -> tuple[str, str]:
 @dataclass(frozen=True, kw_only=True)
 class _LiveDelayOptions:
     experiment: ExperimentPath
-    rate: Annotated[str, Option(help="Frames a second; several, one after the other: 100,200,500.")] = "200"
-    seconds: Annotated[float, Option(min=1.0, help="How long; the movie is shown there and back again.")] = 20.0
-    loop: Annotated[bool, Option("--loop", help="Show it from its begin again: it has no seam.")] = False
-    load: Annotated[int, Option(min=0, max=64, help="Other programs, each of which keeps a core busy.")] = 0
+    rate: Annotated[str, Option(help="Frames per second; several run in turn: 100,200,500.")] = "200"
+    seconds: Annotated[float, Option(min=1.0, help="Duration; the movie runs forwards, then backwards.")] = 20.0
+    loop: Annotated[bool, Option("--loop", help="Restart the movie at its end: it closes on itself.")] = False
+    load: Annotated[int, Option(min=0, max=64, help="Other programs, each keeping a core busy.")] = 0
     faults: Annotated[bool, Option("--faults", help="Black for 0.5 s of each 5 s; the tracker stops once.")] = False
-    learnt: Annotated[Path | None, Option(help="As of `live`.")] = None
+    learnt: Annotated[Path | None, Option(help="As for `live`.")] = None
     cameras: Cameras = None
     quiet: Quiet = False
 
 
 @bench.command("live")
 def live_delay(given: _LiveDelayOptions) -> None:
-    """Time `live`, from a picture in memory to a line on a socket; and its errors, by a truth.h5 beside the movie."""
+    """Measure latency of `live`, picture in memory to line on a socket; and errors, if truth.h5 is beside the movie."""
     from sphereorient.bench.live import COLUMNS, LiveTiming, delays, neighbours
 
     rates = [_rate_hz(part) for part in names_in(given.rate) or [given.rate]]
@@ -429,7 +429,7 @@ def _rate_hz(text: str) -> float:
         rate_hz = 0.0
     if not 1.0 <= rate_hz < 1e5:
         do = "write e.g. --rate 100,200,500"
-        raise SettingsError(refusal("--rate", expected="frames a second, 1 at least", got=repr(text)[:40], do=do))
+        raise SettingsError(refusal("--rate", expected="frames per second, at least 1", got=repr(text)[:40], do=do))
     return rate_hz
 
 

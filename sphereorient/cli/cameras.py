@@ -22,11 +22,11 @@ MADE_BY = "X_cam = R X_lab + T, mm; made by"
 @app.command()
 def calibrate(
     source: Annotated[Path, Argument(metavar="FILE", help="calibration.yaml; with --refine-with: cameras.yaml.")],
-    out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write; its picture goes beside it.")],
+    out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write, and a figure beside it.")],
     refine_with: Annotated[Path | None, Option(help="track.h5 of these cameras: repair them by the sphere.")] = None,
     quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, no tables.")] = False,
 ) -> None:
-    """Calibrate cameras from pictures of a plate, or repair cameras that moved, from a track of both."""
+    """Calibrate cameras from pictures of a plate, or repair cameras that moved, by a track of their movies."""
     check_ending(out, "--out", YAML)
     check_writable(out)
     picture = out.with_suffix(".png")
@@ -37,7 +37,7 @@ def calibrate(
         repaired = refine_with_track(source, refine_with)
         save_cameras(out, load_cameras(source) | dict(repaired.cameras), f"repaired by {command_line()}")
         if not quiet:
-            echo_lines([*repair_lines(repaired), f"Wrote {out}. Track again with it; a second repair is finer still."])
+            echo_lines([*repair_lines(repaired), f"Wrote {out}. Track again with it; a second repair is better still."])
         return
     check_writable(picture)
     from sphereorient.calibration.plates import calibrate_cameras
@@ -95,7 +95,7 @@ def convert_cameras(
     sources: Annotated[list[Path], Argument(metavar="SOURCE...", help="Of OpenCV, ROS, anipose, COLMAP, or OpenPTV")],
     out: Annotated[Path, Option("--out", "-o", help="cameras.yaml to write.")],
     names: Annotated[str | None, Option(help="Names of the cameras, e.g. cam1,cam2; else those of the files.")] = None,
-    image_size: Annotated[str | None, Option(metavar="W,H", help="Size, px, for files without it.")] = None,
+    image_size: Annotated[str | None, Option(metavar="W,H", help="Picture size, px, if not in the files.")] = None,
     par: Annotated[Path | None, Option(help="OpenPTV's ptv.par or YAML (sensor, indices, wall), for .ori.")] = None,
 ) -> None:
     """Convert cameras of other programs to cameras.yaml. A .addpar beside its .ori is read too."""

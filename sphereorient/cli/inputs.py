@@ -1,4 +1,4 @@
-"""`sphereorient check`, `movie` and `convert`: what goes in, before a run."""
+"""`sphereorient check`, `movie` and `convert`: inputs before a run."""
 
 import re
 import shutil
@@ -53,7 +53,7 @@ def check(
     _print_findings(result.findings, quiet)
     if not quiet:
         counts = [sum(one.severity is severity for one in result.findings) for severity in Severity]
-        typer.echo(f"faults: {counts[2]}, warnings: {counts[1]}, without complaint: {counts[0]}. Wrote {picture}")
+        typer.echo(f"faults: {counts[2]}, warnings: {counts[1]}, ok: {counts[0]}. Wrote {picture}")
     if result.severity is Severity.FAULT:
         raise typer.Exit(1)
 
@@ -108,9 +108,9 @@ def show_movie(
 def convert(
     source: _Movie,
     target: Annotated[Path, Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
-    frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
+    frames: Annotated[str, Option(metavar="A:B", help="Only frames A to B - 1; 100: means from 100 on.")] = ":",
     flip: Flip = "none",
-    rate: Annotated[float | None, Option(min=1e-3, max=1e6, help="Hz, of .mkv in players; else as before.")] = None,
+    rate: Annotated[float | None, Option(min=1e-3, max=1e6, help="Hz, of .mkv in players; else the movie's.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""
@@ -130,11 +130,11 @@ def convert(
             return
         echo_lines(f"{source}: {remark}" for remark in opened.remarks)
         if dead:
-            left = "black" if target.suffix.lower() == ".mkv" else "left out, still counted"
+            left = "black" if target.suffix.lower() == ".mkv" else "left out, numbers kept"
             typer.echo(f"Not decodable, {left}: {_numbers(dead, ', ')}")
         typer.echo(f"Wrote {target}: {_frames(count)}" + (f", {first} .. {last - 1} of the movie" if first else ""))
         if opened.likely_units:
-            typer.echo("Their times are left out: the file does not state the unit, and they are hardly in s.")
+            typer.echo("The times are left out: the file does not state their unit, and seconds are implausible.")
         if times_s is not None and target.suffix.lower() == ".mkv":
             typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
 
@@ -163,11 +163,11 @@ def _times(opened: "Movie") -> str:
 
     times_s = opened.times_s
     if times_s is None:
-        shown = f"even ones of players, {opened.played_hz:.6g} Hz" if opened.played_hz else "none"
+        shown = f"only the rate of players, {opened.played_hz:.6g} Hz" if opened.played_hz else "none"
         return f"{shown}: give frame_rate or times in experiment.yaml"
     if len(times_s) < 2:
         return f"{times_s[0]:.9g} s"
-    unit = f"; no unit is stated: by their size in {opened.likely_units}" if opened.likely_units else ""
+    unit = f"; no unit is stated, their size suggests {opened.likely_units}" if opened.likely_units else ""
     return f"{times_s[0]:.9g} .. {times_s[-1]:.9g} s, {spacing(times_s)[1]}{unit}"
 
 

@@ -1,4 +1,4 @@
-"""`sphereorient map` and `compare-maps`: texture maps learnt from movies, two of them, or a series."""
+"""`sphereorient map` and `compare-maps`: learn a texture map from movies, compare two or a series."""
 
 import json
 import math
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from sphereorient.sphere.compare import MapComparison
     from sphereorient.tools.wear import WearSeries
 
-OFTEN = 10  # pictures from which on a texel counts as well seen
-PAINT_MIN = 0.7  # correlation of held-out pictures below which a map is doubted
+OFTEN = 10  # pictures; a texel in so many is well seen
+PAINT_MIN = 0.7  # correlation of held-out pictures; below it a map is doubtful
 PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
 @dataclass(frozen=True, kw_only=True)
 class _MapOptions(CameraOptions):
     experiment: ExperimentPath
-    out: Annotated[Path, Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")]
-    init: Annotated[Path | None, Option(help="Old map: gives the body frame, and the texture never seen here.")] = None
+    out: Annotated[Path, Option("--out", "-o", help="Texture map to write, .png; other files go beside it.")]
+    init: Annotated[Path | None, Option(help="Old map: defines the body frame, fills paint not seen here.")] = None
     photographs: Annotated[
-        bool, Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
+        bool, Option("--photographs", help="Pictures in any order, not a movie: --set paint.unordered=true.")
     ] = False
     resume: Resume = False
     no_cache: NoCache = False
@@ -43,8 +43,8 @@ class _MapOptions(CameraOptions):
 
 @app.command("map")
 def map_(given: _MapOptions) -> None:
-    """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed. Of several
-    balls each gets one, OUT_NAME.png; those that wear one paint share it.
+    """Learn the texture map of a ball, and all orientations, from movies in which it rotates, without a map. Several
+    balls give a map each, OUT_NAME.png; balls of the same paint share one.
     """
     check_ending(given.out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
     from sphereorient.experiment import load_experiment
@@ -85,21 +85,20 @@ def map_(given: _MapOptions) -> None:
         _print(result)
         if result.comparison is not None:
             _print_moved(result.comparison, f"against {given.init}")
-            typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
+            typer.echo(f"kept from the old map, not seen here: {100 * result.kept_share:.0f} % of the sphere")
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in files))
     for name, result in results.items():
         map_path = outs[result.paint_of]
         if result.experiment.texture_path != map_path:
-            place = f"the ball {name} under spheres:" if name else "sphere:"
-            why = "" if result.paint_of == name else f" (it wears the paint of {result.paint_of})"
-            typer.echo(
-                f"next: write texture: {map_path.name} in {place} of the experiment{why}, then `sphereorient track`"
-            )
+            place = f"ball {name} of spheres:" if name else "sphere:"
+            why = "" if result.paint_of == name else f" (same paint as {result.paint_of})"
+            line = f"next: add texture: {map_path.name} under {place} in the experiment{why}, then `sphereorient track`"
+            typer.echo(line)
 
 
 def _files_of(out: Path) -> list[Path]:
-    """Return the names of the map, its counts, all results, its figure, and that of what moved."""
+    """Return the files of the map: map, counts, results, figure, and figure of displacements."""
     return [out, *(out.with_name(out.stem + end) for end in ("_seen.png", "_map.h5", "_map.png", "_moved.png"))]
 
 
@@ -126,26 +125,26 @@ def _print(result: "MapResult") -> None:
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
     closure, last = learnt.closure, learnt.rounds[-1]
     before, after = (math.degrees(drift) for drift in (closure.drift_before_rad, closure.drift_after_rad))
-    drift = f"drift {before:.2f}° before, {after:.2f}° after" if closure.closed else "the drift is not known"
+    drift = f"drift {before:.2f}° before, {after:.2f}° after" if closure.closed else "drift not known"
     state = "arrived" if learnt.arrived else "not arrived: --set paint.rounds=N for more"
     lines = [
         f"seen: {100 * seen:.1f} % of the sphere, {100 * often:.1f} % of it in {OFTEN} pictures or more",
         f"frames: {len(learnt.valid)}, with the ball {int(learnt.valid.sum())}, fitted {int(learnt.fitted.sum())}",
         f"loops: {closure.closed} of {closure.loops} closed; {drift}",
-        f"iterations: {len(learnt.rounds)}, the last moved attitudes by {math.degrees(last.moved_rad):.4f}° ({state})",
+        f"iterations: {len(learnt.rounds)}, last change of orientation {math.degrees(last.moved_rad):.4f}° ({state})",
     ]
     alone = ~learnt.valid & learnt.position_lab_mm[:, 0].isfinite()  # of photographs
     if alone.any():
         named = ", ".join(str(k) for k in alone.nonzero()[:, 0].tolist())
-        lines.append(f"without an attitude, because they share too little with the others: frames {named}")
+        lines.append(f"without an orientation, because they overlap the others too little: frames {named}")
     paint = learnt.paint[learnt.paint.isfinite()]
     if len(paint):
         middle, low = paint.quantile(0.5), paint.quantile(0.05)
-        said = f"paint in pictures held out of the map: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)"
+        said = f"paint in pictures held out of the map: correlation {middle:.3f} (median), {low:.3f} (5th percentile)"
         lines.append(said if middle > PAINT_MIN else f"doubt: {said}; do not trust the map")
     if len(learnt.jumps):
         named = ", ".join(str(k) for k in learnt.jumps[:PLACES_PRINTED].tolist())
-        lines.append(f"doubt: the rate jumps at {len(learnt.jumps)} frames: {named}")
+        lines.append(f"doubt: the angular velocity jumps at {len(learnt.jumps)} frames: {named}")
     echo_lines(lines)
 
 
@@ -159,7 +158,7 @@ def compare_maps_(
         ),
     ],
     out: Annotated[Path | None, Option("--out", "-o", help="Figure: displacements, changes of the texture.")] = None,
-    series: Annotated[bool, Option("--series", help="Maps in order of time: wear of all since the first.")] = False,
+    series: Annotated[bool, Option("--series", help="Maps in order of time: wear of each since the first.")] = False,
     same_frame: Annotated[
         bool, Option("--same-frame", help="Same body frame; else the rotation is estimated.")
     ] = False,
@@ -169,7 +168,7 @@ def compare_maps_(
     if out is not None:
         check_writable(out)
     if not series and len(maps) != 2:
-        do = "name the new map and the old one, or add --series and name the first one first"
+        do = "name the new map and the old one, or add --series and name maps in order of time"
         raise PaintError(refusal("maps", expected="two", got=str(len(maps)), do=do))
     (_compare_series if series else _compare_two)(maps, out, turned=not same_frame, as_json=as_json)
     if out is not None and not as_json:
@@ -284,7 +283,7 @@ def _numbers(comparison: "MapComparison") -> dict[str, object]:
 
 
 def _known_map(path: Path) -> "Tensor":
-    """Read a map, NaN where it is no paint."""
+    """Read a map; NaN: unseen paint."""
     from sphereorient.sphere import load_texture, load_unseen
 
     texture, unseen = load_texture(path), load_unseen(path)

@@ -1,4 +1,4 @@
-"""Options that several commands have, and what their texts mean."""
+"""Options shared by several commands, and the parsing of their texts."""
 
 import os
 import re
@@ -20,11 +20,11 @@ ExperimentPath = Annotated[Path, Argument(metavar="EXPERIMENT", help="experiment
 TrackPath = Annotated[Path, Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
 SphereName = Annotated[str | None, Option("--sphere", help="Of several balls, only this one.")]
 Align = Annotated[
-    str, Option(help="Constant rotations to remove first: none; body: of its axes; both: of the frame too.")
+    str, Option(help="Constant rotations to remove first: none; body: of the body axes; both: of the lab axes too.")
 ]
 FicTracConfigPath = Annotated[
     Path | None,
-    Option("--axes", metavar="CONFIG", help="FicTrac's config.txt: its table in its own axes; default: in the lab's."),
+    Option("--axes", metavar="CONFIG", help="FicTrac's config.txt: write its table in its axes; default: lab axes."),
 ]
 Cameras = Annotated[str | None, Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
 SettingsPath = Annotated[Path | None, Option(help="YAML as `sphereorient settings` writes it.")]
@@ -44,10 +44,10 @@ NoCache = Annotated[
     Option(
         "--no-cache",
         callback=_without_cache,
-        help="Compute what earlier runs kept in the user's cache folder, and keep nothing.",
+        help="Neither read nor write the user's cache folder.",
     ),
 ]
-Resume = Annotated[bool, Option("--resume", help="Go on with what a run that was cut off left beside --out.")]
+Resume = Annotated[bool, Option("--resume", help="Continue an interrupted run from its files beside --out.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no summary.")]
 
 
@@ -60,7 +60,7 @@ class CommonOptions:
     quiet: Quiet = False
 
     def chosen(self, method: str, *also: str) -> "Settings":
-        """Read the settings that a method reads, with further overrides, and print remarks on the others."""
+        """Read the settings of a method, with further overrides; print remarks on those that it does not use."""
         from sphereorient.methods.settings import METHODS, read_settings
 
         overrides = [*(self.set_ or ()), *also]
@@ -100,17 +100,17 @@ def cameras_of(text: str | None) -> tuple[str, ...] | None:
 
 
 def ball_words(name: str) -> str:
-    """Return the beginning of a line about a ball; nothing for an unnamed one."""
+    """Return the start of a line about a ball; empty without a name."""
     return f"ball {name}: " if name else ""
 
 
 def file_of(out: Path, ball: str) -> Path:
-    """Return the file of a ball: `out` of an unnamed one, else out_NAME."""
+    """Return the file of a ball: `out` without a name, else out_NAME."""
     return out.with_name(f"{out.stem}_{ball}{out.suffix}") if ball else out
 
 
 def frames_of(text: str, error: type[SphereOrientError], count: int | None = None) -> tuple[int, int | None]:
-    """Return first and last + 1 of A:B, of a movie of `count` frames; None: the last one. Raise `error` for others."""
+    """Return first and last + 1 of A:B in a movie of `count` frames; None: open end. Raise `error` for other texts."""
     found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
     first, last = (int(found[1] or 0), int(found[2]) if found[2] else count) if found else (0, 0)
     if last is not None and not first < last <= (count or last):

@@ -1,4 +1,4 @@
-"""`sphereorient report`, `overlay` and `export`: what a track is looked at with."""
+"""`sphereorient report`, `overlay` and `export`: views of a track."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -65,11 +65,11 @@ def report(given: _ReportOptions) -> None:
 
 
 def load_tracks(paths: list[Path], sphere: str | None) -> "dict[str, Trajectory]":
-    """Read the tracks; the name of each is the shortest unique end of its path, and the name of its sphere."""
+    """Read tracks by name: the shortest unique end of the path, then the name of the sphere."""
     whole = [path.resolve() for path in paths]
     for path in whole:
         if whole.count(path) > 1:
-            do = "name it once: twice it would count as new data"
+            do = "name it once; a second time it would count as new data"
             raise TrackError(refusal(str(path), expected="each track once", got="it twice", do=do))
 
     def name(path: Path) -> str:
@@ -90,9 +90,9 @@ class _OverlayOptions:
     track: TrackPath
     out: Annotated[Path | None, Option("--out", "-o", help="Movie to write: .mp4, .mov or .mkv (H.264).")] = None
     cameras: Annotated[str | None, Option(help="Show only these, e.g. cam1 or cam1,cam2.")] = None
-    frames: Annotated[str, Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":"
-    every: Annotated[int, Option(min=1, help="Show one of so many frames.")] = 1
-    fps: Annotated[float, Option(min=0.1, max=240.0, help="Frames a second of the movie.")] = 25.0
+    frames: Annotated[str, Option(metavar="A:B", help="Only frames A to B - 1; 100: means from 100 on.")] = ":"
+    every: Annotated[int, Option(min=1, help="Show every N-th frame.")] = 1
+    fps: Annotated[float, Option(min=0.1, max=240.0, help="Frames per second of the movie.")] = 25.0
     worst: Annotated[Path | None, Option(help="Contact sheet of the worst frames, with reasons (.png, .pdf).")] = None
     count: Annotated[int, Option(min=1, max=120, help="Frames on that sheet.")] = 24
     sphere: SphereName = None
@@ -145,11 +145,11 @@ class _ExportOptions:
     to: Annotated[
         str | None,
         Option(
-            help="csv, parquet, mat, fictrac, tum, vtk, nwb or netcdf; default: by the suffix of the name.",
+            help="csv, parquet, mat, fictrac, tum, vtk, nwb or netcdf; default: by the suffix of --out.",
             metavar="FORMAT",
         ),
     ] = None
-    experiment: Annotated[Path | None, Option(help="experiment.yaml: FicTrac's table needs the camera.")] = None
+    experiment: Annotated[Path | None, Option(help="experiment.yaml, for the camera of FicTrac's table.")] = None
     axes: FicTracConfigPath = None
     sphere: SphereName = None
     quiet: Quiet = False
@@ -158,7 +158,7 @@ class _ExportOptions:
 @app.command()
 def export(given: _ExportOptions) -> None:
     """Write a track for other programs: tables, MATLAB, FicTrac's table, poses (TUM), ParaView, NWB, netCDF.
-    Of several balls, write a file each, with the ball's name at the end of its own.
+    Several balls give one file each, named OUT_BALL.
     """
     from sphereorient.report.export import export_track, format_of
 

@@ -1,4 +1,4 @@
-"""Tools beside tracking: `sphereorient spin`, the spin of a ball from photographs, and `texture`, the design of one."""
+"""`sphereorient spin`: spin of a ball from photographs; `texture`: design of a texture map."""
 
 import json
 import math
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from sphereorient.tools.spin.spin import SpinEstimate
 
 SPREAD = ("min", "median", "max")
-HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
+HEIGHT_MAX = 1024  # rows of a judged map; no picture resolves more
 
 
 @dataclass(frozen=True, kw_only=True)
 class _SpinOptions:
     photographs: Annotated[list[Path], Argument(metavar="PHOTOGRAPHS...", help="Pictures of a flight, or a folder.")]
-    times: Annotated[str, Option(help="Table .csv with file,t_s; or pictures a second, e.g. 400, at equal intervals.")]
+    times: Annotated[str, Option(help="Table .csv with file,t_s; or pictures per second, e.g. 400.")]
     texture: Annotated[Path, Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")]
     out: Annotated[Path, Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")]
     dot_radius: Annotated[float | None, Option(help="Radius of the dots on the ball, degrees; else measured.")] = None
@@ -41,7 +41,7 @@ class _SpinOptions:
 
 @app.command()
 def spin(given: _SpinOptions) -> None:
-    """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
+    """Measure angular velocity and orientations of a spinning ball from photographs (docs/photographs.md)."""
     check_ending(given.out, "--out", [".json"])
     check_writable(given.out)
     check_writable(given.out.with_suffix(".png"))
@@ -111,8 +111,8 @@ def _print_spin(result: dict[str, Any]) -> None:
         ambiguous = result["ambiguous"] > 1 and not one["distinguished"]
         words = "; alias that the times do not exclude" if ambiguous and k else "" if not k else "; less likely"
         typer.echo(
-            f"omega ({omega}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} rad/s = {rate / (2 * math.pi):.2f} turns/s, "
-            f"evidence {one['evidence']:.0f}{words}"
+            f"omega ({omega}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} rad/s = {rate / (2 * math.pi):.2f} revolutions/s"
+            f", evidence {one['evidence']:.0f}{words}"
         )
     followed = [one["residual_deg"] for one in result["photographs"] if one["residual_deg"] is not None]
     typer.echo(
@@ -143,9 +143,9 @@ class _DesignOptions:
     tries: Annotated[int, Option(min=1, max=1000, help="With --make: maps of each kind.")] = 24
     seed: Annotated[int, Option(help="With --make: the same seed gives the same map.")] = 0
     diameter_px: Annotated[float, Option(min=12, max=400, help="Diameter of the ball's picture, px.")] = 80.0
-    noise: Annotated[float, Option(min=0.001, max=1, help="Noise of a pixel over the step from black to white.")] = 0.05
-    views: Annotated[int, Option(min=12, max=2000, help="Views that are judged.")] = 96
-    gores: Annotated[int | None, Option(help="Print so many strips, e.g. 12; needs --diameter-mm.")] = None
+    noise: Annotated[float, Option(min=0.001, max=1, help="Noise of a pixel, as a share of black to white.")] = 0.05
+    views: Annotated[int, Option(min=12, max=2000, help="Number of views to judge.")] = 96
+    gores: Annotated[int | None, Option(help="Number of strips to print, e.g. 12; needs --diameter-mm.")] = None
     diameter_mm: Annotated[float | None, Option(help="Diameter of the ball, mm.")] = None
     as_json: Annotated[bool, Option("--json", help="Print the judgement as JSON.")] = False
     quiet: Annotated[bool, Option("--quiet", "-q", help="No progress, no table.")] = False
@@ -187,7 +187,7 @@ def design(given: _DesignOptions) -> None:
 
 def _check_design(given: _DesignOptions) -> None:
     if given.make == (given.map_ is not None):
-        got, do = ("both", "leave one of them away") if given.make else ("neither", "name a map, or say --make")
+        got, do = ("both", "leave one out") if given.make else ("neither", "name a map, or add --make")
         raise TextureError(refusal("texture design", expected="a map to judge or --make", got=got, do=do))
     if (given.gores is None) != (given.diameter_mm is None):
         got = "--gores alone" if given.diameter_mm is None else "--diameter-mm alone"

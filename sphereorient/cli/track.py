@@ -27,16 +27,16 @@ class _TrackOptions(CameraOptions):
     experiments: Annotated[
         list[Path], Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
     ]
-    out: Annotated[Path, Option("--out", "-o", help="HDF5 file to write; of several experiments a folder.")]
+    out: Annotated[Path, Option("--out", "-o", help="HDF5 file to write; for several experiments a folder.")]
     method: Annotated[
         str, Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
     ] = "precise"
     device: Annotated[str, Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu"
     jobs: Annotated[int, Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1
-    cluster: Annotated[str | None, Option(help="Dask cluster: its scheduler's address or file; or local.")] = None
+    cluster: Annotated[str | None, Option(help="Dask cluster: address or file of its scheduler, or local.")] = None
     resume: Resume = False
-    learnt: Annotated[Path | None, Option(help="Use what another run of these cameras learnt (--save-learnt).")] = None
-    save_learnt: Annotated[Path | None, Option(help="Keep what is learnt: empty scenes, light, scores, noise.")] = None
+    learnt: Annotated[Path | None, Option(help="Use a file that --save-learnt wrote for these cameras.")] = None
+    save_learnt: Annotated[Path | None, Option(help="Write what is learnt: empty scenes, light, scores, noise.")] = None
     proposer: Annotated[str | None, Option(help="Proposer's checkpoint, or default (docs/proposer.md).")] = None
     no_learn_paint: Annotated[bool, Option("--no-learn-paint", help="Use the map even where paint differs.")] = False
     no_cache: NoCache = False
@@ -84,7 +84,7 @@ def track(given: _TrackOptions) -> None:
 
 
 def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path | Experiment":
-    """Return an experiment with a map; of an only ball that has none, one is learnt and written."""
+    """Return an experiment with a map; for a single ball without one, learn and write it."""
     from sphereorient.experiment import load_experiment
 
     experiment = load_experiment(path)
@@ -103,12 +103,12 @@ def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path |
         write_map(found, target)
     if not given.quiet:
         share = 100 if found.unseen is None else 100 * (1 - unseen_share(found.unseen))
-        about = f"{share:.0f} % of the ball, by the first frames; its axes are the lab's at the first of them"
+        about = f"{share:.0f} % of the ball, from the first frames; its axes are the lab axes at the first frame"
         typer.echo(f"note: no map: wrote {target}, {about}; `sphereorient map` learns a finer one.")
         for remark in remarks:
             typer.echo(f"note: {remark}")
         if experiment.texture_path is None:
-            typer.echo(f"next: write texture: {target.name} in sphere: of {path}")
+            typer.echo(f"next: add texture: {target.name} under sphere: in {path}")
     return experiment.with_sphere(texture_path=target)
 
 
@@ -176,7 +176,7 @@ class _LiveOptions(CameraOptions):
     experiment: ExperimentPath
     source: Annotated[
         str,
-        Option(help="movie: at its rate; movie-fast; -; shared:FILE; camera:0; genicam:X.cti#A; pylon:A,B; vimba:A"),
+        Option(help="movie; movie-fast; - (stdin); shared:FILE; camera:0; genicam:X.cti#A; pylon:A,B; vimba:A"),
     ] = "movie"
     to: Annotated[
         list[str] | None,
@@ -184,17 +184,17 @@ class _LiveOptions(CameraOptions):
             help="Repeatable: tcp:PORT, udp:, zmq:, osc:, serial:PORT@BAUD, lsl:NAME, shared:FILE, .dat, .jsonl, .h5"
         ),
     ] = None
-    record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5, one a camera.")] = None
-    learnt: Annotated[Path | None, Option(help="What `track --save-learnt` kept of this set-up: no learning.")] = None
+    record: Annotated[Path | None, Option(help="Record the pictures: a new .mkv or .h5 per camera.")] = None
+    learnt: Annotated[Path | None, Option(help="File of `track --save-learnt`: skips the learning.")] = None
     axes: FicTracConfigPath = None
-    page: Annotated[int | None, Option(min=0, max=65535, help="Port of a page in the browser; 0: any free one.")] = None
+    page: Annotated[int | None, Option(min=0, max=65535, help="Port of the page in the browser; 0: any.")] = None
 
 
 @app.command()
 def live(given: _LiveOptions) -> None:
-    """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
+    """Track while the ball rotates: each pose from earlier frames, a line per frame to sockets and files.
 
-    The experiment's movies show the empty scene and the light. Without a map, that of a fixed ball is learnt meanwhile.
+    The experiment's movies give the empty scene and the light. Without a map, the map of a fixed ball is learnt.
     """
     from sphereorient.experiment import load_experiment
     from sphereorient.live.live import TrackBlocks
@@ -213,8 +213,8 @@ def live(given: _LiveOptions) -> None:
         for output, _ in outputs:
             opened.callback(output.close)
         if len(experiment.names) > 1 and any(form != "json" for _, form in outputs):
-            got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other lines do not name the ball"
-            raise SettingsError(refusal("--to", expected="JSON, of several balls", got=got, do=do))
+            got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other outputs do not name the ball"
+            raise SettingsError(refusal("--to", expected="JSON for several balls", got=got, do=do))
         if given.axes is not None and not {"fictrac", "marked"} & {form for _, form in outputs}:
             got, do = ", ".join(given.to or ()) or "none", "add --to tcp:PORT, or leave out --axes"
             raise SettingsError(refusal("--axes", expected="an output with FicTrac's table", got=got, do=do))
@@ -234,7 +234,7 @@ def live(given: _LiveOptions) -> None:
             opened.callback(recorders[-1].close)
         monitor = run_live(set_up, recorded(source, recorders) if movies else source, outputs, page, _log, given.axes)
         if set_up.save_map is not None:
-            _log("the map is finished; this takes some seconds")
+            _log("finishing the map; this takes some seconds")
             try:
                 typer.echo(set_up.save_map())
             except PaintError as error:
@@ -244,7 +244,7 @@ def live(given: _LiveOptions) -> None:
 
 
 def _movies_of(given: _LiveOptions, experiment: "Experiment") -> dict[str, Path]:
-    """Return the movie of each camera to record, of several NAME.CAMERA.mkv; OutputError where one cannot be new."""
+    """Return the movie to record per camera; of several NAME.CAMERA.mkv. Raise OutputError if one exists."""
     from sphereorient.live.outputs import check_new
     from sphereorient.movies.write import WRITERS, times_path
 

@@ -39,7 +39,7 @@ def train(
     from sphereorient.report.plots.style import write_figure
 
     prepare(settings, out, resume)
-    with writing(force=resume), progress_bar(quiet, unit="steps") as advance:  # last.ckpt says whose folder it is
+    with writing(force=resume), progress_bar(quiet, unit="steps") as advance:  # only into a folder with last.ckpt
         for name in (CHECKPOINT, LAST, "metrics.csv"):
             check_target(out / name)
         if config.resolve() != (out / "settings.yaml").resolve():
@@ -60,12 +60,12 @@ def train(
 @app.command()
 def evaluate(
     checkpoint: Annotated[Path, Argument(metavar="CHECKPOINT", help="proposer.ckpt of `sphereorient train`.")],
-    config: Annotated[Path | None, Option(help="YAML with the `pictures` to use; else those of its training.")] = None,
+    config: Annotated[Path | None, Option(help="YAML with the `pictures` to use; default: as in its training.")] = None,
     pictures: Annotated[int, Option(min=1, help="Pictures of each degradation and level.")] = 240,
     as_json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
-    """Measure the recall of a proposer's checkpoint on balls that no training sees, one degradation at a time."""
+    """Measure the recall of a proposer's checkpoint on held-out balls, one degradation at a time."""
     from sphereorient.learn.checkpoint import load_checkpoint
     from sphereorient.learn.metrics import benchmark_checkpoint
     from sphereorient.learn.settings import ProposerSettings

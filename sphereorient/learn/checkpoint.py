@@ -35,7 +35,7 @@ class Checkpoint(BaseModel, frozen=True, extra="forbid", arbitrary_types_allowed
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint, equal ones with equal bytes; raise CheckpointError if invalid, OutputError if unwritable."""
+    """Write a checkpoint, equal ones with equal bytes. Raises CheckpointError: invalid; OutputError: unwritable."""
     state = {name: tensor.detach().cpu().float().contiguous().clone() for name, tensor in checkpoint.state.items()}
     tree = {
         "schema": SCHEMA,
@@ -46,7 +46,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "about": dict(checkpoint.about),
     }
     _checked(tree, str(path))
-    # A stream, not a name: torch writes the name into the file.
+    # A stream, as torch would write a name into the file.
     with put_aside(path, also=(RuntimeError,)) as aside, aside.open("wb") as file:
         torch.save(tree, file)
 
@@ -62,7 +62,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     except Exception as error:  # damaged pickles raise nearly anything
         code = "Weights only load failed" in str(error) or "Unsupported" in str(error)
         got = "other objects or code, which were not loaded" if code else "a damaged file"
-        _refuse(name, "a file of weights", got, "train it anew, or fetch it again", error)
+        _refuse(name, "a file of weights", got, "train it again, or download it again", error)
     return _checked(tree, name)
 
 
@@ -85,7 +85,7 @@ def check_texture(checkpoint: Checkpoint, texture: Tensor) -> None:
     own = checkpoint.texture_sha256
     if own is not None and own != (other := texture_sha256(texture)):
         expected, got = f"the map that it was fine-tuned on ({own[:12]})", f"another map ({other[:12]})"
-        _refuse("checkpoint", expected, got, "pass a checkpoint for any map, or fine-tune anew")
+        _refuse("checkpoint", expected, got, "pass a checkpoint for any map, or fine-tune again")
 
 
 def _refuse(name: str, expected: str, got: str, do: str, cause: Exception | None = None) -> NoReturn:
@@ -112,8 +112,8 @@ def _checked(tree: Any, name: str) -> Checkpoint:
     schema = tree.get("schema") if isinstance(tree, dict) else None
     if schema != SCHEMA:
         got = short(schema) if isinstance(schema, str) else "none"
-        _refuse(name, f"schema {SCHEMA}", got, "train it anew with this version, or install the one that wrote it")
-    # A file has every key; the defaults are for new checkpoints.
+        _refuse(name, f"schema {SCHEMA}", got, "train it again with this version, or install the version that wrote it")
+    # A file has every key; defaults are for new checkpoints.
     absent = dict.fromkeys(Checkpoint.model_fields.keys() - tree.keys(), "absent")
     content = {key: value for key, value in tree.items() if key != "schema"}
     checkpoint = validated(Checkpoint, content | absent, name, CheckpointError)
@@ -126,5 +126,5 @@ def _checked(tree: Any, name: str) -> Checkpoint:
         if tensor.shape != (shape := known[key].shape):
             _refuse(f"{name}, {key}", f"shape {tuple(shape)}", str(tuple(tensor.shape))[:60], DO)
         if not bool(tensor.isfinite().all()):
-            _refuse(f"{name}, {key}", "finite numbers", "others", "train it anew")
+            _refuse(f"{name}, {key}", "finite numbers", "others", "train it again")
     return checkpoint

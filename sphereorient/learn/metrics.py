@@ -1,4 +1,4 @@
-"""The quality of a proposer: metrics, and recall by degradation, speed and example pictures on unseen maps."""
+"""The quality of a proposer: metrics; recall by degradation, speed and examples on held-out maps."""
 
 import math
 import time
@@ -35,9 +35,9 @@ Z95 = 1.959964  # normal quantile of a two-sided interval of 95 %
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
-WITHIN_DEG = 10.0  # of the truth counts as right: the pose fit converges from there
+WITHIN_DEG = 10.0  # of the truth is right: the pose fit converges from there
 TEMPERATURES = tuple(2 ** (k / 2) for k in range(-4, 5))  # tried first: 1/4 .. 4
-NEARER = tuple(2 ** (k / 8) for k in (-3, -2, -1, 1, 2, 3))  # then the best one times these
+NEARER = tuple(2 ** (k / 8) for k in (-3, -2, -1, 1, 2, 3))  # then the best times these
 BENCHMARK_SEED = 2 * VALIDATION_SEED  # of the first map
 LEVELS = (3, 4, 5)
 MIXED = 999  # random stream of the mixed pictures; those of the degradations are below

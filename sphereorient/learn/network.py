@@ -19,10 +19,10 @@ from sphereorient.sphere.view import disk_offsets
 
 SCALES = (0.06, 0.1, 0.16, 0.25, 0.4, 0.7)  # standard deviations of the map's blurs, rad
 WINDOW = 0.3  # of the neighbourhood mean that is subtracted, radii
-SEARCHED = 48  # likeliest grid points among which modes are searched
-APART_DEG = 25.0  # nearer modes are suppressed by a better one
-AROUND_DEG = 22.0  # grid points whose mean is the mode
-# Disks at once, padded: the last bits of a product depend on its number of rows, a disk's result must not.
+SEARCHED = 48  # likeliest grid points searched for modes
+APART_DEG = 25.0  # a better mode suppresses nearer ones
+AROUND_DEG = 22.0  # grid points of the mean at a mode
+# Disks per batch, padded, as the last bits of a product depend on its number of rows.
 CANDIDATES = 8
 PROBABILITY_MIN = 1e-5  # of a candidate
 DEFAULT_CHECKPOINT = Path(__file__).with_name("proposer.ckpt")
@@ -157,7 +157,7 @@ def map_blurs(textures: Tensor, side: int) -> Tensor:
     paint = paint / (share * paint.square()).sum(0).sqrt().clamp_min(1e-6)
     blurs = [paint]
     for scale in SCALES:
-        # One kernel at a time: all of them take half a gigabyte.
+        # One kernel at a time, as all take half a gigabyte.
         kernel = torch.exp((direction @ direction.T - 1) / scale**2) * area
         blurs.append((kernel @ paint) / kernel.sum(1, keepdim=True))
     return torch.stack(blurs, -1).transpose(0, 1).contiguous()

@@ -17,8 +17,8 @@ from sphereorient.synth.degrade_scene import misdrawn, worn
 from sphereorient.synth.disks import film_disks
 from sphereorient.synth.severities import DEGRADATIONS, LEVELS
 
-MAPS = 24  # that no training sees, of a validation or a benchmark
-VALIDATION_SEED = 1 << 20  # of the first validation map; training maps begin at 0
+MAPS = 24  # held out, of a validation or a benchmark
+VALIDATION_SEED = 1 << 20  # of the first validation map; training maps start at 0
 BLUR_BATCH = 64  # maps blurred at once
 
 
@@ -40,7 +40,7 @@ class TrainingBatch(NamedTuple):
 
 def generator_of(*numbers: int) -> torch.Generator:
     """Return a generator seeded by whole numbers, not negative."""
-    # torch reads 32 bits of its seed: sums would repeat. The count comes first, else zeros at the end are ignored.
+    # torch reads 32 bits of its seed, so sums would repeat. The count comes first, else final zeros have no effect.
     return torch.Generator().manual_seed(int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1)[0]))
 
 

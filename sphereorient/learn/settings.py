@@ -19,7 +19,7 @@ class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
 
 
 class PictureSettings(BaseModel, frozen=True, extra="forbid"):
-    """The pictures from which a network learns; drawn anew for each step."""
+    """The training pictures, new for each step."""
 
     disks: DiskSettings = Field(default_factory=lambda: DiskSettings(scale=0.55), description="how they are filmed")
     kinds: tuple[str, ...] = Field(tuple(KINDS), description="of paint")
@@ -27,9 +27,9 @@ class PictureSettings(BaseModel, frozen=True, extra="forbid"):
     texture: str | None = Field(None, description="path of one map: learn this ball alone (fine-tuning)")
     texture_rows: int = Field(128, ge=32, description="height of the maps, texels")
     degradations: tuple[str, ...] = Field(DISK_DEGRADATIONS, description="drawn from these")
-    at_once: int = Field(3, ge=0, description="degradations of a picture, at most")
-    hardest: float = Field(5.0, ge=1, le=5, description="level up to which they are drawn; 1 .. 5")
-    validation: int = Field(1024, ge=16, description="pictures, of maps that training has not seen")
+    at_once: int = Field(3, ge=0, description="most degradations of a picture")
+    hardest: float = Field(5.0, ge=1, le=5, description="highest level drawn; 1 .. 5")
+    validation: int = Field(1024, ge=16, description="pictures of held-out maps")
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -39,25 +39,25 @@ class PictureSettings(BaseModel, frozen=True, extra="forbid"):
                     expected, do = ", ".join(sorted(known)), "choose among these"
                     raise SettingsError(refusal(f"pictures.{name}", expected=expected, got=repr(one)[:60], do=do))
         if not self.kinds:
-            raise SettingsError(refusal("pictures.kinds", expected="one at least", got="none", do="name some"))
+            raise SettingsError(refusal("pictures.kinds", expected="at least one", got="none", do="name some"))
         return self
 
 
 class TrainingSettings(BaseModel, frozen=True, extra="forbid"):
     """How a network is trained."""
 
-    epochs: int = Field(200, ge=1, description="at most; each ends with a look at the validation pictures")
+    epochs: int = Field(200, ge=1, description="at most; each ends with a validation")
     steps: int = Field(150, ge=1, description="of an epoch")
     maps: int = Field(2, ge=1, description="maps in a step")
-    groups: int = Field(8, ge=1, description="groups of pictures of each map, each with degradations of its own")
+    groups: int = Field(8, ge=1, description="groups of pictures of each map, each with its own degradations")
     group: int = Field(16, ge=1, description="pictures in a group")
-    learning_rate: float = Field(2e-3, gt=0, description="largest; rises over the first steps, then falls to nothing")
+    learning_rate: float = Field(2e-3, gt=0, description="largest; rises over the first steps, then falls to zero")
     weight_decay: float = Field(1e-4, ge=0, description="of AdamW")
-    spread_deg: float = Field(8.0, gt=0, description="the right answer is spread over the grid by this much")
+    spread_deg: float = Field(8.0, gt=0, description="spread of the right answer over the grid")
     patience: int = Field(20, ge=1, description="epochs without a better validation after which training ends")
     minutes: float | None = Field(80.0, gt=0, description="end after this time; null: no limit")
     seed: int = Field(0, ge=0, description="same seed, same network on the same machine")
-    start: str | None = Field(None, description="path of a checkpoint whose weights training begins with (fine-tuning)")
+    start: str | None = Field(None, description="path of a checkpoint with initial weights (fine-tuning)")
 
 
 class ProposerSettings(BaseModel, frozen=True, extra="forbid"):

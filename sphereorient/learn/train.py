@@ -34,7 +34,7 @@ from sphereorient.sphere import load_texture
 CHECKPOINT = "proposer.ckpt"
 LENGTH = ("epochs", "minutes", "patience")  # may change when training is resumed
 LAST = "last.ckpt"
-TRAINING, VALIDATION = 0, 1  # random streams: no picture occurs in both
+TRAINING, VALIDATION = 0, 1  # random streams, without common pictures
 VALIDATION_SHAPE = 1, 2, 8  # of a validation batch: maps, groups of each, pictures of a group
 WARM_UP_STEPS = 100  # of the learning rate; at most a tenth of all steps
 RECALL_EVERY = 10  # steps between measurements of the recall on training pictures
@@ -42,7 +42,7 @@ _Row = dict[str, float]
 
 
 class TrainingData(LightningDataModule):
-    """Training pictures, a function of seed, epoch and step alone, and validation pictures, drawn once."""
+    """Training pictures, a function of seed, epoch and step only; validation pictures, drawn once."""
 
     def __init__(self, settings: ProposerSettings) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class ProposerModule(LightningModule):
         return torch.optim.AdamW(self.network.parameters(), lr=of.learning_rate, weight_decay=of.weight_decay)
 
     def learning_rate(self) -> float:
-        """Return the rate of the next step: a linear rise, then a cosine of the share of steps or time that is done."""
+        """Return the rate of the next step: a linear rise, then a cosine of the finished share of steps or time."""
         training = self.settings.training
         total = training.epochs * training.steps
         warm = min(WARM_UP_STEPS, max(total // 10, 1))
@@ -135,7 +135,7 @@ class ProposerModule(LightningModule):
         return row
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the settings: training is resumed only with the same ones."""
+        """Add the settings, which must be the same on resuming."""
         checkpoint["sphereorient_settings"] = self.settings.model_dump(mode="json")
 
 
@@ -196,7 +196,7 @@ class Trained:
 
     checkpoint: Checkpoint
     metrics: Metrics  # on the validation pictures, with the temperature
-    rows: tuple[_Row, ...]  # metrics of each epoch, as in metrics.csv; the first is the untrained network
+    rows: tuple[_Row, ...]  # metrics of each epoch, as in metrics.csv; first the untrained network
 
 
 def train_proposer(
@@ -213,7 +213,7 @@ def train_proposer(
     progress("draw maps", 0, 1)
     data = TrainingData(settings)
     progress("draw maps", 1, 1)
-    with writing(force=resume):  # last.ckpt says whose folder it is
+    with writing(force=resume):  # last.ckpt proves that training made the folder
         _fit(ProposerModule(settings, network), data, kept, timer, resume)
     if not kept.best:
         do = "lower training.learning_rate"
@@ -267,7 +267,7 @@ def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Corr
 
 def _check_last(last: Path, settings: ProposerSettings) -> None:
     """Refuse to resume another training, before Lightning reads the file."""
-    name, do = f"--resume {last}", "train anew without --resume"
+    name, do = f"--resume {last}", "train again without --resume"
     if not last.is_file():
         raise CheckpointError(refusal(name, expected="the last.ckpt of an interrupted training", got="none", do=do))
     try:
@@ -304,7 +304,7 @@ def _fit(module: ProposerModule, data: TrainingData, kept: CheckpointCallback, t
                 default_root_dir=str(kept.out),
                 gradient_clip_val=1.0,
                 reload_dataloaders_every_n_epochs=1,
-                num_sanity_val_steps=0 if resume else -1,  # the untrained network is the first row of the history
+                num_sanity_val_steps=0 if resume else -1,  # first row of the history: the untrained network
                 enable_checkpointing=False,
                 enable_progress_bar=False,
                 enable_model_summary=False,

@@ -1,4 +1,4 @@
-"""While the ball turns: frames of a camera or of another program in, poses out over sockets, frame by frame."""
+"""Live tracking: frames of a camera or another program in, poses out over sockets, frame by frame."""
 
 from sphereorient.live.feed import Feed
 from sphereorient.live.live import Measured, measured

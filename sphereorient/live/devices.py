@@ -1,5 +1,5 @@
-"""Cameras of makers and of OpenCV, set as experiment.yaml says. A maker's part is a function here, which opens a device
-by its serial number, and a line of `MAKERS`; features have GenICam's names (SFNC).
+"""Cameras of makers and of OpenCV, set by experiment.yaml. A maker needs a function here, which opens a device by its
+serial number, and a line in `MAKERS`; features have GenICam's names (SFNC).
 """
 
 import time
@@ -23,11 +23,11 @@ from sphereorient.live.instants import Instants, RawPicture
 from sphereorient.movies import flipped_picture, flipped_shape
 
 AGAIN_S = 1.0  # between attempts to open a camera
-WAIT_S = 0.2  # of one call of a driver; a camera that waits for its trigger is asked again
-RELEASE_S = 10.0  # until drivers have let their cameras go
-BUFFERS = 16  # pictures that a driver holds
-OPENING = Lock()  # one camera at a time: drivers look for their cameras meanwhile
-ALIKE = 0.02  # share by which a device may round what it is set to
+WAIT_S = 0.2  # limit of one call of a driver; without a trigger it is repeated
+RELEASE_S = 10.0  # for drivers to release their cameras
+BUFFERS = 16  # pictures buffered by a driver
+OPENING = Lock()  # one camera at a time, as drivers scan for cameras
+ALIKE = 0.02  # relative rounding of settings by a device
 OLDER = {"ExposureTime": "ExposureTimeAbs", "AcquisitionFrameRate": "AcquisitionFrameRateAbs"}  # of older GigE cameras
 OPENCV = {
     "Width": cv2.CAP_PROP_FRAME_WIDTH,
@@ -38,11 +38,11 @@ OPENCV = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Device:
-    """An opened camera. All may raise the errors of its driver."""
+    """An opened camera. All functions may raise errors of its driver."""
 
     get: Callable[[str], Any]  # the value of a feature
     set: Callable[[str, Any], object]
-    shot: Callable[[], RawPicture | None]  # the next one; None: none within WAIT_S; EOFError: none comes any more
+    shot: Callable[[], RawPicture | None]  # the next one; None: none within WAIT_S; EOFError: the end
     start: Callable[[], object] = lambda: None
 
 
@@ -52,7 +52,7 @@ Came = tuple[int, RawPicture | None] | None  # number of a camera, and what `Liv
 
 @contextmanager
 def _genicam(producer: str) -> Iterator[Open]:
-    """GenICam cameras, through harvesters and the producer that their maker's driver brings."""
+    """GenICam cameras, through harvesters and the producer of their maker's driver."""
     driver = package("harvesters.core", "genicam", MovieError)
     with driver.Harvester() as harvester:
         harvester.add_file(producer, check_existence=True, check_validity=True)
@@ -61,7 +61,7 @@ def _genicam(producer: str) -> Iterator[Open]:
         @contextmanager
         def device(serial: str) -> Iterator[Device]:
             if not opened:
-                harvester.update()  # closes those that are open
+                harvester.update()  # closes open ones
             _check_seen(serial, [one.serial_number for one in harvester.device_info_list])
             with harvester.create({"serial_number": serial} if serial else 0) as camera:
                 camera.num_buffers = max(BUFFERS, camera.min_num_buffers)
@@ -72,12 +72,12 @@ def _genicam(producer: str) -> Iterator[Open]:
                         buffer = camera.fetch(timeout=WAIT_S)
                     except driver.TimeoutException:
                         return None
-                    if buffer is None:  # not whole; the counter tells it
+                    if buffer is None:  # incomplete; the counter shows it
                         return None
                     arrived_s = time.perf_counter()
-                    with buffer:  # its memory is the driver's again behind this
+                    with buffer:  # afterwards the driver reuses its memory
                         shown = buffer.payload.components[0]
-                        picture = np.array(shown.data.reshape(shown.height, -1)[:, : shown.width])  # padding behind
+                        picture = np.array(shown.data.reshape(shown.height, -1)[:, : shown.width])  # without padding
                         stamp_s = _known(lambda: buffer.timestamp / buffer.timestamp_frequency)
                         counter = _known(lambda: buffer.frame_id)
                     return RawPicture(picture=picture, arrived_s=arrived_s, stamp_s=stamp_s, counter=counter)
@@ -168,12 +168,12 @@ def _vimba(serial: str) -> Iterator[Device]:
 
 @contextmanager
 def _opencv(where: str) -> Iterator[Device]:
-    """What OpenCV opens, by its number or address; pictures are made grey and lie as they are stored."""
+    """A camera of OpenCV, by number or address; pictures become grey, in their stored orientation."""
     capture = cv2.VideoCapture(int(where) if where.isdecimal() else where)
     try:
         if not capture.isOpened():
-            do = "connect it, or name another number"
-            raise MovieError(refusal(f"camera:{where}", expected="a camera", got="none that opens", do=do))
+            do = "connect it, or choose another number"
+            raise MovieError(refusal(f"camera:{where}", expected="a camera", got="none", do=do))
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as movies are read
 
         def known(name: str) -> int:
@@ -199,7 +199,7 @@ def _opencv(where: str) -> Iterator[Device]:
         capture.release()
 
 
-# By the name of a source; the functions hold a maker's driver, and get what GenICam's producer is.
+# By the name of a source; the functions hold a maker's driver; their argument is GenICam's producer.
 MAKERS: Mapping[str, Callable[[str], AbstractContextManager[Open]]] = {
     "camera:": lambda _: nullcontext(_opencv),
     "genicam:": _genicam,
@@ -210,24 +210,24 @@ MAKERS: Mapping[str, Callable[[str], AbstractContextManager[Open]]] = {
 
 def _check_seen(serial: str, seen: Sequence[str]) -> None:
     if not seen or (serial and serial not in seen):
-        got, do = ", ".join(seen) or "none", "connect it, or close the program that has it"
+        got, do = ", ".join(seen) or "none", "connect it, or close the program that uses it"
         raise MovieError(refusal("--source", expected=f"a camera {serial}".rstrip(), got=got, do=do))
 
 
 def _known(read: Callable[[], Any]) -> Any:
-    """Return what a driver tells; None: nothing."""
+    """Return a value of a driver; None: it has none."""
     with suppress(Exception):
         return read() or None
     return None
 
 
 def _tick_s(read: Callable[[str], Any]) -> float:
-    """Return the unit of a device's time stamps: 1 ns, or that of older GigE cameras."""
+    """Return the unit of a device's time stamps, s: 1 ns, or that of older GigE cameras."""
     return 1 / float(_known(lambda: read("GevTimestampTickFrequency")) or 1e9)
 
 
 def _features(keys: DeviceKeys, size: tuple[int, ...]) -> Iterator[tuple[str, Any]]:
-    """Yield what to set on a device, in the order in which devices take it; with "?" where it has such a feature."""
+    """Yield features and values to set, in an order that devices accept; "?": only if the device has the feature."""
     if keys.pixel_format:
         yield "PixelFormat", keys.pixel_format
     if keys.offset:
@@ -246,13 +246,13 @@ def _features(keys: DeviceKeys, size: tuple[int, ...]) -> Iterator[tuple[str, An
 
 
 def _refused(device: Device, name: str, value: Any) -> str:
-    """Set a feature where it has another value; return in words what the device does not take."""
+    """Set a feature if its value differs; return as text what the device refuses."""
     try:
         if not _alike(device.get(name.rstrip("?")), value):
             device.set(name.rstrip("?"), value)
         taken = device.get(name.rstrip("?"))
-        return "" if name[-1] == "?" or _alike(taken, value) else f"{name} {value} (it took {taken})"
-    except Exception as error:  # each driver has errors of its own
+        return "" if name[-1] == "?" or _alike(taken, value) else f"{name} {value} (it is {taken})"
+    except Exception as error:  # errors differ between drivers
         if name in OLDER and _known(lambda: device.get(OLDER[name])) is not None:
             return _refused(device, OLDER[name], value)
         return "" if name[-1] == "?" else f"{name} {value} ({error_words(error)[:80]})"
@@ -264,23 +264,23 @@ def _alike(one: Any, other: Any) -> bool:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LiveCamera:
-    """A camera of an experiment, and how its device is opened."""
+    """A camera of an experiment, and the opener of its device."""
 
     name: str  # in messages
     open: Callable[[], AbstractContextManager[Device]]
     stream: CameraStream
-    keys: DeviceKeys | None  # None: the device is as it is
+    keys: DeviceKeys | None  # None: the device is not changed
     flip: str  # of `movies.flipped`
-    log: Log | None  # gets what is wrong, in one line; None: a movie, which ends
+    log: Log | None  # gets faults, in one line; None: a movie, which ends
 
     def pictures(self, stopped: Event) -> Iterator[RawPicture | None]:
-        """Yield pictures until `stopped`; None whenever the device is opened: its clock starts again. After the first
-        picture, a device that ends or fails is opened again each second. Raise MovieError: no camera, one that refuses
-        its settings, or pictures of another size or type.
+        """Yield pictures until `stopped`; None whenever the device is opened, as its clock restarts. After the first
+        picture, a device that ends or fails is reopened each second. Raises MovieError: no camera, settings refused,
+        or pictures of another size or type.
         """
         fault, seen = "", False
         while not stopped.is_set():
-            found = f"{self.name}: no picture comes any more."
+            found = f"{self.name}: pictures have stopped."
             try:
                 with worded(self.name), suppress(EOFError), ExitStack() as opened:
                     with OPENING:
@@ -293,7 +293,7 @@ class LiveCamera:
                             continue
                         fitting = self._fitting(shot)
                         if fault and self.log is not None:
-                            self.log(f"{self.name}: pictures come again.")
+                            self.log(f"{self.name}: pictures arrive again.")
                         fault, seen = "", True
                         yield fitting
             except MovieError as error:
@@ -303,7 +303,7 @@ class LiveCamera:
             if self.log is None or not seen:
                 return
             if not fault and not stopped.is_set():
-                self.log(f"{found} It is opened again each second.")
+                self.log(f"{found} It is reopened each second.")
             fault = found
             stopped.wait(AGAIN_S)
 
@@ -312,14 +312,14 @@ class LiveCamera:
         wanted = _features(self.keys, size) if self.keys else ()
         if refused := ", ".join(filter(None, (_refused(device, feature, value) for feature, value in wanted))):
             do = f"correct camera: {name}: in experiment.yaml"
-            raise MovieError(refusal(self.name, expected="a device that takes its settings", got=refused, do=do))
+            raise MovieError(refusal(self.name, expected="a device that accepts its settings", got=refused, do=do))
         form = str(device.get("PixelFormat"))
         if not form.removeprefix("Mono").isdecimal():
-            do = f"set its PixelFormat to Mono8 or Mono16, or write pixel_format in camera: {name}: of experiment.yaml"
+            do = f"set its PixelFormat to Mono8 or Mono16, or add pixel_format under camera: {name}: in experiment.yaml"
             raise MovieError(refusal(self.name, expected="grey pictures", got=form, do=do))
 
     def _fitting(self, shot: RawPicture) -> RawPicture:
-        """Return a picture as it lies in the movie; MovieError: of another size or type."""
+        """Return a picture in the movie's orientation. Raises MovieError: of another size or type."""
         if (picture := shot.picture) is None:
             return shot
         height, width = flipped_shape(self.stream.movie.frame_shape, self.flip)
@@ -338,13 +338,13 @@ def worded(name: str) -> Iterator[None]:
         yield
     except MovieError:
         raise
-    except Exception as error:  # each driver has errors of its own
-        do = "look whether the maker's viewer shows its pictures"
-        raise MovieError(refusal(name, expected="a camera that works", got=error_words(error), do=do)) from None
+    except Exception as error:  # errors differ between drivers
+        do = "check that the maker's viewer shows its pictures"
+        raise MovieError(refusal(name, expected="a working camera", got=error_words(error), do=do)) from None
 
 
 def device_frames(cameras: Sequence[LiveCamera], log: Log, stopped: Event) -> Iterator[Arrival]:
-    """Yield the instants of cameras until `stopped`, or the only one ends; errors: as `LiveCamera`, `Instants`."""
+    """Yield the instants of cameras until `stopped` or a single camera ends. Raises as as `LiveCamera`, `Instants`."""
     instants, waiting = Instants([one.stream.name for one in cameras], log), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
     pictures: Iterator[Came] = ((0, shot) for shot in cameras[0].pictures(stopped))
@@ -362,14 +362,14 @@ def device_frames(cameras: Sequence[LiveCamera], log: Log, stopped: Event) -> It
 
 
 def _side_by_side(cameras: Sequence[LiveCamera], stopped: Event, due_s: Callable[[], float]) -> Iterator[Came]:
-    """Yield the pictures of cameras, each read in a thread, as they come; None: none came until one was due."""
+    """Yield the pictures of cameras, each read in a thread, as they come; None: one was due and none came."""
     waiting: SimpleQueue[Came | Exception] = SimpleQueue()
 
     def read(number: int) -> None:
         try:
             for shot in cameras[number].pictures(stopped):
                 waiting.put((number, shot))
-        except Exception as error:  # goes on in the thread that iterates
+        except Exception as error:  # raised in the iterating thread
             waiting.put(error)
 
     threads = [Thread(target=read, args=(k,), name=one.name, daemon=True) for k, one in enumerate(cameras)]

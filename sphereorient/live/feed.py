@@ -1,4 +1,4 @@
-"""Frames as they come, read in a thread of their own."""
+"""Frames in order of arrival, read in a separate thread."""
 
 import math
 import time
@@ -14,24 +14,24 @@ from numpy.typing import NDArray
 from sphereorient.experiment.recording import CameraStream
 
 Picture = NDArray[Any]
-Log = Callable[[str], object]  # gets what is wrong, in one line
-LATE, GROWS = 1, 2  # frames that may wait; times the step before, of the next one
-STEADY = 8  # frames in a row without a search: then the next search is not for a motion that steps hide
-STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: then the source stalls
+Log = Callable[[str], object]  # gets a message of one line
+LATE, GROWS = 1, 2  # frames that may wait; largest ratio of successive steps
+STEADY = 8  # frames without a search after which large steps did not cause the next search
+STALLED_S, STALLED_FRAMES = 1.0, 10.0  # without a frame, usual intervals: the source stalls
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Arrival:
-    """One instant: a picture of each camera, None where it could not be read."""
+    """One instant: a picture of each camera, None if unreadable."""
 
-    number: int  # counts all instants of the source, also those that were dropped
+    number: int  # counts all instants of the source, also dropped ones
     time_s: float
     pictures: Sequence[Picture | None]
-    arrived_s: float  # by the clock of time.perf_counter; NaN: when the tracking takes it
+    arrived_s: float  # by the clock of time.perf_counter; NaN: set when tracking takes it
 
 
 class FrameBytes:
-    """How the pictures of all cameras lie in the bytes of one frame: row by row, of the movies' size and type."""
+    """Layout of all cameras' pictures in the bytes of one frame: row by row, of the movies' size and type."""
 
     def __init__(self, streams: Sequence[CameraStream]) -> None:
         self._kinds = [(stream.movie.frame_shape, stream.movie.dtype) for stream in streams]
@@ -48,9 +48,9 @@ class FrameBytes:
 
 
 class Feed:
-    """Reads a source in a thread, and yields its frames in order, or its error. At most `most` frames wait: then the
-    oldest is dropped, or with `wait` the source waits. While more than `LATE` wait, frames are skipped, in steps that
-    grow slowly: the motion stays known. `log` gets a line where the source stalls, and where it goes on.
+    """Reads a source in a thread, and yields its frames in order, or raises its error. At most `most` frames wait; then
+    the oldest is dropped, or with `wait` the source waits. While more than `LATE` wait, frames are skipped, in steps
+    that grow slowly so that the motion stays known. `log` gets a line when the source stalls and when it resumes.
     """
 
     def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool, log: Log = lambda line: None) -> None:
@@ -62,7 +62,7 @@ class Feed:
         self._changed = Condition()
         self._ended = self._closed = False
         self._fault: Exception | None = None
-        self._overrun = False  # whether frames behind the last one were dropped
+        self._overrun = False  # whether frames after the last one were dropped
         self._step, self._since = 0, STEADY  # from the frame before to the last one; frames since the last search
         self._thread = Thread(target=self._read, name="feed", daemon=True)
         self._thread.start()
@@ -85,18 +85,18 @@ class Feed:
                     self._changed.notify_all()
                     if self._closed:
                         return
-        except Exception as fault:  # goes on in the thread that iterates
+        except Exception as fault:  # raised in the iterating thread
             self._fault = fault
         finally:
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
             if isinstance(self._source, Generator):
-                self._source.close()  # a device is released
+                self._source.close()  # releases a device
 
     def restart(self) -> None:
-        """Begin with small steps: the motion from here is not known. The first step is one frame where the last search
-        was recent. Where frames after the last one were dropped, those that wait are skipped.
+        """Restart with small steps, as the motion is unknown; with one frame if the last search was recent. If frames
+        after the last one were dropped, the waiting ones are skipped.
         """
         with self._changed:
             self._step, self._since = int(self._since >= STEADY), 0
@@ -117,7 +117,7 @@ class Feed:
                 if not self._waiting:
                     break
                 arrival, self._overrun = self._waiting.popleft(), False
-                late = LATE if self._since else 0  # what came during a search is late as it is
+                late = LATE if self._since else 0  # frames that came during a search are late anyway
                 most = min(len(self._waiting) + 1 - late, GROWS * self._step)
                 if not self._wait and most > 1:
                     self.dropped += most - 1
@@ -140,4 +140,4 @@ class Feed:
         self._log(f"source: no frame for {time.perf_counter() - since:.1f} s; tracking waits.")
         self._changed.wait_for(is_there)
         if self._waiting:
-            self._log(f"source: frames come again, after {time.perf_counter() - since:.1f} s.")
+            self._log(f"source: frames arrive again, after {time.perf_counter() - since:.1f} s.")

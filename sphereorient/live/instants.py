@@ -1,4 +1,4 @@
-"""Which pictures of several cameras show one instant, by the time stamps of their devices."""
+"""Groups the pictures of several cameras by instant, by time stamps of their devices."""
 
 import math
 import statistics
@@ -11,34 +11,34 @@ import numpy as np
 from sphereorient.errors import MovieError, refusal
 from sphereorient.live.feed import Arrival, Log, Picture
 
-JOINING, SURE = 16, 256  # pictures by which a camera comes into step; by which it does in any case
-NEAR = 0.25  # shortest intervals of late: pictures of one instant lie nearer
-SHORTEST = 4  # delays of a camera that agree: then nothing held these pictures up
-DRIFT = 1e-4  # of two devices' clocks, at most
-FOLLOW = 0.125  # share of the drift that is taken over at each instant: stamps scatter
-LATE_S = 0.01, 0.1  # an instant waits for its last picture for one usual interval, within these
-SILENT = 3  # usual intervals without a picture: no instant waits for the camera
-SILENT_S = 1.0  # at least: then another camera gives the time
-JUMP_S = 1.0  # a clock that goes back further was set anew
-LOG_EVERY_S = 10.0  # between lines about pictures that are not there
+JOINING, SURE = 16, 256  # pictures after which a camera is synchronised; after which it is in any case
+NEAR = 0.25  # of the shortest recent interval: pictures of one instant are nearer
+SHORTEST = 4  # agreeing delays of a camera: these pictures were not held up
+DRIFT = 1e-4  # largest, between two devices' clocks
+FOLLOW = 0.125  # share of the drift applied per instant, since stamps scatter
+LATE_S = 0.01, 0.1  # limits of the wait for the last picture, one usual interval
+SILENT = 3  # usual intervals without a picture after which no instant waits for the camera
+SILENT_S = 1.0  # at least, after which another camera gives the time
+JUMP_S = 1.0  # a clock that goes back further was reset
+LOG_EVERY_S = 10.0  # between notes on missing pictures
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawPicture:
-    """A picture as its device gave it."""
+    """A picture from a device."""
 
-    picture: Picture | None  # None: it did not arrive whole
+    picture: Picture | None  # None: incomplete
     arrived_s: float  # by the clock of time.perf_counter
-    stamp_s: float | None = None  # by the clock of the device, from any zero on; None: it has none
-    counter: int | None = None  # of the device, of all pictures that it took; None: it has none
+    stamp_s: float | None = None  # by the device's clock, from any zero; None: no clock
+    counter: int | None = None  # of all pictures taken by the device; None: no counter
 
 
 @dataclass(eq=False)
 class _Clock:
-    """What a device's clock and counter say, and how it lies to the time of all."""
+    """Clock and counter of a device, and its offset to the common time."""
 
     name: str
-    offset_s: float | None = None  # stamp + offset is the time of all; None: out of step
+    offset_s: float | None = None  # stamp + offset is the common time; None: not synchronised
     counter: int | None = None
     stamps: deque[float] = field(default_factory=lambda: deque(maxlen=SURE))
     lags: deque[float] = field(default_factory=lambda: deque(maxlen=SURE))  # arrival - stamp
@@ -54,13 +54,13 @@ class _Instant:
     time_s: float
     arrived_s: float  # of its first picture
     pictures: list[Picture | None]
-    steps: dict[int, int] = field(default_factory=dict)  # of the counters of cameras that took a picture
+    steps: dict[int, int] = field(default_factory=dict)  # of the counters of cameras with a picture
 
 
 class Instants:
-    """Groups the pictures of several cameras by instant. The first camera gives the time; another one is synchronised
-    by its first 16 pictures, by the shortest delays, then by its time stamps with the drift of its clock. An instant
-    has None for a camera whose picture is missing, late or incomplete; `log` gets the counts.
+    """Groups the pictures of several cameras by instant. The first camera gives the time; another is synchronised by
+    the shortest delays of its first 16 pictures, then by its time stamps and the drift of its clock. A missing, late or
+    incomplete picture is None; `log` gets the counts.
     """
 
     def __init__(self, names: Sequence[str], log: Log) -> None:
@@ -68,7 +68,7 @@ class Instants:
         self._log, self._begun_s = log, math.nan  # arrival of the first picture
         self._steps: deque[float] = deque(maxlen=32)  # between pictures of a camera
         self._open: list[_Instant] = []  # in order of time
-        self._times: deque[float] = deque(maxlen=2 * JOINING)  # of those that are gone
+        self._times: deque[float] = deque(maxlen=2 * JOINING)  # of finished instants
         self._number = -1
         self._lacks, self._logged, self._log_s = Counter[str](), 0, -math.inf
 
@@ -81,11 +81,11 @@ class Instants:
         self._clocks[camera].forget()
 
     def take(self, camera: int, shot: RawPicture) -> None:
-        """Take a picture of a camera. Raise MovieError: one of several whose device has no clock."""
+        """Take a picture of a camera. Raises MovieError: several cameras, and this device has no clock."""
         clock, several = self._clocks[camera], len(self._clocks) > 1
         if several and shot.stamp_s is None:
             self._lacks[untimed := f"{clock.name} without a time stamp"] += 1
-            if self._lacks[untimed] > 1:  # a clock may begin at 0, which others give for none
+            if self._lacks[untimed] > 1:  # a clock may begin at 0, which for others means none
                 do = "choose one camera with --cameras"
                 raise MovieError(refusal(clock.name, expected="time stamps of the device", got="none", do=do))
             return
@@ -99,7 +99,7 @@ class Instants:
                 self._lacks[f"{clock.name} doubled"] += 1
                 return
             if step_s < 0 or step_s * DRIFT > near_s > 0:
-                clock.forget()  # nobody knows how far it drifted
+                clock.forget()  # its drift is unknown
             else:
                 self._steps.append(step_s)
         clock.stamps.append(stamp_s)
@@ -115,12 +115,12 @@ class Instants:
         self._put(camera, stamp_s + clock.offset_s, shot, step, near_s)
 
     def _offset_s(self, clock: _Clock) -> float | None:
-        """Return stamp + offset by the shortest delays, then by the instants that lie nearest; None: not known yet."""
+        """Return stamp + offset by the shortest delays, then by the nearest instants; None: not known yet."""
         since_s = clock.stamps[-1] + clock.lags[-1] - max(SILENT_S, SILENT * self._usual_s)
         in_step = [one for one in self._clocks if one.offset_s is not None]
         lead = next((one for one in in_step if one.stamps[-1] + one.lags[-1] > since_s), None)
         if lead is None or lead.offset_s is None:
-            for one in in_step:  # they do not film any more
+            for one in in_step:  # they have stopped
                 one.forget()
             return clock.lags[-1] - self._begun_s
         if len(clock.lags) % JOINING or len(lead.lags) < SHORTEST:
@@ -147,20 +147,20 @@ class Instants:
 
     @property
     def due_s(self) -> float:
-        """When the next instant goes on with what it has, by the clock of time.perf_counter."""
+        """Time at which the next instant stops waiting, by the clock of time.perf_counter."""
         return self._open[0].arrived_s + min(max(self._usual_s, LATE_S[0]), LATE_S[1]) if self._open else math.inf
 
     def ready(self, now_s: float) -> Iterator[Arrival]:
-        """Yield the instants that wait for no picture any more, in order."""
+        """Yield the instants that no longer wait, in order."""
         while self._open and (self.due_s <= now_s or not self._awaited(self._open[0])):
             yield self._arrival(self._open.pop(0))
         if now_s > self._log_s and (count := self._lacks.total()) > self._logged:
             self._logged, self._log_s = count, now_s + LOG_EVERY_S
             lacks = ", ".join(f"{what} {count}" for what, count in self._lacks.items() if count)
-            self._log(f"pictures not used or not there so far: {lacks}; frames go on without them.")
+            self._log(f"pictures unused or missing so far: {lacks}; tracking goes on without them.")
 
     def _awaited(self, instant: _Instant) -> bool:
-        """Return whether a camera may yet give its picture of an instant."""
+        """Return whether a camera's picture of an instant may still come."""
         earliest_s = instant.time_s - SILENT * self._usual_s
         return any(
             clock.offset_s is not None and earliest_s < clock.stamps[-1] + clock.offset_s < instant.time_s

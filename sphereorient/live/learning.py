@@ -1,4 +1,4 @@
-"""No map at the start: orientations by a map that grows with each frame; meanwhile place and map are adjusted."""
+"""Live tracking without a map: the map grows with each frame; a separate process adjusts position and map."""
 
 import multiprocessing
 import signal
@@ -32,38 +32,38 @@ from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.poses import Poses, supported
 
 Array = NDArray[Any]
-FIRST, MORE = 24, 1.5  # frames of the first adjustment, and by how many times more of the next one
-DRIFT_LEFT = 1 / 3  # of the error of turns at the first place, in frames that are not adjusted yet
-SINCE = 16  # of the frames that came meanwhile, evenly spread, that are added to its map: it must not take long
+FIRST, MORE = 24, 1.5  # frames of the first adjustment; factor from one to the next
+DRIFT_LEFT = 1 / 3  # of the rotation error at the first position, in frames not yet adjusted
+SINCE = 16  # of the frames that came during an adjustment, evenly spread, so many enter its map: adding must be quick
 
 
 class LearningTracker:
-    """Follows a ball without a map: by one that grows with each frame. The body frame is the lab at the first one.
-    Place and map are adjusted in a process of its own. `number` is that of the map: another one after each adjustment.
+    """Tracks a ball by a map that grows with each frame. The body frame is the lab at the first frame. A separate
+    process adjusts position and map; `number` of the map changes with each adjustment.
     """
 
     def __init__(self, place: Crops) -> None:
         self.number = 1
         self._coarse = CoarserPictures.of(place)
-        # Tensors that are sent move to other memory: before fits hold their addresses. Later, arrays alone are sent.
+        # Sending moves tensors to other memory, so it precedes fits, which hold addresses. Later only arrays are sent.
         spawn, begin = multiprocessing.get_context("spawn"), (self._coarse.place,)
         self._aside = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin, initargs=begin)
-        self._aside.submit(int)  # the process begins with its first task
+        self._aside.submit(int)  # starts the process
         self._pass, self._kept = FirstPass(self._coarse.place), KeptFrames(self._coarse.place)
         fitter = first_fitter(place.views, place.radius_mm, self._pass.cells.table, FIRST_BLUR_PX)
         lasting = Lasting.none(len(place.views))
         self._known = Appearance(fitter=fitter, still=fitter, lasting=lasting, score_min=0.0, right_score=1.0)
         self.appearances: Mapping[str, Appearance] = {"": self._known}
-        self._error = OUTLINE_ERROR  # of the place, radii in pictures
-        self._away_rad = 0.0  # farthest turn from the first frame
-        self._drift_rad = 0.0  # of the frames that came while the map was adjusted
+        self._error = OUTLINE_ERROR  # of the position, radii in pictures
+        self._away_rad = 0.0  # largest rotation from the first frame
+        self._drift_rad = 0.0  # of the frames that came during the adjustment
         self._now: tuple[Sequence[Frame], Poses] | None = None
         self._due = float(FIRST)
         self._adjusting: tuple[KeptFrames, Future[tuple[Array, ...]]] | None = None
-        self._adjusted_by_rad = 0.0  # turn within the frames that are adjusted
+        self._adjusted_by_rad = 0.0  # rotation within the adjusted frames
 
     def next(self, time_s: float, frames: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
-        """Return the poses of a frame, and whether they were searched for; see `OnlineTracker`."""
+        """Return the poses of a frame, and whether they were searched for, see `OnlineTracker`."""
         coarse = self._coarse.frames(frames)
         poses, searched = self._pass.next(time_s, coarse)
         self._now = (coarse, poses) if supported(poses) else None
@@ -72,13 +72,13 @@ class LearningTracker:
         return {"": (poses, searched)}
 
     def _turned(self, poses: Poses) -> Tensor:
-        """Return the covariance (6, 6) of an orientation since the first frame: a wrong place scales all turns."""
+        """Return the covariance (6, 6) of the rotation since the first frame: a wrong position scales all rotations."""
         self._away_rad = max(self._away_rad, float(so3.log(poses.R_lab_body[0]).norm()))
         variance = (self._error * self._away_rad) ** 2 + self._drift_rad**2
         return torch.diag(torch.tensor([variance] * 3 + [0.0] * 3, dtype=torch.float64))
 
     def between(self) -> None:
-        """Keep the frame, and go over to what was adjusted meanwhile."""
+        """Keep the frame, and adopt a finished adjustment."""
         if self._now is not None:
             self._kept.add(*self._now)
         if self._adjusting is not None and self._adjusting[1].done():
@@ -88,7 +88,7 @@ class LearningTracker:
             correction, since = self._kept.corrected(self._adjusting[0], R_lab_body)
             moved.shown(*since.crops(SINCE)).follow(self._pass, correction)
             self._pass, self._adjusting, self.number = moved, None, self.number + 1
-            # Views that are farther apart tell the place better.
+            # Views farther apart determine the position better.
             self._error = OUTLINE_ERROR * min(1.0, TURNED_RAD / self._adjusted_by_rad)
             self._drift_rad = OUTLINE_ERROR * DRIFT_LEFT * since.path_rad
         if self._adjusting is None and self._kept.count >= self._due and self._kept.turned_rad > TURNED_RAD:
@@ -97,7 +97,7 @@ class LearningTracker:
             self._adjusting = frames, self._aside.submit(_adjusted, *frames.arrays())
 
     def texture(self) -> TextureMap:
-        """Return the map of the frames so far; this takes some seconds. PaintError: the ball has not turned."""
+        """Return the map of the frames so far (takes seconds). Raises PaintError: the ball has not rotated."""
         return self._kept.adjusted().texture()
 
     def close(self) -> None:
@@ -107,7 +107,7 @@ class LearningTracker:
         self._aside.shutdown(wait=False, cancel_futures=True)
 
 
-_PLACE: list[Crops] = []  # of the process that adjusts: the one that it begins with
+_PLACE: list[Crops] = []  # of the adjusting process: the initial one
 
 
 def _begin(place: Crops) -> None:
@@ -118,7 +118,7 @@ def _begin(place: Crops) -> None:
 
 
 def _adjusted(crops: list[list[Crop]], use: Array, R_lab_body: Array) -> tuple[Array, ...]:
-    """Return orientations (N, 3, 3), the place (1, 3), mm, and the map's mean and weight of each cell."""
+    """Return orientations (N, 3, 3), position (1, 3), mm, and the map's mean and weight of each cell."""
     seen = _PLACE[0].holding(crops, torch.from_numpy(use))
     found = adjusted(seen, torch.from_numpy(R_lab_body))
     cells = FirstPass(found.crops).shown(found.crops, found.R_lab_body).cells

@@ -1,4 +1,4 @@
-"""A measured pose as a line of text, FicTrac's and JSON, and as numbers by name."""
+"""A measured pose as a line of FicTrac's table or JSON, and as named numbers."""
 
 import json
 import math
@@ -21,14 +21,12 @@ AXES = {3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}  # by their number
 
 
 class FicTracLines:
-    """FicTrac's 25 columns frame by frame, as `export --to fictrac`; NaN without a pose, after which a new stretch
-    begins.
-    """
+    """FicTrac's 25 columns per frame, as of `export --to fictrac`; NaN without a pose, then a new stretch begins."""
 
     def __init__(self, axes: FicTracAxes) -> None:
         self._axes = axes
         self._before: tuple[float, Floats] | None = None  # time, s, and R_lab_body (3, 3) of the frame before
-        self._first = np.eye(3)  # R_lab_body where this stretch begins
+        self._first = np.eye(3)  # R_lab_body at the start of this stretch
         self._sequence = -1
         self._heading, self._path, self._sums = 0.0, np.zeros((1, 2)), np.zeros((1, 2))
 
@@ -70,9 +68,9 @@ class FicTracLines:
 
 
 class Quantities:
-    """Quantities of each frame by name, with units; lengths are in mm or radii (`length_unit`); a `ball` of several is
-    named. Angular velocity, and velocity unless the ball is `fixed`, are from this frame and those before it; they
-    start again after a search, and are NaN where no errors are stated (relative orientations).
+    """Named quantities of each frame, with units; lengths in mm or radii (`length_unit`); `ball`: name of one of
+    several. Angular velocity, and velocity unless the ball is `fixed`, use this and earlier frames; they restart after
+    a search, and are NaN without stated errors (relative orientations).
     """
 
     def __init__(self, fixed: bool, length_unit: str = "mm", ball: str = "") -> None:
@@ -81,7 +79,7 @@ class Quantities:
         self._before: Measured | None = None
 
     def of(self, now: Measured) -> dict[str, Any]:
-        """Return those of the next frame: numbers, or lists of a number for each axis; NaN where they are not known."""
+        """Return those of the next frame: numbers, or lists of a number per axis; NaN: unknown."""
         unit = self._unit
         sigma = np.sqrt(np.diag(now.covariance + now.lasting))
         omega, velocity = self._rates(now)
@@ -128,7 +126,7 @@ def _states_errors(now: Measured) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Forms:
-    """A frame in the forms that outputs take; each is made where one takes it."""
+    """A frame in the forms of the outputs, each computed on demand."""
 
     now: Measured
     table: FicTracLines
@@ -152,18 +150,18 @@ class Forms:
 
     @property
     def short(self) -> str:
-        """The number of the frame, and the rotation vector of R_lab_body, rad, NaN where there is no pose."""
+        """Number of the frame and rotation vector of R_lab_body, rad; NaN without a pose."""
         x, y, z = rotation_vectors(self.now.R_lab_body[None])[0].tolist()
         return f"{self.now.number},{x:.5f},{y:.5f},{z:.5f}"
 
     @cached_property
     def quantities(self) -> dict[str, Any]:
-        """What is known, see `Quantities.of`."""
+        """Named quantities, see `Quantities.of`."""
         return self.known.of(self.now)
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """The same, each number by its own name, with the axis behind."""
+        """The same as single numbers, with the axis at the end of the name."""
         found: dict[str, float] = {}
         for name, value in self.quantities.items():
             parts = zip(AXES[len(value)], value, strict=True) if isinstance(value, list) else [("", value)]
@@ -172,6 +170,6 @@ class Forms:
 
     @cached_property
     def json(self) -> str:
-        """A line of JSON: null for what is not known, flags and reasons by their names."""
+        """A line of JSON: null for unknown values, flags and reasons by name."""
         words = {"flags": [flag.name for flag in Flag(self.now.flags)], "reason": [str(why) for why in self.now.reason]}
         return json.dumps(without_nan(self.quantities | words), allow_nan=False)

@@ -1,4 +1,4 @@
-"""Estimate the pose of each frame of a feed from the frames before it; and these frames as a track, by blocks."""
+"""Estimate the pose of each frame of a feed from earlier frames; write these frames as a track, in blocks."""
 
 import math
 import time
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 LiveTracker = Union["OnlineTracker", "LearningTracker"]
 
-SEARCH_S = 1.0  # from one long search to the next: the frames between must not wait for it
-MOST_MISSING = 100_000  # frames between two that are written as missing
+SEARCH_S = 1.0  # between long searches: other frames must not wait for them
+MOST_MISSING = 100_000  # missing frames that are written between two frames
 REMARK = "measured frame by frame by `sphereorient live`: no smoother ran, so no smooth poses and no velocities"
 
 
 class OnlineTracker:
-    """Follows balls through frames one after the other, none ahead: each from those before it, else from a search
-    without history. Balls of `tracker` have one chunk at a time (setting `refine.chunks`). Memory does not grow.
+    """Tracks balls frame by frame: each pose from earlier frames, else from a search without history. Balls of
+    `tracker` have one chunk at a time (setting `refine.chunks`). Memory does not grow.
     """
 
     number = 1  # of the map in use
@@ -52,13 +52,13 @@ class OnlineTracker:
         self._time_s: dict[int, float] = {}  # of the last frames
         self._chunks = {name: Chunk(0, self._time_s) for name in balls}
         self._number = 0
-        self._last: dict[str, Poses] = {}  # of the last frame, before it is remembered
-        self._lost: list[str] = []  # balls that the last frame was searched for
+        self._last: dict[str, Poses] = {}  # of the last frame, before it enters the history
+        self._lost: list[str] = []  # balls searched for in the last frame
         self._searched_s = math.nan  # time of the last long search
 
     def next(self, time_s: float, frames: Sequence[Frame]) -> dict[str, tuple[Poses, bool]]:
-        """Return the poses of each ball in the frame of a time, and whether it was searched for, since it was not
-        predicted, or not there. `frames`: a frame of each view. Where time does not increase, the history is dropped.
+        """Return the poses of each ball in a frame, and whether it was searched for (no prediction, or a wrong one).
+        `frames`: a frame of each view. If time does not increase, the history is dropped.
         """
         self.between()
         if not time_s > self._time_s.get(self._number - 1, -math.inf):
@@ -68,7 +68,7 @@ class OnlineTracker:
         self._last = self._step(frames)
         for name in self._lost:
             if supported(self._last[name]):
-                self._chunks[name].forget()  # what was before says nothing of the motion from here
+                self._chunks[name].forget()  # the history does not predict the motion from here
         return {name: (poses, name in self._lost) for name, poses in self._last.items()}
 
     def _step(self, frames: Sequence[Frame]) -> dict[str, Poses]:
@@ -83,7 +83,7 @@ class OnlineTracker:
     def _searched(
         self, frames: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
     ) -> dict[str, Poses]:
-        """Find balls, as `Tracker.start`: by its blob if there is only one; the long search once in a while."""
+        """Find balls, as `Tracker.start`: a single ball by its blob; the long search only each `SEARCH_S`."""
         time_s, self._lost = self._time_s[self._number], list(names)
         if len(self._tracker.balls) == 1:
             found = {name: self._tracker.balls[name].spotted(frames) for name in names}
@@ -109,21 +109,21 @@ class OnlineTracker:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measured:
-    """Pose of one ball in one frame as it was measured, without frames that came later; NaN where there is none."""
+    """Pose of one ball in one frame, measured without later frames; NaN: no pose."""
 
     ball: str  # its name; "": the only one
     number: int  # of the source, dropped frames included
     time_s: float
     position_lab_mm: Floats  # (3,)
     R_lab_body: Floats  # (3, 3)
-    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm): what differs from frame to frame
-    lasting: Floats  # (6, 6), likewise: what all frames share
-    reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
-    poses: Poses  # all that the fit says
-    map_number: int  # of the map that it was measured with
-    flags: int  # bits of `Flag` that its fit has
-    found: bool  # whether it was searched for: the first one, found again, or not where it was expected
-    dropped: int  # frames since the one before that came too late
+    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm): independent part
+    lasting: Floats  # (6, 6), likewise: part common to all frames
+    reason: tuple[Reason, ...]  # of each camera, `OK` if it is used
+    poses: Poses  # full result of the fit
+    map_number: int  # of the map used
+    flags: int  # bits of `Flag` of its fit
+    found: bool  # whether it was searched for: at the start, after a loss, or not found at its prediction
+    dropped: int  # frames dropped since the one before
     latency_s: float  # from the picture's arrival to here
 
     @property
@@ -181,18 +181,18 @@ def _flags(poses: Poses, learnt: Appearance) -> int:
 
 @dataclass(eq=False)
 class TrackBlocks:
-    """Makes a track of each block of frames of an only ball, in order; frames that were dropped are missing in it."""
+    """Makes a track of each block of frames of a single ball, in order; dropped frames become missing ones."""
 
     recording: Recording
     tracker: LiveTracker  # whose appearance is that of the frames
     even: bool  # whether the frames come at the experiment's rate
     settings: Settings
-    command: str  # as it was typed
+    command: str  # as typed
     _last: Measured | None = None
     _segment: int = -1  # of the last frame with a pose
 
     def head(self) -> Trajectory:
-        """Return a track without frames that has the attributes of all."""
+        """Return a track without frames, with the common attributes."""
         recording, experiment = self.recording, self.recording.experiment
         origin = provenance(input_files(experiment, list(recording.cameras)), experiment.folder, self.command)
         return Trajectory.empty(
@@ -207,7 +207,7 @@ class TrackBlocks:
         )
 
     def block(self, frames: Sequence[Measured]) -> Trajectory:
-        """Return the next frames, and those missing before them, as a track."""
+        """Return the next frames, with the missing ones before them, as a track."""
         time_s: list[float] = []
         poses: list[Poses] = []
         marks: list[tuple[int, int]] = []  # segment, flags

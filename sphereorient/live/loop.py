@@ -1,4 +1,4 @@
-"""`live`: the set-up learnt from its movie, or only its place, and the loop over the frames of a source."""
+"""`live`: the set-up learnt from its movie (without a map its position only), and the loop over frames of a source."""
 
 import gc
 from collections.abc import Callable, Iterator, Sequence
@@ -29,19 +29,19 @@ MOST_WAITING, MOST_BYTES = 512, 64 << 20  # frames that wait
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LiveSetup:
-    """An opened experiment and who follows its balls."""
+    """An opened experiment and the tracker of its balls."""
 
     recording: Recording
     tracker: LiveTracker
-    save_map: Callable[[], str] | None = None  # writes the map that is learnt meanwhile, and tells it
+    save_map: Callable[[], str] | None = None  # writes the map learnt live, and returns a message
 
 
 @contextmanager
 def open_live(
     source: Experiment | Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
 ) -> Iterator[LiveSetup]:
-    """Open an experiment. Without a texture map, that of a fixed ball is learnt meanwhile. Raises SphereOrientError:
-    unusable inputs; ExperimentError: cameras that contradict each other, or no map of a ball that moves.
+    """Open an experiment. Without a texture map, the map of a fixed ball is learnt live. Raises SphereOrientError:
+    unusable inputs; ExperimentError: cameras contradict each other, or no map of a moving ball.
     """
     experiment = load_experiment(source)
     if experiment.mapless and learnt is None:
@@ -55,7 +55,7 @@ def open_live(
         job = Job(recording=recording, settings=chosen, device=torch.device("cpu"), given=given)
         follower = precise.learn(job, silent) if given is None else precise.resume(job, given)
         if not follower.tracker.balls:
-            do = "look with `sphereorient check`, or name one camera with --cameras"
+            do = "run `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
         yield LiveSetup(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
 
@@ -64,21 +64,21 @@ def open_live(
 def _learning(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, path: Path
 ) -> Iterator[LiveSetup]:
-    # Import late: with a map nothing is learnt.
+    # Imported only if a map is learnt.
     from sphereorient.live.learning import LearningTracker
     from sphereorient.mapping.disks import held_place
     from sphereorient.report.texture_map import write_map
 
     if not experiment.fixed:
         got, do = "one that moves, and no map", "learn the map from a movie with `sphereorient track`"
-        raise ExperimentError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
+        raise ExperimentError(refusal("sphere.fixed", expected="a fixed ball", got=got, do=do))
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         tracker = LearningTracker(held_place(recording, settings.paint, settings.locate))
 
         def save() -> str:
-            with writing(force=True):  # that of before, by this run
+            with writing(force=True):  # the earlier map of this run
                 write_map(tracker.texture(), path)
-            named = "" if experiment.texture_path is not None else f"; next: write texture: {path.name} in sphere:"
+            named = "" if experiment.texture_path is not None else f"; next: add texture: {path.name} under sphere:"
             return f"Wrote {path}{named}"
 
         try:
@@ -95,23 +95,23 @@ def run_live(
     log: Log,
     fictrac: Path | None = None,
 ) -> Monitor:
-    """Track the frames of a source until it ends, or Ctrl-C. `outputs`: each with the attribute of `Forms` that it
-    takes; `log` gets messages for the user; `fictrac`: see `fictrac_axes`.
+    """Track the frames of a source until its end or Ctrl-C. `outputs`: each with the attribute of `Forms` that it takes;
+    `log` gets messages for the user; `fictrac`: see `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker
-    first = next(iter(tracker.appearances))  # of several balls the page shows this one
+    first = next(iter(tracker.appearances))  # the page shows the first ball
     experiment, views = recording.experiment, tracker.appearances[first].fitter.views
     table = FicTracLines(fictrac_axes(views[0].camera, fictrac))
     known = {ball: Quantities(experiment.of(ball).fixed, experiment.length_unit, ball) for ball in tracker.appearances}
     gc.collect()
-    gc.freeze()  # what is here stays: no pause looks through it
+    gc.freeze()  # permanent objects: garbage collection skips them
     size = FrameBytes(recording.streams).size
     feed = Feed(source.frames(recording), min(MOST_WAITING, max(MOST_BYTES // size, 16)), wait=source.waits, log=log)
     monitor = Monitor(feed, log)
     try:
         if page is not None:
             page.begin(recording, monitor.running, opened.save_map)
-        # In one thread: a second one may wait for a core that another program has.
+        # In one thread: a second one may wait for a core that another program uses.
         with suppress(KeyboardInterrupt), limited_cores(1):
             for now in measured(tracker, views, monitor):
                 forms = Forms(now, table, known[now.ball])

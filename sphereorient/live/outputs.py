@@ -1,5 +1,5 @@
-"""Outputs: sockets, serial ports, LSL, files. A slow or dead reader loses lines; the loop never waits. A new output is
-a class, and a line of `SOCKETS`, `NAMED` or `FILES`.
+"""Outputs: sockets, serial ports, LSL, files. A slow reader loses lines; the loop never waits. A new output is a class
+and a line in `SOCKETS`, `NAMED` or `FILES`.
 """
 
 import os
@@ -22,30 +22,30 @@ from sphereorient.live.live import TrackBlocks
 from sphereorient.live.shared import POSE_BYTES, POSES, SharedFrames
 from sphereorient.trajectory import Trajectory, journal
 
-MOST_LINES = 1000  # that wait for one reader; then the oldest is lost
-SOON_LINES = 200  # likewise, of a serial port: soon it is told that it is too slow, and lines are never much late
-SOON_S, DISK_S = 1.0, 30.0  # to write what waits, at the end
-BLOCK_S = 0.5  # from one write of a track's rows to the next
-LEAST_OF = 256  # frames, of which the least delayed one sets LSL's clock
-UNIT = re.compile(r"_((?:rad|mm|radii)_s|rad|mm|radii|ms|s)(?:_[wxyz])?$")  # in the name of a number
+MOST_LINES = 1000  # that wait for one reader; beyond, the oldest is lost
+SOON_LINES = 200  # likewise for a serial port: few, so that lines are never late by much
+SOON_S, DISK_S = 1.0, 30.0  # to write waiting lines at the end
+BLOCK_S = 0.5  # between writes of a track's rows
+LEAST_OF = 256  # frames; the least delayed of these sets LSL's clock
+UNIT = re.compile(r"_((?:rad|mm|radii)_s|rad|mm|radii|ms|s)(?:_[wxyz])?$")  # unit in the name of a number
 
 
 class Output:
-    """Takes lines, or frames."""
+    """A receiver of lines or frames."""
 
     def begin(self, blocks: TrackBlocks) -> None:
         """Begin; `blocks` makes tracks of frames."""
 
     def send(self, thing: Any) -> None:
-        """Take one, and return at once."""
+        """Take a line or frame, and return at once."""
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the waiting things, and end."""
 
 
 class Spool:
-    """Hands things to `write` in a thread of its own; of more than `most` that wait the oldest is lost.
-    After an OSError, which `faulty` gets, nothing more is written. `pause_s`: from one write to the next, at least.
+    """Passes things to `write` in a thread; if more than `most` wait, the oldest is lost. After an OSError, passed
+    to `faulty`, nothing more is written. `pause_s`: least time between writes.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Spool:
             self._changed.notify()
 
     def close(self, limit_s: float = SOON_S) -> bool:
-        """Write what waits, within a limit, drop the rest, and return whether nothing is being written any more."""
+        """Write the waiting things within a limit, drop the rest, and return whether writing has ended."""
         with self._changed:
             self._ends = True
             self._changed.notify()
@@ -100,18 +100,18 @@ class Spool:
 
 
 def no_room(path: Path, error: OSError) -> str:
-    """Return the words for a file that the disk does not take."""
+    """Return the message for a file that cannot be written."""
     do = "make room; tracking goes on without this file"
     return refusal(str(path), expected="a disk with room", got=error_words(error), do=do)
 
 
 class UdpOutput(Output):
-    """A datagram a line, to one address. Raise OutputError: no such host."""
+    """One datagram per line, to one address. Raises OutputError: no such host."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
-            self._to = socket.gethostbyname(host), port  # once: a name server may take its time
-        except (OSError, UnicodeError) as error:  # the latter of a name that no host can have
+            self._to = socket.gethostbyname(host), port  # once: name look-up may be slow
+        except (OSError, UnicodeError) as error:  # UnicodeError: an impossible name
             do = "correct the name of the host"
             raise OutputError(refusal(f"udp:{host}:{port}", expected="a host", got=error_words(error), do=do)) from None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -131,8 +131,8 @@ class UdpOutput(Output):
 
 
 class OscOutput(UdpOutput):
-    """OSC over UDP: a message /sphereorient a frame, all `Forms.numbers` as int32 or float32. OutputError: no python-
-    osc, no host.
+    """OSC over UDP: a message /sphereorient per frame with all `Forms.numbers` as int32 or float32. Raises OutputError:
+    no python-osc, or no such host.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -147,9 +147,9 @@ class OscOutput(UdpOutput):
 
 
 class LslOutput(Output):
-    """A stream of LSL: a sample of float64 a frame, of all numbers (`Forms.numbers`), with names and units; the least
-    delayed of the last frames sets LSL's clock. Only this machine sees it, unless LSLAPICFG names a configuration.
-    Raise OutputError: the package pylsl, or its library liblsl, is missing.
+    """An LSL stream: a float64 sample per frame of all `Forms.numbers`, with names and units; the least delayed of the
+    last frames sets LSL's clock. Visible on this machine only, unless LSLAPICFG names a configuration. Raises
+    OutputError: the package pylsl, or its library liblsl, is missing.
     """
 
     def __init__(self, name: str, log: Log) -> None:
@@ -187,25 +187,25 @@ class LslOutput(Output):
 
 
 class SharedOutput(Output):
-    """A ring of poses in memory (`shared`): all numbers of `lines.Quantities`. OutputError: there is such a file, or no
-    folder.
+    """A ring of poses in memory (`shared`): all numbers of `lines.Quantities`. Raises OutputError: the file exists, or
+    its folder does not.
     """
 
     def __init__(self, address: str, log: Log) -> None:
         self._ring = SharedFrames(Path(address), POSE_BYTES, POSES)
 
     def send(self, numbers: dict[str, float]) -> None:
-        """Write a pose; nobody is waited for."""
+        """Write a pose, without waiting."""
         self._ring.write(numbers["time_s"], [np.fromiter(numbers.values(), np.float64)])
 
     def close(self) -> None:
-        """Tell readers the end, and remove the file."""
+        """Mark the end for readers, and remove the file."""
         self._ring.close()
 
 
 class SerialOutput(Output):
-    """A serial port, PORT@BAUD. `log` gets a line where it fails, or is too slow: then the oldest lines are lost.
-    Raise OutputError: the package pyserial is missing, or no such port, one in use, or not a baud rate.
+    """A serial port, PORT@BAUD. `log` gets a line if it fails or is too slow; then the oldest lines are lost. Raises
+    OutputError: pyserial is missing, or no such port, port in use, or wrong baud rate.
     """
 
     def __init__(self, address: str, log: Log) -> None:
@@ -213,14 +213,14 @@ class SerialOutput(Output):
         serial, (port, _, baud) = package("serial", "live"), address.rpartition("@")
         try:
             self._port = serial.Serial(port, int(baud) or -1, exclusive=True)  # 0 hangs up
-        except (OSError, ValueError, ArithmeticError) as error:  # the last two of a rate that the port does not have
-            do = "correct it, or end the program that has the port"
+        except (OSError, ValueError, ArithmeticError) as error:  # the last two: an unsupported rate
+            do = "correct it, or end the program that uses the port"
             expected = "PORT@BAUD, a free port and its baud rate"
             raise OutputError(refusal(self._name, expected=expected, got=error_words(error), do=do)) from None
         self._spool = Spool(lambda lines: self._port.write(_joined(lines)), self._failed, SOON_LINES)
 
     def _failed(self, error: OSError) -> None:
-        do = "connect it and begin again; tracking goes on without it"
+        do = "connect it and restart; tracking goes on without it"
         self._log(refusal(self._name, expected="a port that takes lines", got=error_words(error), do=do))
 
     def send(self, line: str) -> None:
@@ -228,20 +228,20 @@ class SerialOutput(Output):
         before = self._spool.lost
         self._spool.send(line)
         if self._spool.lost > before == 0:
-            self._log(f"{self._name}: lines are lost: they come faster than they are taken; try a higher baud rate.")
+            self._log(f"{self._name}: lines are lost: the port is too slow; try a higher baud rate.")
 
     def close(self) -> None:
-        """Write what waits, within a second, and close the port."""
+        """Write waiting lines within a second, and close the port."""
         if not self._spool.close():
             self._port.cancel_write()
             self._spool.close()
-            with suppress(Exception):  # each system has errors of its own
-                self._port.reset_output_buffer()  # the system would wait for a reader
+            with suppress(Exception):  # errors differ between systems
+                self._port.reset_output_buffer()  # else the system waits for a reader
         self._port.close()
 
 
 class ZmqOutput(Output):
-    """A PUB socket of ZeroMQ; a slow subscriber loses lines. OutputError: pyzmq is missing, or the port is in use."""
+    """A PUB socket of ZeroMQ; a slow subscriber loses lines. Raises OutputError: no pyzmq, or the port is in use."""
 
     def __init__(self, host: str, port: int) -> None:
         name = f"zmq:{host}:{port}"
@@ -263,7 +263,7 @@ class ZmqOutput(Output):
         self._socket.send_string(line)  # a PUB socket never waits
 
     def close(self) -> None:
-        """Send what waits, and end."""
+        """Send waiting lines, and end."""
         self._socket.close()
         self._context.term()
 
@@ -295,7 +295,7 @@ class TcpOutput(Output):
             self._readers = [*(reader for reader in self._readers if not reader[1].gone), (connection, spool)]
 
     def send(self, line: str) -> None:
-        """Hand a line to all readers."""
+        """Send a line to all readers."""
         for _, spool in self._readers:
             spool.send(line)
 
@@ -310,7 +310,7 @@ class TcpOutput(Output):
 
 
 def _taken(name: str, error: Exception) -> OutputError:
-    do = "choose another port, or end the program that has it"
+    do = "choose another port, or end the program that uses it"
     return OutputError(refusal(name, expected="a free port", got=error_words(error), do=do))
 
 
@@ -319,8 +319,8 @@ def _joined(lines: list[str]) -> bytes:
 
 
 class FileOutput(Output):
-    """A new text file, a line a frame, flushed. `log` gets a line where the disk is full or too slow. Raise
-    OutputError: there is such a file, or no folder for it.
+    """A new text file, a flushed line per frame. `log` gets a line if the disk is full or too slow. OutputError:
+    the file exists, or its folder does not.
     """
 
     def __init__(self, path: Path, log: Log, pause_s: float = 0.0) -> None:
@@ -342,7 +342,7 @@ class FileOutput(Output):
         self._file.flush()
 
     def close(self) -> None:
-        """Write what waits, and close the file."""
+        """Write waiting lines, and close the file."""
         self._spool.close(DISK_S)
         if self._spool.lost and not self._spool.gone:
             self._log(f"{self._path}: the disk was too slow for {self._spool.lost} frames; they are missing.")
@@ -352,7 +352,7 @@ class FileOutput(Output):
 
 
 class TrackOutput(FileOutput):
-    """A new track.h5 (docs/data-format.md): rows in a journal beside it until it is written whole at the end."""
+    """A new track.h5 (docs/data-format.md): a journal beside it takes the rows until the end."""
 
     def __init__(self, path: Path, log: Log) -> None:
         check_new(path)
@@ -371,16 +371,16 @@ class TrackOutput(FileOutput):
             raise OutputError(no_room(self._path, error)) from None
 
     def _bytes(self, frames: list[Any]) -> bytes:
-        assert self._blocks is not None  # no frame comes before it
+        assert self._blocks is not None  # `begin` comes before frames
         return journal.rows(self._blocks.block(frames))
 
     def _write(self, frames: list[Any]) -> None:
         super()._write(frames)
         assert self._file is not None
-        os.fsync(self._file.fileno())  # also a power cut leaves what is older than a second
+        os.fsync(self._file.fileno())  # a power cut loses at most a second
 
     def close(self) -> None:
-        """Write the track, and remove the journal; where that fails, tell it and keep the journal."""
+        """Write the track, and remove the journal; if that fails, report it and keep the journal."""
         super().close()
         if self._file is None:
             return
@@ -388,17 +388,17 @@ class TrackOutput(FileOutput):
             Trajectory.load(self._path).save(self._track)
             self._path.unlink()
         except (SphereOrientError, OSError) as error:
-            self._log(f"{error} What was measured is in {self._path}.")
+            self._log(f"{error} The measured rows are in {self._path}.")
 
 
 def check_new(path: Path) -> None:
-    """Raise OutputError if there is such a file, or no folder for it."""
+    """Raise OutputError if the file exists, or its folder does not."""
     if path.exists() or not path.parent.is_dir():
-        got = "one that is there" if path.exists() else f"no folder {path.parent}"
+        got = "an existing one" if path.exists() else f"no folder {path.parent}"
         raise OutputError(refusal(str(path), expected="a new file", got=got, do="name another one"))
 
 
-# By the part before ":" or the suffix: the class, and what it takes of a frame, an attribute of `lines.Forms`.
+# By prefix (before ":") or suffix: the class, and the attribute of `lines.Forms` that it takes.
 SOCKETS: Mapping[str, tuple[Callable[[str, int], Output], str]] = {
     "tcp": (TcpOutput, "marked"),
     "udp": (UdpOutput, "marked"),
@@ -419,7 +419,7 @@ FILES: Mapping[str, tuple[Callable[[Path, Log], Output], str]] = {
 
 
 def open_output(name: str, log: Log) -> tuple[Output, str]:
-    """Open an output by its name, and return what it takes of a frame too; raise SettingsError for an unknown one."""
+    """Open an output by name; return it and the attribute of `Told` that it takes. Raises SettingsError: unknown."""
     kind, _, address = name.partition(":")
     host, _, port = address.rpartition(":")
     if kind in SOCKETS and port.isdecimal() and int(port) < 1 << 16:

@@ -1,5 +1,5 @@
-"""What `live` counts of its frames, for the summary; and its page in the browser, which a process of its own serves and
-draws: the loop writes poses and, now and then, pictures into memory that both see.
+"""Frame counts of `live` for the summary, and its page in the browser. A separate process serves the page; the loop
+writes poses, and some of the pictures, into shared memory.
 """
 
 import base64
@@ -43,30 +43,30 @@ from sphereorient.report.overlay_model import Path3D, axes_px, outline_px
 from sphereorient.trajectory.walk import FICTRAC, FicTracAxes
 
 KEPT = 1000  # latencies
-LOST_S = 0.5  # without a pose: then it is told
-CONFIRMED = 2  # poses in a row: one alone may be a chance match
-MOSTLY = 0.8  # of all frames without a pose: the ball was not explained before
-# Likely causes of a ball that is not found, by the reason that says most.
+LOST_S = 0.5  # without a pose before a note
+CONFIRMED = 2  # poses in a row; a single one may be a chance match
+MOSTLY = 0.8  # share of frames without a pose from which the ball counts as never explained
+# Likely causes of a lost ball, by reason, the most specific first.
 CAUSES = {
-    Reason.LOW_SCORE: "its outline is seen, but no orientation explains its paint: it is partly hidden, the light or "
+    Reason.LOW_SCORE: "its outline is found, but no orientation explains its paint: it is partly hidden, the light or "
     "the focus has changed, or this is another ball",
-    Reason.OUTLINE: "something is seen, but no outline of the ball's size: it is partly hidden, or sphere.diameter or "
-    "the place of the camera is wrong",
-    Reason.NOT_FOUND: "nothing of its size stands out from the empty scene: it is hidden or gone",
-    Reason.UNSEEN: "it shows paint that the map does not know",
-    Reason.CONTRADICTS: "the cameras contradict each other: their pictures are of different times, or one was moved",
+    Reason.OUTLINE: "a blob is found, but no outline of the ball's size: it is partly hidden, or sphere.diameter or "
+    "the camera's position is wrong",
+    Reason.NOT_FOUND: "nothing of its size differs from the empty scene: it is hidden or gone",
+    Reason.UNSEEN: "it shows paint that the map lacks",
+    Reason.CONTRADICTS: "the cameras contradict each other: their pictures differ in time, or one was moved",
     Reason.DARK: "the picture is dark: the lamp is off, or something covers the lens",
-    Reason.SATURATED: "the picture is white: less light, or a shorter exposure",
+    Reason.SATURATED: "the picture is white: reduce the light or the exposure",
     Reason.REPEATED: "the camera sends the same picture again",
 }
 NOT_EXPLAINED = (
-    "its outline is seen, but no orientation explains its paint: this is another ball, or the map of another one, or "
-    "light or focus are others than when they were studied"
+    "its outline is found, but no orientation explains its paint: this is another ball, or the map of another one, or "
+    "light or focus have changed since they were learnt"
 )
 PAGE = Path(__file__).with_name("page.html")
-WIDEST = 640  # px, of a picture that is sent
-PICTURES_HZ = 30.0  # at most, that the page gets
-TAKE_S = 0.1  # between looks for new poses
+WIDEST = 640  # px, of a sent picture
+PICTURES_HZ = 30.0  # at most, for the page
+TAKE_S = 0.1  # between polls for new poses
 ROW = 5 + 3 + 9  # of a frame: number, time (s), latency (ms), dropped, error (rad), position (mm), R_lab_body
 REASONS = list(Reason)
 
@@ -79,7 +79,7 @@ class _Absence:
 
 
 class Monitor:
-    """Yields the frames of a feed unless stopped, and counts them; a frame is lost where one of several balls is."""
+    """Yields the frames of a feed unless stopped, and counts them; a frame is lost if any ball is."""
 
     def __init__(self, feed: Feed, log: Log = lambda line: None) -> None:
         self.count = self.lost = 0
@@ -94,13 +94,13 @@ class Monitor:
     def __iter__(self) -> Iterator[Arrival]:
         for arrival in self._feed:
             self.running.wait()
-            for absence in self._absence.values():  # before this one is searched: that takes long
+            for absence in self._absence.values():  # before the search in this frame, which takes long
                 self._log_lost(absence, max(arrival.time_s, self._feed.newest_s))
             self.arrival = arrival
             yield arrival
 
     def saw(self, now: Measured) -> None:
-        """Take what was measured of a ball in the last frame."""
+        """Take the measurement of a ball in the last frame."""
         if now.number != self._counted:
             self.count, self._counted = self.count + 1, now.number
             self.latency_ms.append(1e3 * now.latency_s)
@@ -120,19 +120,19 @@ class Monitor:
         self._log_lost(of, now.time_s)
 
     def _log_lost(self, of: _Absence, time_s: float) -> None:
-        """Tell a ball that is not found for a while at a time of the source, once, with the likely cause."""
+        """Report once, with the likely cause, a ball that is lost for a while at a time of the source."""
         if of.lost is None or of.logged or time_s - of.lost[0] < LOST_S:
             return
         now, of.logged = of.lost[1], True
         why = ", ".join(sorted({str(reason) for reason in now.reason}))
-        cause = next((words for reason, words in CAUSES.items() if reason in now.reason), "no picture can be used")
+        cause = next((words for reason, words in CAUSES.items() if reason in now.reason), "no picture is usable")
         if Reason.LOW_SCORE in now.reason and self.lost > MOSTLY * self.count:
             cause = NOT_EXPLAINED
         lost = f"{_called(now)} is not found for {LOST_S:g} s ({why})"
         self._log(f"frame {now.number}: {lost}: {cause}; tracking goes on.")
 
     def summary(self) -> list[str]:
-        """Return the counts and latencies in words."""
+        """Return counts and latencies as text."""
         latency = np.array(self.latency_ms or [0.0])
         middle, slow = np.quantile(latency, (0.5, 0.99))
         return [
@@ -146,8 +146,8 @@ def _called(now: Measured) -> str:
 
 
 class PageWriter:
-    """The loop side of the page: it copies a row of each frame, and at most `PICTURES_HZ` times a second its pictures,
-    into rings in a folder, and obeys commands. `log` gets a line where none can come any more.
+    """The loop's side of the page: copies a row per frame, and pictures at most at `PICTURES_HZ`, into rings in a
+    folder, and executes commands. `log` gets a line when the page has ended.
     """
 
     def __init__(self, folder: Path, commands: Connection, log: Log) -> None:
@@ -156,7 +156,7 @@ class PageWriter:
         self._rings: tuple[SharedFrames, SharedFrames] | None = None
 
     def begin(self, recording: Recording, running: Event, save_map: Callable[[], str] | None) -> None:
-        """Begin with a recording: the page sets `running`; `save_map` writes a learnt map; None: no button."""
+        """Begin with a recording; the page sets `running`; `save_map` writes a learnt map (None: no button)."""
         poses = SharedFrames(self.folder / "poses", WORD * ROW, POSES)
         self._rings = poses, SharedFrames(self.folder / "pictures", _shown_bytes(recording), 4)
         self._blank = [np.zeros(stream.movie.frame_shape, stream.movie.dtype) for stream in recording.streams]
@@ -164,7 +164,7 @@ class PageWriter:
         Thread(target=self._listen, args=(running, save_map), name="page", daemon=True).start()
 
     def saw(self, arrival: Arrival, now: Measured) -> None:
-        """Take a frame and what was measured of it."""
+        """Take a frame and its measurement."""
         assert self._rings is not None  # it has begun
         numbers = [now.number, now.time_s, 1e3 * now.latency_s, now.dropped, now.error_rad]
         row = np.concatenate([numbers, now.position_lab_mm, now.R_lab_body.ravel()])
@@ -186,7 +186,7 @@ class PageWriter:
                     said = {"error": str(error)}
                 self._commands.send_bytes(json.dumps(said).encode())
         if not self._closing:
-            running.set()  # nobody could start it again
+            running.set()  # else it could not be started again
             self._log("page: its process has ended; tracking goes on without the page.")
 
     def close(self) -> None:
@@ -197,12 +197,12 @@ class PageWriter:
 
 
 def _shown_bytes(recording: Recording) -> int:
-    """Return the bytes of a slot of pictures: these, the reason of each camera, whether a map is learnt, and a row."""
+    """Return the bytes of a slot: pictures, reason of each camera, whether a map is learnt, and a row."""
     return FrameBytes(recording.streams).size + WORD * (len(recording.streams) + 1 + ROW)
 
 
 class PageProcess(PageWriter):
-    """A page in the browser, served by a process of its own; port 0: any free one. Raise OutputError: it is in use."""
+    """A page in the browser, served by a separate process; port 0: any free one. Raises OutputError: port in use."""
 
     def __init__(self, experiment: Path, cameras: Sequence[str] | None, port: int, log: Log) -> None:
         door, token = listen(port, "--page", OutputError), new_token()
@@ -233,10 +233,10 @@ def _obeyed(word: str, running: Event, save_map: Callable[[], str] | None) -> st
         return "Tracking goes on."
     if word == "stop":
         running.clear()
-        return "Tracking is stopped: no frame is measured."
+        return "Tracking is stopped."
     if save_map is None:
-        do = "begin without a map"
-        raise OutputError(refusal("map", expected="one that is learnt meanwhile", got="none", do=do))
+        do = "start without a map"
+        raise OutputError(refusal("map", expected="one that is learnt live", got="none", do=do))
     return save_map()
 
 
@@ -245,20 +245,20 @@ def _serve(
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
     if hasattr(os, "nice"):
-        os.nice(10)  # tracking goes first
+        os.nice(10)  # tracking has priority
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     limit_cores(1)
-    # The loop opens the same files, and tells what is wrong with them.
+    # The loop opens the same files and reports their faults.
     with suppress(SphereOrientError), open_recording(experiment, cameras, textured=False) as recording:
         page = LivePage(recording, folder, commands)
         Thread(target=PageServer(page, door, token).serve_forever, name="page", daemon=True).start()
         page.follow()
-    shutil.rmtree(folder, ignore_errors=True)  # where the loop was killed
+    shutil.rmtree(folder, ignore_errors=True)  # if the loop was killed
 
 
 class LivePage:
-    """What the page shows and does, in its process: it reads the rings in a folder, and sends commands to the loop."""
+    """The page, in its process: reads the rings in a folder, and sends commands to the loop."""
 
     def __init__(self, recording: Recording, folder: Path, commands: Connection) -> None:
         self._recording, self._folder, self._commands = recording, folder, commands
@@ -278,7 +278,7 @@ class LivePage:
         return MaskMarking(self._recording.experiment.path)
 
     def follow(self) -> None:
-        """Take what the loop writes and answers, until its process ends."""
+        """Read poses and answers of the loop until its process ends."""
         with suppress(EOFError, OSError):
             while True:
                 if self._commands.poll(TAKE_S):
@@ -286,7 +286,7 @@ class LivePage:
                 self.take()
 
     def take(self) -> None:
-        """Take the poses that were written since."""
+        """Read the new poses."""
         if self._rings is None:
             try:
                 pictures = SlotReader(self._folder / "pictures", _shown_bytes(self._recording))
@@ -313,7 +313,7 @@ class LivePage:
         self._heading_rad = float(columns[FICTRAC["heading"]][0])
 
     def shown(self, steps: Sequence[str]) -> Answer:
-        """Return the page, or what is known now."""
+        """Return the page, or its present data."""
         match steps:
             case [""]:
                 return PAGE
@@ -324,7 +324,7 @@ class LivePage:
         return None
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Answer:
-        """Start or stop measuring, or save the map: the loop does it; raise OutputError where it cannot."""
+        """Start or stop measuring, or save the map, by the loop. Raises OutputError if it cannot."""
         self.take()
         match steps:
             case ["setup", *rest]:
@@ -338,11 +338,11 @@ class LivePage:
                 self._running = {"start": True, "stop": False}.get(word, self._running)
                 return said
             case ["start" | "stop" | "save"]:
-                return {"said": "The set-up is looked at; no frame is measured yet."}
+                return {"said": "The set-up is being examined; no frame is measured yet."}
         return None
 
     def look(self) -> Json:
-        """Return what is known now: counts, latencies, path, and each camera's newest picture with what is drawn."""
+        """Return the present data: counts, latencies, path, and each camera's newest picture with its drawing."""
         self.take()
         if self._rings is None or not (count := self._rings[1].written):
             return {"begun": self._rings is not None}

@@ -1,6 +1,4 @@
-"""Which cameras this machine sees. Drivers may hang, or end the program: each kind is asked by a process of its own,
-this file run as a program.
-"""
+"""The cameras of this machine. Drivers may hang or crash: this file runs as a program, in one process per kind."""
 
 import os
 import subprocess
@@ -15,7 +13,7 @@ from typing import Any
 
 
 def _opencv(cv2: Any) -> Iterator[str]:
-    for number in range(8):  # of each camera Linux lists two
+    for number in range(8):  # Linux lists each camera twice
         capture = cv2.VideoCapture(number)
         if capture.isOpened():
             width, height = (round(capture.get(one)) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -44,7 +42,7 @@ def _vimba(vmbpy: Any) -> Iterator[str]:
             yield f"vimba:{one.get_id()} ({one.get_model()})"
 
 
-# By kind: the module of its driver, and who asks that.
+# By kind: the module of its driver, and the function that lists its cameras.
 KINDS: Mapping[str, tuple[str, Callable[[Any], Iterator[str]]]] = {
     "opencv": ("cv2", _opencv),
     "genicam": ("harvesters.core", _genicam),
@@ -54,14 +52,14 @@ KINDS: Mapping[str, tuple[str, Callable[[Any], Iterator[str]]]] = {
 
 
 def cameras_here(limit_s: float = 10.0) -> dict[str, list[str] | str]:
-    """Return the cameras of each kind whose package is installed; in place of a list, in words, why there is none."""
+    """Return the cameras of each kind whose package is installed, or as text why there are none."""
     kinds = [kind for kind, (module, _) in KINDS.items() if find_spec(module.partition(".")[0]) is not None]
     with ThreadPoolExecutor() as pool:
         return dict(zip(kinds, pool.map(partial(_asked, limit_s=limit_s), kinds), strict=True))
 
 
 def _asked(kind: str, limit_s: float) -> list[str] | str:
-    command = [sys.executable, "-P", __file__, kind]  # -P: the modules beside this file hide no others
+    command = [sys.executable, "-P", __file__, kind]  # -P: modules beside this file must not hide others
     try:
         ended = subprocess.run(command, capture_output=True, errors="replace", timeout=limit_s)
     except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""A ring of frames, as pictures or as poses, in a file that programs map into memory: one writes, others read.
+"""A ring of pictures or poses in a file mapped into memory: one program writes, others read.
 
 Bytes, little-endian: "SPHEREO1"; then uint64: slots, bytes a slot, slots written so far, 1 at the end; then float64
 times (s) of the slots; then the slots. Number n lies in slot n % slots. A writer writes time and content first, then
@@ -23,19 +23,19 @@ from sphereorient.experiment.recording import CameraStream
 from sphereorient.live.feed import Arrival, FrameBytes
 
 MAGIC = b"SPHEREO1"
-SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # places of the numbers behind MAGIC
+SLOTS, SIZE, WRITTEN, ENDED = range(1, 5)  # indices of the numbers after MAGIC
 HEAD = 5  # words of 8 bytes
 WORD = 8  # bytes
-REPLACED_S = 0.5  # between looks for another ring
-NEXT_S = 0.0002  # between looks for a new slot
-# No look before this share of the usual interval has passed: each holds up the thread that computes. From one frame to
-# the next that interval changes by these factors at most.
+REPLACED_S = 0.5  # between checks for another ring
+NEXT_S = 0.0002  # between checks for a new slot
+# No check before this share of the usual interval, since each delays the computing thread; largest factors by which
+# that interval changes from frame to frame.
 NO_LOOK, SHRINKS, GROWS = 0.7, 0.5, 1.2
 POSES, POSE_BYTES = 4096, WORD * 33  # of a ring of poses: slots, and bytes of each
 
 
 class SharedFrames:
-    """Writes into a ring of `slots` of `size` bytes, never waits. OutputError: the file exists, or no room for it."""
+    """Writes into a ring of `slots` of `size` bytes; never waits. Raises OutputError: the file exists, or no room."""
 
     def __init__(self, path: Path, size: int, slots: int = 16) -> None:
         length = WORD * (HEAD + slots) + slots * size
@@ -43,7 +43,7 @@ class SharedFrames:
         try:
             with path.open("x+b") as file:
                 file.truncate(length)
-                if hasattr(os, "posix_fallocate"):  # a page that finds no room later would end the program
+                if hasattr(os, "posix_fallocate"):  # a full disk later would end the program
                     os.posix_fallocate(file.fileno(), 0, length)
                 self._map = mmap.mmap(file.fileno(), length)
         except OSError as error:
@@ -56,10 +56,10 @@ class SharedFrames:
         self._times = np.frombuffer(self._map, np.float64, slots, WORD * HEAD)
         self._content = np.frombuffer(self._map, np.uint8, slots * size, WORD * (HEAD + slots)).reshape(slots, size)
         self._words[SLOTS], self._words[SIZE] = slots, size
-        self._map[:WORD] = MAGIC  # last: now it can be read
+        self._map[:WORD] = MAGIC  # last: then readers accept it
 
     def write(self, time_s: float, parts: Sequence[NDArray[Any]]) -> None:
-        """Write what is of one instant: the pictures of all cameras, or a pose."""
+        """Write one instant: the pictures of all cameras, or a pose."""
         number = int(self._words[WRITTEN])
         slot, begin = number % self._slots, 0
         self._times[slot] = time_s
@@ -70,7 +70,7 @@ class SharedFrames:
         self._words[WRITTEN] = number + 1
 
     def close(self) -> None:
-        """Tell readers the end, and remove the file."""
+        """Mark the end for readers, and remove the file."""
         self._words[ENDED] = 1
         del self._words, self._times, self._content
         self._map.close()
@@ -83,11 +83,11 @@ class SharedFrames:
         self.close()
 
 
-Slot = tuple[int, float, bytes, float]  # number, time (s), content, when it was read by the clock of time.perf_counter
+Slot = tuple[int, float, bytes, float]  # number, time (s), content, time of reading by time.perf_counter
 
 
 class SlotReader:
-    """A ring that another program writes, slots of `size` bytes. Raise MovieError: none there, or of another size."""
+    """A ring of another program, with slots of `size` bytes. Raises MovieError: no ring, or slots of another size."""
 
     def __init__(self, path: Path, size: int) -> None:
         try:
@@ -95,7 +95,7 @@ class SlotReader:
                 self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
                 self._path, self._file_number = path, os.fstat(file.fileno()).st_ino
         except (OSError, ValueError):  # ValueError: an empty file
-            do = "begin the program that writes it (docs/live.md)"
+            do = "start the program that writes it (docs/live.md)"
             raise MovieError(refusal(str(path), expected="a ring of frames", got="none", do=do)) from None
         self._slots, self._size = self._word(SLOTS), self._word(SIZE)
         self._first = WORD * (HEAD + self._slots)  # of the slots
@@ -121,17 +121,17 @@ class SlotReader:
 
     @property
     def replaced(self) -> bool:
-        """Whether another ring, which can be read already, has the name of this one."""
+        """Whether another readable ring has replaced this one."""
         with suppress(OSError), self._path.open("rb") as file:
             return os.fstat(file.fileno()).st_ino != self._file_number and file.read(WORD) == MAGIC
         return False
 
     def oldest(self, number: int) -> int:
-        """Return the number, or that of the oldest slot that is not written over."""
+        """Return the number, or that of the oldest slot not yet overwritten."""
         return max(number, self.written - self._slots + 1)
 
     def read(self, number: int) -> Slot | None:
-        """Return a slot that was written; None if it was written over meanwhile."""
+        """Return a written slot; None if it was overwritten."""
         slot, arrived_s = number % self._slots, time.perf_counter()
         begin = self._first + slot * self._size
         content = self._memory[begin : begin + self._size]
@@ -153,14 +153,14 @@ def shared_poses(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
 
 
 def shared_slots(path: Path, size: int) -> Iterator[Slot]:
-    """Yield the slots of a ring, from the newest one on; overwritten slots leave gaps in the numbering, which goes on
-    where another ring of this name replaces it. Raise MovieError: no such ring, or one of slots of another size.
+    """Yield the slots of a ring from the newest on; overwritten slots leave gaps in the numbering, which continues in a
+    ring that replaces this one. Raises MovieError: no such ring, or slots of another size.
     """
     before = 0  # slots of former rings
     while True:
         ring, look_s = SlotReader(path, size), time.perf_counter()
         number, arrived_s, usual_s = max(0, ring.written - 1), look_s, NEXT_S
-        while not ring.ended or number < ring.written:  # in this order: at the end nothing is left out
+        while not ring.ended or number < ring.written:  # this order misses none at the end
             if number >= ring.written:
                 if time.perf_counter() > look_s + REPLACED_S:
                     look_s = time.perf_counter()

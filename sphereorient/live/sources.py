@@ -1,5 +1,5 @@
-"""Sources of frames: movies, raw bytes of another program, cameras, a ring in memory. A new source is a function, and a
-line of `SOURCES`.
+"""Sources of frames: movies, raw bytes of another program, cameras, rings in memory. A new one needs a function and a
+line in `SOURCES`.
 """
 
 import math
@@ -24,16 +24,16 @@ from sphereorient.movies.record import Recorder
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Frames, and how they come."""
+    """A source of frames and its timing."""
 
     frames: Callable[[Recording], Iterator[Arrival]]
-    waits: bool = False  # for the tracking, instead of dropping frames
-    even: bool = False  # at the rate of the experiment
-    close: Callable[[], None] = lambda: None  # releases what it holds
+    waits: bool = False  # whether it waits for the tracking instead of dropping frames
+    even: bool = False  # whether frames come at the experiment's rate
+    close: Callable[[], None] = lambda: None  # releases its resources
 
 
 def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
-    """Yield the frames of an experiment's movies; `paced`: at the times of the recording, else when they are taken."""
+    """Yield the frames of an experiment's movies; `paced`: at the recorded times, else on demand."""
     pictures = zip(*(stream.pictures() for stream in recording.streams), strict=True)
     begun, first_s = time.perf_counter(), float(recording.timeline.time_s[0])
     for number, (row, time_s) in enumerate(zip(pictures, recording.timeline.time_s.tolist(), strict=True)):
@@ -46,7 +46,7 @@ def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
 
 
 def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float) -> Iterator[Arrival]:
-    """Yield frames of bytes without a header, see `FrameBytes`. Raise MovieError: the source ends within a frame."""
+    """Yield frames of raw bytes, see `FrameBytes`. Raises MovieError: the source ends within a frame."""
     layout, number = FrameBytes(streams), 0
     while content := source.read(layout.size):
         arrived_s = time.perf_counter()
@@ -60,7 +60,7 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
 
 
 def _devices(kind: str, where: str, log: Log) -> Source:
-    """Return the cameras of a maker: a serial number for each camera of the experiment, in its order."""
+    """Return a maker's cameras by serial numbers, in the order of the experiment's cameras."""
     ends = kind == "camera:" and Path(where).is_file()  # a movie
     stopped, released = Event(), Event()
     released.set()
@@ -99,7 +99,7 @@ def _devices(kind: str, where: str, log: Log) -> Source:
     return Source(frames=frames, waits=ends, close=close)
 
 
-# By name; the functions get what is behind ":".
+# By name; the functions get the text after ":".
 SOURCES: Mapping[str, Callable[[str, Log], Source]] = {
     "movie": lambda *_: Source(frames=partial(movie_frames, paced=True), even=True),
     "movie-fast": lambda *_: Source(frames=partial(movie_frames, paced=False), waits=True, even=True),
@@ -114,7 +114,7 @@ SOURCES: Mapping[str, Callable[[str, Log], Source]] = {
 
 
 def source_of(name: str, log: Log) -> Source:
-    """Return the source of a name, such as movie or camera:0; raise SettingsError for an unknown one."""
+    """Return the source of a name, such as movie or camera:0. Raises SettingsError: unknown name."""
     kind, colon, where = name.partition(":")
     if kind + colon not in SOURCES or bool(colon) != bool(where):
         expected = "movie, movie-fast, -, shared:FILE, camera:NUMBER, genicam:PRODUCER.cti, pylon:SERIAL or vimba:ID"
@@ -123,7 +123,7 @@ def source_of(name: str, log: Log) -> Source:
 
 
 def recorded(source: Source, recorders: Sequence[Recorder]) -> Source:
-    """Return a source whose frames are recorded as they come, in all movies or in none, flipped as the movies are."""
+    """Return a source whose frames are recorded, in all movies or in none, flipped as the movies."""
 
     def frames(recording: Recording) -> Iterator[Arrival]:
         how = [recording.experiment.flip.get(stream.name, "none") for stream in recording.streams]

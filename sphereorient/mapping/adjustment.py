@@ -1,8 +1,8 @@
-"""Place, turns, light and paint of a ball from many pictures at once, from near ones: a bundle adjustment.
+"""Bundle adjustment of position, rotations, light and paint of a ball in many pictures, from near values.
 
-The paint of each cell of the map is eliminated: it is the weighted mean of what the pictures show there. What a picture
-shows less this mean depends on place and turns alone. Sources: bundle adjustment, Triggs et al. 2000; elimination of
-what enters linearly, Golub and Pereyra 1973.
+The paint of each map cell is eliminated as the weighted mean of the pictures there; residuals from this mean depend on
+position and rotations only. Sources: bundle adjustment, Triggs et al. 2000; variable projection, Golub and Pereyra
+1973.
 """
 
 import math
@@ -26,38 +26,38 @@ from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.pose.camera_view import FIRST_BLUR_PX, CameraView
 from sphereorient.sphere.texture import map_directions
 
-LEVELS = 4.0, 2.0, 1.0  # pixels in the disk's middle along a cell, of one adjustment after the other
-MOST_STEPS, NEAR = 12, 0.02  # of each; a step that moves what is seen by less, in cells, is the last
-PAINT_PX = 0.5  # the same of the map at the end
-MOST_CELLS = 320  # along each axis: the pictures of larger balls are blurred for it
-BLUR = 0.4  # cells, of pictures with smaller pixels
-WITHIN = 0.98  # of the radius: pixels that count
+LEVELS = 4.0, 2.0, 1.0  # pixels per cell at the disk's centre, in successive adjustments
+MOST_STEPS, NEAR = 12, 0.02  # of each; the last step moves the paint by less, in cells
+PAINT_PX = 0.5  # the same for the final map
+MOST_CELLS = 320  # along each axis; pictures of larger balls are blurred
+BLUR = 0.4  # cells, for pictures with smaller pixels
+WITHIN = 0.98  # of the radius: pixels that are used
 LIGHT_RADII = 0.08  # half side of the neighbourhood over which light is averaged, twice
-LIGHT_ROUNDS, LIGHT_FRAMES = 2, 64  # in each of which it follows from the paint, and of which frames
-BLACKEST = 1e-3  # of the brightest light: the least
-ROBUST = 4.0  # deviations from the paint from which a picture counts less: what hides the ball, glare
-PRIOR, SCATTER = 0.05, 0.02  # of the radius: error of all places at the start, and of those of a ball that moves
-HELD, FREE = 1e3, 1e-6  # of a turn's precision: what is added for the first, which is held, and for all
-FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and how many to either side
-FOCAL_FRAMES, FOCAL_BETTER = 60, 0.9  # and share of what is left with the given one
+LIGHT_ROUNDS, LIGHT_FRAMES = 2, 64  # rounds that estimate light from the paint, and their frames
+BLACKEST = 1e-3  # of the brightest light, lower limit
+ROBUST = 4.0  # deviations from the paint; beyond, a picture has less weight (occluders, glare)
+PRIOR, SCATTER = 0.05, 0.02  # of the radius: initial error of all positions; scatter of those of a moving ball
+HELD, FREE = 1e3, 1e-6  # of a rotation's precision: ridge for the first, which is fixed, and for all
+FOCAL_STEP, FOCAL_STEPS = 0.4, 5  # of the logarithm of a focal length, and number to either side
+FOCAL_FRAMES, FOCAL_BETTER = 60, 0.9  # frames; share of the residual with the given one that is clearly better
 NEAREST = 2.0  # radii, of a camera from the ball's centre
-FARTHEST = 0.1  # of the radius, of a step: a place is near
+FARTHEST = 0.1  # of the radius: longest step of a position
 AT_ONCE = 4096  # cells
-LEAST = 1e-6  # of a weight
+LEAST = 1e-6  # least weight
 
 Singles = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Adjustment:
-    """What the pictures of a ball in its place have in common."""
+    """Position, rotations, light and paint common to the pictures of a ball."""
 
-    crops: Crops  # as given, at the place found
+    crops: Crops  # as given, at the adjusted position
     R_lab_body: Tensor  # (N, 3, 3) float64; the first is as given
-    cells: PaintCells  # in which it was found, of paint in shares of the light
+    cells: PaintCells  # of the adjustment; paint in shares of the light
     light: Sequence[Singles]  # of each camera, in the pixels of its crops
-    left: float  # root mean square of what the pictures differ from the paint
-    moved_mm: Tensor  # (3,), by which the places found are off those given, in the mean
+    left: float  # root mean square of the residuals from the paint
+    moved_mm: Tensor  # (3,), mean change of the positions
 
     def texture(self) -> TextureMap:
         """Return the map, 0 black .. 1 white."""
@@ -74,9 +74,8 @@ class Adjustment:
 def adjusted(
     crops: Crops, R_lab_body: Tensor, progress: Progress = silent, levels: Sequence[float] = LEVELS
 ) -> Adjustment:
-    """Return what all crops of a ball have in common, from near turns (N, 3, 3) and a near place: coarse to fine,
-    `levels` as `LEVELS`. Of a ball that moves each crop has its own place; by how much those given scatter about the
-    right ones is learnt.
+    """Adjust all crops of a ball from near rotations (N, 3, 3) and a near position, coarse to fine, `levels` as
+    `LEVELS`. A moving ball has a position per crop; the scatter of the given ones is learnt.
     """
     places = 1 if crops.fixed else len(R_lab_body)
     expected = crops.position_lab_mm[:places] / crops.radius_mm
@@ -103,8 +102,8 @@ def adjusted(
 
 
 def focal_ratio(found: Adjustment) -> float:
-    """Return by which factor the focal length of an only pinhole camera explains the pictures best, to some per cent; 1
-    where none that is 1.5 times longer or shorter does clearly: seen from nearer, more of the sides turns away.
+    """Return the factor on the focal length of a single pinhole camera that fits best, within some per cent; 1 unless
+    one of 1.5 times or its inverse is clearly better: from nearer, less of the sides is visible.
     """
     rows = torch.linspace(0, len(found.R_lab_body) - 1, min(FOCAL_FRAMES, len(found.R_lab_body))).long()
     begin = replace(found, crops=found.crops.where(rows), R_lab_body=found.R_lab_body[rows])
@@ -120,7 +119,7 @@ def focal_ratio(found: Adjustment) -> float:
         return 1.0
     tried |= {log: at(log, begin) for log in logs if log not in tried}
     log = min(tried, key=lambda log: tried[log].left)
-    if tried[log].left > FOCAL_BETTER * tried[0.0].left:  # a ball far away looks alike
+    if tried[log].left > FOCAL_BETTER * tried[0.0].left:  # no effect for a distant ball
         return 1.0
     here, step = tried[log], FOCAL_STEP / 4
     for _ in range(FOCAL_STEPS):
@@ -133,7 +132,7 @@ def focal_ratio(found: Adjustment) -> float:
 
 
 def _with_focal(crops: Crops, ratio: float) -> Crops:
-    """Return a ball that one pinhole camera sees of the same size, but with another focal length."""
+    """Return a ball of the same size in one pinhole camera of another focal length."""
     (view,) = crops.views
     coarse = view.camera if isinstance(view.camera, CoarserCamera) else None
     camera = view.camera if coarse is None else coarse.camera
@@ -145,7 +144,7 @@ def _with_focal(crops: Crops, ratio: float) -> Crops:
 
 
 def cells_of(place: Crops, pixels: float = 1.0) -> PaintCells:
-    """Return an empty map of a ball at its usual position, with `pixels` in a disk's middle along a cell."""
+    """Return an empty map of a ball at its usual position, with `pixels` per cell at a disk's centre."""
     radius_px = max(float(view.radius_px(place.usual, place.radius_mm)) for view in place.views)
     side = 16 * math.ceil(math.sqrt(4 * math.pi) * radius_px / pixels / 16)
     return PaintCells(min(side, MOST_CELLS), FIRST_BLUR_PX / radius_px)
@@ -153,10 +152,10 @@ def cells_of(place: Crops, pixels: float = 1.0) -> PaintCells:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Seen:
-    """What one camera's N pictures show of all cells."""
+    """Values of all cells in one camera's N pictures."""
 
     grey: Tensor  # (N, cells) float32
-    cosine: Tensor  # (N, cells), of the slant; 0: does not show it
+    cosine: Tensor  # (N, cells), of the slant; 0: not visible
     pixel: Tensor  # (N, cells) int32, of the crop
 
     def where(self, rows: Tensor) -> "_Seen":
@@ -191,7 +190,7 @@ def _seen(at: Adjustment, camera: int) -> _Seen:
 
 
 def _within(crops: Crops, camera: int, frame: int = 0) -> NDArray[np.bool_]:
-    """Return which pixels of a crop of a camera show the ball, (H, W); of a frame that it has not seen, of another."""
+    """Return which pixels of a camera's crop show the ball, (H, W); of another frame if this one is unseen."""
     crop = crops.crops[camera][frame] or next(crop for crop in crops.crops[camera] if crop is not None)
     there = tuple(slice(at, at + size) for at, size in zip((crop.top, crop.left), crop.grey.shape, strict=True))
     return within_limb(crops.views[camera], crops.position_lab_mm[frame], crops.radius_mm, there)
@@ -200,7 +199,7 @@ def _within(crops: Crops, camera: int, frame: int = 0) -> NDArray[np.bool_]:
 def within_limb(
     view: CameraView, position_lab_mm: Tensor, radius_mm: float, there: tuple[slice, ...]
 ) -> NDArray[np.bool_]:
-    """Return which pixels of a part of the picture, rows and columns, show a ball at a position (3,) well."""
+    """Return which pixels of a part of the picture (rows, columns) are well within a ball at a position (3,)."""
     y, x = np.ogrid[there]
     u, v = view.camera.project(position_lab_mm).tolist()
     within: NDArray[np.bool_] = np.hypot(x - u, y - v) < WITHIN * float(view.radius_px(position_lab_mm, radius_mm))
@@ -212,7 +211,7 @@ def within_limb(
 
 
 def _smooth(crops: Crops, camera: int, total: Singles, share: Singles) -> Singles:
-    """Return the local mean of what counts: sums over pixels, by the share that each has."""
+    """Return the local mean: sums over pixels, weighted by the share of each."""
     radius_px = float(crops.views[camera].radius_px(crops.usual, crops.radius_mm))
     side = (2 * int(LIGHT_RADII * radius_px) + 1,) * 2
     for _ in range(2):
@@ -225,14 +224,14 @@ def _smooth(crops: Crops, camera: int, total: Singles, share: Singles) -> Single
 
 
 def _mean_light(crops: Crops, camera: int) -> Singles:
-    """Return the local mean of all crops: the light, as far as paint averages out."""
+    """Return the local mean of all crops: the light, if paint averages out."""
     counts = _within(crops, camera).astype(np.float32)
     mean = np.mean([crop.grey for crop in crops.crops[camera] if crop is not None], axis=0, dtype=np.float32)
     return _smooth(crops, camera, mean * counts, counts)
 
 
 def _light(at: Adjustment, seen: _Seen, camera: int) -> Singles:
-    """Return the light under which the paint that all pictures have in common looks like them."""
+    """Return the light that explains the pictures best with the common paint."""
     light, count = at.light[camera], len(seen.grey)
     some = seen.where(torch.linspace(0, count - 1, min(LIGHT_FRAMES, count)).long())
     weight, where = some.cosine.square(), some.pixel.reshape(-1)
@@ -251,7 +250,7 @@ def _mean(grey: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 def _together(at: Adjustment, seen: Iterable[_Seen]) -> tuple[Tensor, Tensor]:
     """Return grey, in shares of light and of each picture's brightness, and weights of all cameras, (C, N, cells).
-    What was seen is used up: these are the largest arrays.
+    Overwrites `seen`, as these are the largest arrays.
     """
     each = [(one.paint(light), one.cosine.square_()) for one, light in zip(seen, at.light, strict=True)]
     grey, weight = (part[0][None] if len(part) == 1 else torch.stack(part) for part in zip(*each, strict=True))
@@ -271,8 +270,8 @@ def sights(place: Crops) -> Tensor:
 
 
 def place_metric(place: Crops) -> Tensor:
-    """Return the metric (3, 3) of moves of a ball's place, by what they move in pictures, 1/radii^2 of each camera:
-    along a line of sight a ball but grows.
+    """Return the metric (3, 3) of changes of position, by their effect in pictures, 1/radii^2 per camera: motion along
+    a line of sight changes only the size.
     """
     sight = sights(place).nanmean(1)
     square = sight.square().sum(1)[:, None, None]
@@ -281,16 +280,16 @@ def place_metric(place: Crops) -> Tensor:
 
 
 def _moved(step: Tensor, at: Adjustment) -> float:
-    """Return how far a step of places (P, 3) moves what is seen, radii, rms."""
+    """Return the rms motion in pictures of a step of positions (P, 3), radii."""
     return math.sqrt(float((step @ place_metric(at.crops) * step).sum(1).mean()))
 
 
 def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Return one Gauss-Newton step of places (P, 3), radii, lab, and of turns (N, 3), rad, in the body; and what is
-    left. P: 1, or N of a ball that moves. `expected` (P, 3), radii, `spread` (P, P), radii^2: what is known of them.
+    """Return one Gauss-Newton step of positions (P, 3), radii, lab, and of rotations (N, 3), rad, body; and the rms
+    residual. P: 1, or N for a moving ball. `expected` (P, 3), radii, and `spread` (P, P), radii^2: prior of positions.
 
-    A turn by t moves what is seen in direction n by t x n; a place that moves by d moves it by d less the part of d
-    along the line of sight w that leaves the sphere: d - w (n.d) / (n.w).
+    A rotation by t moves the paint in direction n by t x n; a motion d of the centre moves it by d minus the part along
+    the line of sight w that leaves the sphere: d - w (n.d) / (n.w).
     """
     R, crops, count = at.R_lab_body, at.crops, len(at.R_lab_body)
     grey, weight = _together(at, seen)
@@ -346,5 +345,5 @@ def _step(at: Adjustment, seen: Sequence[_Seen], expected: Tensor, spread: Tenso
 
 
 def _of_places(each: Tensor, places: int) -> Tensor:
-    """Return what is of N places (N, 3, ...) for as many, or for all as one, (3 P, ...)."""
+    """Return values of N positions (N, 3, ...) for each, or summed for a common one, (3 P, ...)."""
     return each.sum(0) if places == 1 else each.flatten(0, 1)

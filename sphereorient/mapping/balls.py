@@ -1,5 +1,5 @@
-"""Several spheres. They are cut out of every frame: disks are assigned to them by predicted position, because no map
-exists yet. Their maps, and an old map and a new one: those of one paint are put into one body frame.
+"""Several spheres. Disks of every frame are assigned to them by predicted position, because no map exists yet. Maps of
+the same paint, also an old and a new one, are put into one body frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,18 +27,18 @@ from sphereorient.pose.camera_view import CameraView
 from sphereorient.sphere.compare import MapComparison, compare_maps, fit_levels, turned_map
 from sphereorient.sphere.texture import map_directions, texel_areas, texture_coordinates
 
-FREE = 1.1  # sums of two radii: disks that are nearer than this are not used
-AWAY = 0.1  # of the radius, for each frame since it was seen: how far a sphere may be from where it is expected
+FREE = 1.1  # sums of two radii; nearer disks are not used
+AWAY = 0.1  # of the radius, per frame since it was seen: error of the predicted position
 SIZE_SIGMA = 0.08  # relative error of a disk's radius
-FARTHEST = 9.0  # chi2 at which a sphere is rather not seen than there
-FORGOTTEN = 20  # frames after which motion is not known any more
+FARTHEST = 9.0  # largest chi2 of an assignment
+FORGOTTEN = 20  # frames after which the motion is unknown
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Instant:
-    """What all cameras see in one frame."""
+    """The disks of all cameras in one frame."""
 
     crops: Sequence[Sequence[Crop]]  # of the disks of C cameras
     matches: Sequence[Match]
@@ -48,11 +48,10 @@ class Instant:
 def crops_of_balls(
     recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress
 ) -> dict[str, Crops]:
-    """Crop each sphere in every frame, by name: an only one as `take_crops`, or several moving ones. Names of spheres
-    of one size are given by chance, and kept: a sphere is the one that is where it is expected. Only disks that no
-    other one touches are used.
-    Raises ExperimentError (a sphere without a diameter, or one that is said to stay in its place), PaintError (no frame
-    shows as many spheres as are named, each by itself).
+    """Crop each sphere in every frame, by name: a single one as `take_crops`, or several moving ones. Spheres of one
+    size get names at random, which then follow predicted positions. Only isolated disks are used.
+    Raises ExperimentError (a sphere without a diameter, or a fixed one), PaintError (no frame shows all spheres,
+    isolated).
     """
     names, streams = recording.experiment.names, recording.streams
     if recording.experiment.alone:
@@ -88,8 +87,8 @@ def matched_instant(
     cameras: Mapping[str, Camera],
     diameter_mm: float,
 ) -> Instant:
-    """Match the disks (px) that C cameras see in one frame, with their crops; `diameter_mm` is the smallest ball's."""
-    least = min(2, len(cameras))  # a distance by the size of one disk is not enough to know who it is
+    """Match the disks (px) of C cameras in one frame, with their crops; `diameter_mm`: of the smallest ball."""
+    least = min(2, len(cameras))  # distance by the size of one disk is too uncertain for identity
     matches = [one for one in match_disks(disks, list(cameras.values())) if one.number >= least]
     X = places_of(matches, cameras, diameter_mm).position_lab_mm.numpy() if matches else np.zeros((0, 3))
     return Instant(crops=crops, matches=matches, position_lab_mm=X)
@@ -116,11 +115,11 @@ def linked_matches(
 
 
 def _first(instants: Sequence[Instant], count: int) -> int:
-    """Return the frame in which most cameras see as many spheres as are named, with the fewest other matches."""
+    """Return the frame in which most cameras see all named spheres, with the fewest other matches."""
     ranks = {}
     for k, at in enumerate(instants):
         apart: list[Match] = []
-        for one in at.matches:  # those of most cameras come first
+        for one in at.matches:  # matches of most cameras come first
             if not any(one.shares(other) for other in apart):
                 apart.append(one)
         if len(apart) < count:
@@ -130,14 +129,14 @@ def _first(instants: Sequence[Instant], count: int) -> int:
         ranks[k] = sum(one.number for one in apart[:count]), -others
     if not ranks:
         do = "name as many balls as the movies show, or learn each map from a movie of one ball"
-        raise PaintError(refusal("movies", expected=f"{count} balls in a frame", got="none that shows them", do=do))
+        raise PaintError(refusal("movies", expected=f"{count} balls in a frame", got="none", do=do))
     return max(ranks, key=lambda k: ranks[k])
 
 
 def _misfit(
     at: Instant, frame: int, past: Sequence[Sequence[tuple[int, Floats]]], sizes: Floats, radius_mm: Floats
 ) -> Floats:
-    """Return chi2 (K, M) of each sphere at each match: where it is expected, and of what size."""
+    """Return chi2 (K, M) of position and size of each sphere at each match."""
     cost = np.zeros((len(past), len(at.matches)))
     for m, match in enumerate(at.matches):
         for c, one in enumerate(match.disks):
@@ -151,13 +150,13 @@ def _misfit(
             X = X_now + (frame - now) / (now - before) * (X_now - X_before)
         sigma = AWAY * radius_mm[n] * gap * (1 if len(seen) > 1 else 3)
         cost[n] += np.square((at.position_lab_mm - X) / sigma).sum(1)
-    # Of two matches of one sphere the one of more cameras counts.
+    # Of two matches of one sphere, prefer that of more cameras.
     cost += np.array([len(one.chosen) - one.number + one.chi2 / max(2 * one.number - 3, 1) for one in at.matches])
     return cost
 
 
 def linked_places(chosen: NDArray[np.int64], instants: Sequence[Instant]) -> Floats:
-    """Return where a sphere is in each frame, (N, 3), mm; between frames in which it is seen on a straight line."""
+    """Return the position of a sphere in each frame, (N, 3), mm, linearly interpolated between sightings."""
     seen = np.flatnonzero(chosen >= 0)
     X = np.array([instants[k].position_lab_mm[chosen[k]] for k in seen.tolist()]).reshape(-1, 3)
     every = np.arange(len(instants))
@@ -172,7 +171,7 @@ def crops_of_ball(
     radius_mm: Mapping[str, float],
     places: Sequence[Floats],
 ) -> Crops:
-    """Return the crops of a sphere; `places` (N, 3), mm, are its own and those of the others."""
+    """Return the crops of a sphere; `places` (N, 3), mm: its positions, then the others'."""
     count = len(instants)
     crops: list[list[Crop | None]] = [[None] * count for _ in views]
     X = torch.full((count, 3), torch.nan, dtype=torch.float64)
@@ -189,12 +188,12 @@ def crops_of_ball(
                 crops[c][k], seen[k, c] = at.crops[c][disk], True
     if not bool(seen.any()):
         do = "learn its map from a movie of this ball alone"
-        raise PaintError(refusal(f"ball {name}", expected="frames in which nothing touches it", got="none", do=do))
+        raise PaintError(refusal(f"ball {name}", expected="frames in which it is isolated", got="none", do=do))
     return Crops(views=views, crops=crops, position_lab_mm=X, seen=seen, radius_mm=radii[0], fixed=False)
 
 
 def _free(view: CameraView, places: Sequence[Tensor], radii_mm: Sequence[float]) -> Tensor:
-    """Return in which frames the disk of the first sphere lies in the picture as a whole, and no other touches it."""
+    """Return the frames in which the disk of the first sphere is whole and isolated."""
     (middle, radius), *others = (
         (view.camera.project(place), view.radius_px(place, size)) for place, size in zip(places, radii_mm, strict=True)
     )
@@ -206,7 +205,7 @@ def _free(view: CameraView, places: Sequence[Tensor], radii_mm: Sequence[float])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SharedMap:
-    """The map of a ball, and the ball whose body frame it is in; another one if both wear one paint."""
+    """A ball's map, and the ball that defines its body frame (another one if both have the same paint)."""
 
     learnt: LearntMap
     first: str
@@ -214,7 +213,7 @@ class SharedMap:
 
 
 def shared_maps(learnt: Mapping[str, LearntMap], progress: Progress) -> dict[str, SharedMap]:
-    """Return the maps of balls, by name; those that show one paint are joined into one, in the frame of the first."""
+    """Return the maps of balls, by name; maps of the same paint are joined, in the frame of the first."""
     found: dict[str, SharedMap] = {}
     for name, one in learnt.items():
         found[name] = SharedMap(learnt=one, first=name, correlation=1.0)
@@ -237,7 +236,7 @@ def shared_maps(learnt: Mapping[str, LearntMap], progress: Progress) -> dict[str
 
 
 def _joined(first: LearntMap, other: LearntMap, R_other_first: Tensor) -> LearntMap:
-    """Return the first map with what the other one shows: means by weight, 1 / sigma^2."""
+    """Return the mean of two maps, weighted by 1 / sigma^2, in the frame of the first."""
     known = torch.where(torch.isfinite(other.sigma), other.sigma.double(), torch.nan)
     parts = (other.texture.double(), known, other.seen.double())
     grey, sigma, seen = (turned_map(part, R_other_first, len(first.texture)) for part in parts)

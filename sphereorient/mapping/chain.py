@@ -14,15 +14,15 @@ from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs,
 from sphereorient.mapping.settings import MapSettings
 
 SEARCH_STEP_DEG = 8.0  # of the grid of relative rotations
-SMALLER = 2  # factor by which disks are reduced for a search
+SMALLER = 2  # factor of reduction of the disks for a search
 ITERATIONS = 6  # of a pair's refinement
-EVERY = 2  # pixels of the disks in it, and of the small ones in a search
-NEAR = 0.5  # cosine between lines of sight in the body, above which two disks share enough for a comparison
-OVERLAP_MIN = 0.25  # of a disk, shared by a loop's pictures
+EVERY = 2  # each n-th pixel of the disks, and of the small ones in a search
+NEAR = 0.5  # cosine between lines of sight in the body; above, two disks share enough for a comparison
+OVERLAP_MIN = 0.25  # least share of a disk common to a loop's pictures
 SCALE_RAD = math.radians(1.0)  # scatter of single frames by errors of their outlines
 APART_RAD = math.radians(3.0)  # larger median differences of two cameras' rotations mean two balls
-APART_SHARE = 0.3  # and this share of the rotation, where that is larger
-ENOUGH_TURN_RAD = math.radians(4.0)  # of a pair that can show whether cameras agree
+APART_SHARE = 0.3  # or this share of the rotation, if larger
+ENOUGH_TURN_RAD = math.radians(4.0)  # least rotation of a pair that tests agreement of cameras
 FEWEST = 4  # such pairs
 
 
@@ -56,12 +56,12 @@ def check_turned(R_lab_body: Tensor, settings: MapSettings) -> None:
     turned = float(so3.geodesic_distance(R_lab_body[:1], R_lab_body).max())
     if turned < math.radians(settings.turned_min_deg):
         got = f"{math.degrees(turned):.2g} degrees in all frames together"
-        do = "use a movie in which the ball turns"
-        raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
+        do = "use a movie in which the ball rotates"
+        raise PaintError(refusal("movies", expected="a ball that rotates", got=got, do=do))
 
 
 def chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, RelativeRotations]:
-    """Compare neighbours, then, from the resulting orientations, frames further apart."""
+    """Compare neighbours, then, by the resulting orientations, more distant frames."""
     count = len(disks)
     grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), math.radians(settings.turn_max_deg))
     first = torch.arange(count - 1)
@@ -99,8 +99,8 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
     good = found.where((found.score > settings.score_min) & (found.overlap > OVERLAP_MIN))
     if len(first) and not len(good):
         got = f"none among {len(first)} pairs of frames"
-        do = "film until the ball has shown its sides again, or use more frames"
-        raise PaintError(refusal("movies", expected="patches of the ball that are seen twice", got=got, do=do))
+        do = "film until the ball shows the same sides again, or use more frames"
+        raise PaintError(refusal("movies", expected="patches of the ball seen twice", got=got, do=do))
     R, residual = solve_graph(R_lab_body, RelativeRotations.joined([pairs, good]), SCALE_RAD)
     closed = good.where(residual[len(pairs) :].norm(dim=-1) < 3 * SCALE_RAD)
     closure = Closure.of(closed, R_lab_body, R, pairs=len(pairs), loops=len(first))
@@ -116,7 +116,7 @@ def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:
 
 
 def _candidates(disks: Disks, R_lab_body: Tensor, settings: MapSettings) -> tuple[Tensor, Tensor]:
-    """Return distant pairs of keyframes that should share a patch; of too many, evenly spread ones."""
+    """Return distant pairs of keyframes that should share a patch; evenly spread ones if there are too many."""
     keys = _keyframes(R_lab_body, math.radians(settings.keyframe_deg))
     near = disks.sight_cosines(R_lab_body, keys)
     a, b = torch.triu_indices(len(keys), len(keys), offset=2)

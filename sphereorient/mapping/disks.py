@@ -1,7 +1,4 @@
-"""The sphere cut out of every frame, so that movies are read once, and its normalised disks with their slopes.
-
-The disks compare pictures before there is a map.
-"""
+"""Crops of the sphere from every frame, so that movies are read once; normalised disks, to compare without a map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,16 +40,16 @@ from sphereorient.sphere.view import perspective_view
 
 Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
-SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
-FOLLOWED = 3000  # frames of a movie, from its first: by then the ball has shown its sides
-PLACES = 2  # per radius: places that far apart have paint of their own
+SHOWN_MIN = 0.99  # least visible share of a disk's pixel
+FOLLOWED = 3000  # first frames of a movie, enough to show all sides
+PLACES = 2  # per radius: independent places of the paint
 BY_INSTANT = ("layers", "R_lab_view", "distance_radii", "seen", "shown")  # of `Disks`
-DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
+DEEPEST = 1e6  # radii: beyond, a perspective view is orthographic
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Crop:
-    """A piece of a picture."""
+    """A part of a picture."""
 
     grey: Picture
     top: int
@@ -89,21 +86,19 @@ class Crops:
         return [[self.picture(k, c) for c in range(len(self.views))] for k in frames.tolist()]
 
     def holding(self, rows: Sequence[Sequence[Crop]], use: Tensor, position_lab_mm: Tensor | None = None) -> "Crops":
-        """Return a record of the ball with crops of all cameras, N rows, of which (N, C) are used, at positions (N, 3);
-        None: at its one place.
-        """
+        """Return a record with N rows of crops of all cameras, used (N, C), at positions (N, 3) (None: fixed)."""
         X = self.position_lab_mm[:1].expand(len(rows), 3) if position_lab_mm is None else position_lab_mm
         return replace(self, crops=list(zip(*rows, strict=True)), position_lab_mm=X, seen=use)
 
     @property
     def usual(self) -> Tensor:
         """The median of the positions, (3,)."""
-        # Of expanded rows torch returns anything.
+        # torch gives wrong medians of expanded rows.
         X: Tensor = self.place(0) if self.fixed else self.position_lab_mm.contiguous().nanmedian(0).values
         return X
 
     def place(self, frame: int) -> Tensor:
-        """Return the position (3,) in a frame, of all that are fixed the first."""
+        """Return the position (3,) in a frame; of a fixed ball the first."""
         X: Tensor = self.position_lab_mm[0 if self.fixed else frame]
         return X
 
@@ -121,9 +116,9 @@ class Crops:
 
 
 def too_few(count: int) -> PaintError:
-    """Return the error about a movie with one frame."""
-    do = "use a movie in which the ball turns"
-    return PaintError(refusal("movies", expected="the ball in 2 frames at least", got=f"{count}", do=do))
+    """Return the error for a movie of one frame."""
+    do = "use a movie in which the ball rotates"
+    return PaintError(refusal("movies", expected="the ball in at least 2 frames", got=f"{count}", do=do))
 
 
 def take_crops(recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress) -> Crops:
@@ -162,8 +157,8 @@ def _positions(sightings: Mapping[str, Sightings], recording: Recording) -> Posi
 
 
 def _scene(recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings) -> CameraScene:
-    """Return the scene of an only ball; of a fixed one, which is what changes in the pictures, with the outline.
-    PaintError: outlines of a fixed ball scatter far more in place than in size.
+    """Return the scene of a single ball, of a fixed one (the changing part of the pictures) with its outline. Raises
+    PaintError: outlines of a fixed ball scatter far more in position than in size.
     """
     if not recording.experiment.fixed:
         (scene,) = locate.find_scenes(recording, stream, settings.background_frames, locating).values()
@@ -177,8 +172,8 @@ def _scene(recording: Recording, stream: CameraStream, settings: MapSettings, lo
     )
     wander = 0.0 if circle else wander_px(pictures, scene, locating)
     if wander:
-        got, do = f"one that wanders by {wander:.1f} px in {stream.name}", "write `fixed: sways`"
-        raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
+        got, do = f"one that moves by {wander:.1f} px in {stream.name}", "set `fixed: sways`"
+        raise PaintError(refusal("sphere.fixed", expected="a fixed ball", got=got, do=do))
     return scene
 
 
@@ -189,8 +184,8 @@ def held_place(
     progress: Progress = silent,
     frames_max: int = FOLLOWED,
 ) -> Crops:
-    """Return an empty record with the views and the positions of a ball: one (1, 3) of a fixed ball, else those of the
-    first frames (N, 3), at most `frames_max`, with the cameras that see it, (N, C). Raise as `take_crops`.
+    """Return an empty record with views and positions of a ball: (1, 3) of a fixed ball, else (N, 3) of the first
+    frames, at most `frames_max`, with the cameras that see it, (N, C). Raises as `take_crops`.
     """
     experiment, views, sightings = recording.experiment, list[CameraView](), dict[str, Sightings]()
     for stream in recording.streams:
@@ -229,7 +224,7 @@ def cut_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Cr
 
 
 def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor | None = None) -> list[Crop]:
-    """Cut a ball in its place, or at a position (3,) near it, out of a picture of each camera: parts of one size."""
+    """Cut a ball at its position, or at one (3,) near it, out of a picture of each camera: parts of equal size."""
     usual, found = place.usual, []
     X = usual if position_lab_mm is None else position_lab_mm
     for view, picture in zip(place.views, pictures, strict=True):
@@ -241,7 +236,7 @@ def cut_out(place: Crops, pictures: Sequence[Picture], position_lab_mm: Tensor |
 
 
 def _whole_crop(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
-    """Cut out as `cut_crop`, black beyond the picture, so that all are of one size."""
+    """Cut out as `cut_crop`, black beyond the picture, so that all have equal size."""
     reach = int(np.ceil(REACH * radius_px)) + 3
     top, left = round(v_px) - reach, round(u_px) - reach
     grey = np.zeros((2 * reach + 1, 2 * reach + 1), picture.dtype)
@@ -353,14 +348,14 @@ def normalised_disks(
     share = rim_share(size)
     fine, wide = Blur(size, settings.detail), Blur(size, settings.window)
     flat, shown = pictures.reshape(-1, size, size).float(), torch.ones(pictures.shape) if shown is None else shown
-    if bool((shown < 1).any()):  # fill what is hidden with the ball's mean grey
+    if bool((shown < 1).any()):  # fill hidden pixels with the ball's mean grey
         part = shown.reshape(-1, size, size)
         total = (part * share).sum((1, 2), keepdim=True).clamp_min(1e-6)
         usual = (flat * (part * share)).sum((1, 2), keepdim=True) / total
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
-    # Add half of the disk's deviation: in uniform texture the local one would amplify noise.
+    # Add half of the disk's deviation: in uniform texture the local one amplifies noise.
     local = (wide(rough.square()) + 0.25 * whole).sqrt().clamp_min(1e-12)
     even = (rough / local).clamp(-3.0, 3.0) * seen.reshape(-1, 1, 1)
     return Disks(
@@ -383,9 +378,9 @@ def _with_slopes(grey: Tensor) -> Tensor:
 
 
 def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
-    """Take off what stays with the camera (shading, sensor pattern), at rough orientations (N, 3, 3).
-    It is each pixel's mean over the places of the ball that it has shown, as far as paint cannot explain it: the mean
-    of n places keeps 1/n of the paint's power. Where paint explains all, the disks come back as they are.
+    """Remove what is static in the camera (shading, sensor pattern), at rough orientations (N, 3, 3): each pixel's mean
+    over the places of the ball that it has shown, except the part that paint explains, as a mean of n places keeps 1/n
+    of the paint's power. Unchanged if paint explains all.
     """
     side, found = 2 * PLACES + 1, False
     grey = disks.layers[:, :, 0].flatten(2).clone()

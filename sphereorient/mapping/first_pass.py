@@ -1,4 +1,4 @@
-"""Orientations of a ball in its place, frame by frame, by a map that grows with each: nothing is known before."""
+"""Orientations of a fixed ball without prior knowledge, frame by frame, by a map that grows with each."""
 
 import math
 from collections.abc import Sequence
@@ -32,39 +32,39 @@ from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, pose
 
 Picture = NDArray[Any]
 LEAST_RADIUS_PX = 45.0  # of pictures with coarser pixels
-GREY = 128.0  # of even pictures: their mean; as the scene about the ball, so that its limb does not show
-CONTRAST = 50.0  # of these, the deviation from it
-WINDOW = 0.35  # half side, radii, of the neighbourhood over which light is taken as even
-EVENER = 0.25  # share of the whole disk's power that is added to that of the neighbourhood
-REACH = 1.2  # of the radius: half side of what is cut out
-CELL_PX = 0.75  # of the map, in the disk's middle
+GREY = 128.0  # mean of even pictures; also the scene around the ball, so that the limb has no contrast
+CONTRAST = 50.0  # their standard deviation
+WINDOW = 0.35  # half side, radii, of the neighbourhood over which light counts as even
+EVENER = 0.25  # share of the whole disk's power added to that of the neighbourhood
+REACH = 1.2  # of the radius: half side of a crop
+CELL_PX = 0.75  # of the map, at the disk's centre
 NOISE = 10.0  # grey levels, of even pictures
-LEAST_SCORE = 0.3  # of a picture that the map explains
-USUAL_OF = 200  # frames that tell the usual score
-SURE_SHARE = 0.7  # of it, where the ball is searched for over all orientations: the best of many wrong ones is less
-OUTLINE_ERROR, ADJUSTED_ERROR = 0.01, 5e-4  # of the place, radii in pictures: by an outline, by all pictures
-HELD = 1e12  # 1/radius^2, precision of the centre at which fits are held
-STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of turns that are tried where the ball is not where it is expected
-WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried where it is none of these
-TURNED_RAD = math.radians(20.0)  # the ball turns by more
-BEGIN = 300  # of these, by which place and map are adjusted first
-MAPPED = 80  # of them that place and map are adjusted by, twice as many at most
-APART_RAD = 0.025  # turn from one of these to the next, at least
-LEAST_FOUND = 0.5  # share of the frames
-TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # pixels and iterations of these, and how many are fitted
+LEAST_SCORE = 0.3  # of a picture explained by the map
+USUAL_OF = 200  # frames for the usual score
+SURE_SHARE = 0.7  # of it, in a search over all orientations: the best wrong one scores less
+OUTLINE_ERROR, ADJUSTED_ERROR = 0.01, 5e-4  # of the position, radii in pictures: by an outline, by all pictures
+HELD = 1e12  # 1/radius^2, precision that fixes the centre in fits
+STEP_DEG, REACH_DEG = 8.0, 40.0  # of the grid of rotations about the expectation, tried if that fails
+WHOLE_STEP_DEG = 12.0  # of the grid of all orientations, tried if these fail
+TURNED_RAD = math.radians(20.0)  # least rotation of the ball
+BEGIN = 300  # first frames, for the first adjustment of position and map
+MAPPED = 80  # frames of an adjustment, at most twice as many
+APART_RAD = 0.025  # least rotation between these
+LEAST_FOUND = 0.5  # least share of frames explained
+TRIED_EVERY, TRIED_STEPS, TRIED_BEST = 16, 2, 4  # each n-th pixel, iterations and number of fits in a search
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CoarserPictures:
-    """Pictures of a large ball with coarser pixels: a first pass needs no finer ones."""
+    """Pictures of a large ball in coarser pixels, sufficient for a first pass."""
 
-    place: Crops  # seen so
+    place: Crops  # in coarser pixels
     whole: Sequence[CameraView]  # the views as filmed
     factor: int
 
     @classmethod
     def of(cls, place: Crops) -> "CoarserPictures":
-        """Return those of a ball at a place."""
+        """Return those of a ball at a position."""
         X = place.usual
         radius_px = min(float(view.radius_px(X, place.radius_mm)) for view in place.views)
         factor = max(1, int(radius_px / LEAST_RADIUS_PX))
@@ -72,10 +72,10 @@ class CoarserPictures:
         return cls(place=coarse, whole=place.views, factor=factor)
 
     def frames(self, frames: Sequence[Frame]) -> Sequence[Frame]:
-        """Return the frames of all cameras so."""
+        """Return the frames of all cameras in coarser pixels."""
         if self.factor == 1:
             return frames
-        # Pictures that show nothing are not looked at.
+        # Unusable pictures are not read.
         return [Frame(shown=coarser(shot.picture.astype(np.float32), self.factor), read=shot.reason) for shot in frames]
 
 
@@ -92,7 +92,7 @@ def _coarser_view(view: CameraView, factor: int) -> CameraView:
 
 
 class EvenLight:
-    """Makes pictures of one camera even: grey less the mean of its neighbourhood, over the deviation there."""
+    """Evens pictures of one camera: grey minus the local mean, over the local deviation."""
 
     def __init__(self, view: CameraView, position_lab_mm: Tensor, radius_mm: float) -> None:
         u, v = view.camera.project(position_lab_mm).tolist()
@@ -114,7 +114,7 @@ class EvenLight:
         return picture
 
     def __call__(self, picture: Picture) -> NDArray[np.float32]:
-        """Return what is cut out of a picture (H, W), even."""
+        """Return the even crop of a picture (H, W)."""
         grey = picture[self._there].astype(np.float32) * self._within
         away = (grey - self._mean(grey) * self._share) * self._within
         square = away * away
@@ -130,11 +130,11 @@ class EvenLight:
 
 
 class FirstPass:
-    """Follows a ball in its place by the map of the frames before: the body frame is the lab at the first one."""
+    """Tracks a fixed ball by the map of earlier frames; the body frame is the lab at the first frame."""
 
     def __init__(self, place: Crops, error: float = OUTLINE_ERROR) -> None:
-        """`place`: a record of crops with the place as first position; `error`: of it, radii in pictures. The place of
-        a ball that moves is given with each frame, and found anew within this error unless outlines alone tell it.
+        """`place`: empty crops with the position; `error`: its error, radii in pictures. A moving ball's position comes
+        with each frame, and is adjusted within this error unless only outlines give it.
         """
         radius_mm = place.radius_mm
         self._place_covariance = torch.linalg.inv(place_metric(place)) * (error * radius_mm) ** 2  # mm^2
@@ -159,19 +159,19 @@ class FirstPass:
         self._near = so3.local_grid(math.radians(STEP_DEG), math.radians(REACH_DEG))
         self._before: tuple[float, Tensor] | None = None  # time, s, and R_lab_body (3, 3)
         self._rate, self._change = torch.zeros(2, 3, dtype=torch.float64)  # rad/s, and its last change
-        self._lost = 0  # frames that are not explained, in a row
-        self._usual, self._count = 0.0, 1  # score of frames that are, and their number
+        self._lost = 0  # unexplained frames in a row
+        self._usual, self._count = 0.0, 1  # score of explained frames, and their number
 
     def _go_to(self, position_lab_mm: Tensor) -> None:
-        """Take what the pictures show at a position (3,) from now on."""
+        """Use a position (3,) from now on."""
         self._X = position_lab_mm
         self._even = [EvenLight(view, self._X, self._ball.radius_mm) for view in self._ball.views]
 
     def next(
         self, time_s: float, frames: Sequence[Frame], there: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Poses, bool]:
-        """Return the pose of the frame of a time, none where the map does not explain it, and whether it was searched
-        for; the map grows by it. `there`: the position (3,) of a ball that moves, and the cameras (C,) that see it.
+        """Return the pose of a frame (none if the map does not explain it), and whether it was searched for; the map
+        grows by the frame. `there`: the position (3,) of a moving ball, and the cameras (C,) that see it.
         """
         use = torch.tensor([shot.usable for shot in frames])
         reason = [shot.reason for shot in frames]
@@ -221,11 +221,11 @@ class FirstPass:
         return self
 
     def begin(self, time_s: float, R_lab_body: Tensor) -> None:
-        """Begin with a frame of a time near an orientation (3, 3)."""
+        """Begin at a time near an orientation (3, 3)."""
         self._before = time_s, R_lab_body
 
     def follow(self, before: "FirstPass", correction: Tensor) -> None:
-        """Go on where another pass is, with its orientation times a correction (3, 3), in the lab."""
+        """Continue another pass, with its orientation times a correction (3, 3), in the lab."""
         assert before._before is not None
         self._before = before._before[0], correction @ before._before[1]
         self._rate, self._change, self._lost = before._rate, before._change, before._lost
@@ -243,8 +243,8 @@ class FirstPass:
     def _fitted(
         self, step_s: float, R: Tensor, even: Sequence[NDArray[np.float32]], use: Tensor
     ) -> tuple[FittedPoses | None, bool]:
-        """Fit near the expected orientation, else near any within reach, or any at all; return also whether the frame
-        was searched for. None: the map explains it nowhere.
+        """Fit near the expected orientation, else near any within reach, else near any at all; return also whether the
+        frame was searched for. None: unexplained at all orientations.
         """
         expected = so3.exp(step_s * (self._rate + LEAST_CHANGE * self._change)) @ R
         fit = self._settled([even], expected[None], use)
@@ -281,7 +281,7 @@ class FirstPass:
         return self._fitter.settled(*self._start(even, R, use))
 
     def _explained(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which fits (B,) have arrived, and explain all pictures in use."""
+        """Return which fits (B,) have converged and explain all pictures in use."""
         arrived: Tensor = fit.step[:, :3].norm(dim=1) < NEAR_RAD
         return arrived & ((fit.score > LEAST_SCORE) | ~use).all(1)
 
@@ -305,27 +305,27 @@ class _Kept:
 
 
 class KeptFrames:
-    """The frames that place and map are adjusted by: apart by a turn that doubles whenever there are too many."""
+    """The frames for adjustments, at least a rotation apart that doubles whenever there are too many."""
 
     def __init__(self, place: Crops) -> None:
-        self.count = 0  # of frames that were kept, those thinned out included
+        self.count = 0  # of kept frames, removed ones included
         self._place, self._apart_rad = place, APART_RAD
         self._rows: list[_Kept] = []
 
     @property
     def turned_rad(self) -> float:
-        """The largest turn from the first frame to another."""
+        """The largest rotation from the first frame to another."""
         turns = [so3.geodesic_distance(self._rows[0].R_lab_body, one.R_lab_body) for one in self._rows]
         return max(map(float, turns), default=0.0)
 
     @property
     def path_rad(self) -> float:
-        """The sum of the turns from each frame to the next."""
+        """The sum of the rotations from each frame to the next."""
         R = [one.R_lab_body for one in self._rows]
         return sum(float(so3.geodesic_distance(a, b)) for a, b in pairwise(R))
 
     def add(self, frames: Sequence[Frame], poses: Poses) -> None:
-        """Keep a frame with a pose where the ball has turned since the last one that was kept."""
+        """Keep a frame with a pose if the ball has rotated since the last kept one."""
         R = poses.R_lab_body[0]
         if self._rows and float(so3.geodesic_distance(self._rows[-1].R_lab_body, R)) < self._apart_rad:
             return
@@ -337,20 +337,20 @@ class KeptFrames:
             self._rows, self._apart_rad = self._rows[::2], 2 * self._apart_rad
 
     def arrays(self) -> tuple[list[list[Crop]], NDArray[np.bool_], NDArray[np.float64]]:
-        """Return all crops, use (N, C) and orientations (N, 3, 3), without tensors: for another process."""
+        """Return all crops, use (N, C) and orientations (N, 3, 3), without tensors, for another process."""
         crops, use, R, _ = self._parts(self._rows)
         return crops, use.numpy(), R.numpy()
 
     def so_far(self) -> "KeptFrames":
-        """Return a record of the same frames, to which no other ones come."""
+        """Return a snapshot of these frames."""
         same = copy(self)
         same._rows = list(self._rows)
         return same
 
     def corrected(self, done: "KeptFrames", R_lab_body: Tensor) -> tuple[Tensor, "KeptFrames"]:
-        """Take orientations (N, 3, 3) from an adjustment of the frames of some time ago, and let later ones go on from
-        there: at a wrong place all turns are too long or too short by the same share. Return by which turn (3, 3), in
-        the lab, the last frame is corrected, and the later frames.
+        """Take orientations (N, 3, 3) of an adjustment of earlier frames, and continue the later ones from there: a
+        wrong position scales all rotations alike. Return the correction (3, 3), lab, of the last frame, and the later
+        frames.
         """
         since, before = self.so_far(), set(map(id, done._rows))
         since._rows = [one for one in self._rows if id(one) not in before]
@@ -366,13 +366,11 @@ class KeptFrames:
         return new @ old.mT, since
 
     def adjusted(self, progress: Progress = silent) -> Adjustment:
-        """Return what the frames have in common.
-        Raises PaintError: the ball has not turned.
-        """
+        """Adjust position, orientations and map. Raises PaintError: the ball has not rotated."""
         if self.turned_rad < TURNED_RAD:
             got = f"{math.degrees(self.turned_rad):.2g} degrees in all frames together"
-            do = "use a movie in which the ball turns"
-            raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
+            do = "use a movie in which the ball rotates"
+            raise PaintError(refusal("movies", expected="a ball that rotates", got=got, do=do))
         return adjusted(*self.crops(), progress)
 
     def crops(self, most: int = 2 * MAPPED) -> tuple[Crops, Tensor]:
@@ -390,13 +388,13 @@ class KeptFrames:
 
 
 def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> Adjustment:
-    """Return what the first frames of a ball near a place, see `held_place`, have in common; the body frame is the lab
-    at the first frame that shows it. A few of them tell place and map; by these, more are followed and tell them again.
-    Raises PaintError: the ball does not turn, or the map explains hardly a frame.
+    """Adjust the first frames of a ball near a position, see `held_place`; the body frame is the lab at the first frame
+    with the ball. A few frames give position and map; by these, more are tracked and adjusted again. Raises PaintError:
+    the ball does not rotate, or the map explains hardly any frame.
     """
     coarse, count = CoarserPictures.of(place), min(FOLLOWED, len(recording.timeline))
     found, kept = swept(recording, coarse, FirstPass(coarse.place), min(count, BEGIN), progress)
-    if kept.turned_rad < TURNED_RAD and count > BEGIN:  # it rests at first
+    if kept.turned_rad < TURNED_RAD and count > BEGIN:  # the ball rests at first
         found, kept = swept(recording, coarse, FirstPass(coarse.place), count, progress)
     adjustment = kept.adjusted(progress)
     if count > len(found):
@@ -404,19 +402,19 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
         adjustment = kept.adjusted(progress)
     seen, shown = sum(map(supported, found)), count if place.fixed else int(place.seen.any(1).sum())
     if seen < LEAST_FOUND * shown:
-        got, do = f"{seen} of {shown} frames that a growing map explains", "learn the map with `sphereorient map`"
+        got, do = f"{seen} of {shown} frames fit the map of earlier ones", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))
     return adjustment
 
 
 def followed_by(adjustment: Adjustment, recording: Recording, place: Crops, progress: Progress) -> list[Poses]:
-    """Return the poses of all frames by the place and map of an adjustment of some, `place` as given to it."""
+    """Return the poses of all frames by position and map of an adjustment, `place` as given to it."""
     after = _after(adjustment, CoarserPictures.of(place), recording)
     return swept(recording, *after, len(recording.timeline), progress)[0]
 
 
 def _after(adjustment: Adjustment, coarse: CoarserPictures, recording: Recording) -> tuple[CoarserPictures, FirstPass]:
-    """Return the pictures with the place that was found, and a pass with the map."""
+    """Return the pictures with the adjusted position, and a pass with the map."""
     follower = FirstPass(adjustment.crops, ADJUSTED_ERROR).shown(adjustment.crops, adjustment.R_lab_body)
     follower.begin(float(recording.timeline.time_s[0]), adjustment.R_lab_body[0])
     X = coarse.place.position_lab_mm + adjustment.moved_mm
@@ -426,7 +424,7 @@ def _after(adjustment: Adjustment, coarse: CoarserPictures, recording: Recording
 def swept(
     recording: Recording, coarse: CoarserPictures, follower: FirstPass, count: int, progress: Progress
 ) -> tuple[list[Poses], KeptFrames]:
-    """Follow the first `count` frames; return their poses, and those kept of them."""
+    """Track the first `count` frames; return their poses and the kept frames."""
     pairs = zip(recording.streams, coarse.whole, strict=True)
     rows = zip(*(screened_frames(stream, view.background, 0, count) for stream, view in pairs), strict=True)
     kept, found = KeptFrames(coarse.place), list[Poses]()

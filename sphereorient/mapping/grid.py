@@ -14,8 +14,8 @@ from sphereorient.sphere.texture import map_directions, spline_weights, texel_co
 from sphereorient.sphere.texture_table import CHUNK, SIDE, SQUARE_25, TextureTable, octahedral_directions, tangents
 
 POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undefined
-READS = 16  # texels that a look-up reads
-WIDER = 4.0  # times the blur of the map, at which its edges are counted
+READS = 16  # texels per look-up
+WIDER = 4.0  # times the map's blur: scale at which edges are counted
 SLOPES, ROUGH_SIDE = 64, 128  # cells per axis: of the directions in which their slope is averaged, of the table
 FEWEST_EDGES = 0.01  # rad/sr
 Array = NDArray[Any]
@@ -32,7 +32,7 @@ def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
     width = 2 * height
     (column, along), (row, across) = (spline_weights(at) for at in texel_coordinates(direction_body, height))
     columns, rows = column[..., None] + torch.arange(4), row[..., None] + torch.arange(4)
-    beyond = (rows < 0) | (rows >= height)  # over a pole the meridian goes on at the other side
+    beyond = (rows < 0) | (rows >= height)  # beyond a pole the meridian continues on the other side
     rows = torch.where(rows < 0, -1 - rows, torch.where(rows >= height, 2 * height - 1 - rows, rows))
     columns = (columns[..., None, :] + torch.where(beyond, height, 0)[..., None]) % width
     place = rows[..., None] * width + columns
@@ -45,7 +45,7 @@ class SplineTable(TextureTable):
     def __init__(self, texture: Tensor, blur_rad: float) -> None:
         super().__init__(torch.zeros(1, 4), blur_rad)
         self.texture = texture
-        self.reads: list[tuple[Tensor, Tensor]] = []  # of each look-up: texels and weights, (L, P, 16)
+        self.reads: list[tuple[Tensor, Tensor]] = []  # per look-up: texels and weights, (L, P, 16)
 
     def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
         """Return value and slope; see `TextureTable.sample`."""
@@ -99,11 +99,11 @@ def stiffness(height: int) -> csr_matrix:
 
 
 class NormalMatrix:
-    """J^T J of a weighted Jacobian (S, T), never multiplied out: that would take longer than the solution."""
+    """J^T J of a weighted Jacobian (S, T), not formed: that would take longer than the solution."""
 
     def __init__(self, jacobian: csr_matrix) -> None:
         self._jacobian = jacobian
-        self._back = jacobian.T.tocsr()  # rows of it are read in order: half the time
+        self._back = jacobian.T.tocsr()  # reading its rows in order halves the time
 
     def __matmul__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         seen = self._jacobian @ values.astype(self._jacobian.dtype)
@@ -115,7 +115,7 @@ class NormalMatrix:
 
 
 def texel_sums(jacobian: csr_matrix) -> NDArray[np.float64]:
-    """Return the diagonal of J^T J, (T,): how well the samples determine each texel; J reads no texel twice."""
+    """Return the diagonal of J^T J, (T,): the information on each texel; no sample reads a texel twice."""
     squares = jacobian.data.astype(np.float64) ** 2
     return np.asarray(np.bincount(jacobian.indices, squares, minlength=jacobian.shape[1]), np.float64)
 
@@ -149,7 +149,7 @@ def solve_map(
 
 
 def dot(a: Array, b: Array) -> float:
-    """Return the dot product of (T,) and (T,), summed in float64. BLAS would use all cores, and wait for busy ones."""
+    """Return the dot product of (T,) and (T,) in float64, without BLAS, which would wait for busy cores."""
     return float(np.einsum("i,i", a, b, dtype=np.float64))
 
 
@@ -186,9 +186,9 @@ def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_mat
 
 
 def paint_tie(texture: Tensor, blur_rad: float) -> float:
-    """Return what the integral of the paint's squared slope weighs against chi^2, from a map of some blur.
-    Paint with edges of length e per sr has the power 2 e / k^3; a map blurred further, where noise is small, tells e.
-    The weight is right for detail of the size of the blur, where pictures and expectation meet (Wiener 1949).
+    """Return the weight of the integral of the paint's squared slope against chi^2, from a map of known blur.
+    Paint with edges of length e per sr has the power 2 e / k^3; e is measured in a further blurred map with little
+    noise. The weight is optimal for detail of the size of the blur (Wiener 1949).
     """
     wide = WIDER * blur_rad
     direction = octahedral_directions(SLOPES).float().T[None]
@@ -198,7 +198,7 @@ def paint_tie(texture: Tensor, blur_rad: float) -> float:
 
 
 def coefficients_blur_rad(blur_rad: float, height: int) -> float:
-    """Return the blur of a map's coefficients whose spline has some blur: it adds a third of a squared texel."""
+    """Return the blur of the coefficients of a map of known blur: the spline adds a third of a squared texel."""
     return math.sqrt(max(blur_rad**2 - (math.pi / height) ** 2 / 3, (0.1 * blur_rad) ** 2))
 
 

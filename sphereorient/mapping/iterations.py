@@ -1,4 +1,4 @@
-"""The iterations of mapping: orientations, light and map in turn, and then poses and map together."""
+"""The iterations of mapping: first orientations, light and map separately, then poses and map together."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -33,26 +33,26 @@ from sphereorient.sphere.texture_table import SIDE, texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
-TEXEL_PX = 0.75  # of the widest disk's middle
-ROW, FINEST_ROWS = 32, 512  # the fitted map has a multiple of the one as rows, and at most the other
-SEPARATE_ITERATIONS = 2  # each instant by itself: a joint step would trust the map, which is still blurred
-LIGHT_ITERATIONS = 8  # in which light, noise and blur are estimated anew
+TEXEL_PX = 0.75  # at the centre of the widest disk
+ROW, FINEST_ROWS = 32, 512  # the number of rows of the fitted map is a multiple of the first, at most the second
+SEPARATE_ITERATIONS = 2  # with each instant alone: the map is still too blurred for joint steps
+LIGHT_ITERATIONS = 8  # that estimate light, noise and blur
 SMOOTHEST = 0.2  # weight of the map's squared slope over that of a typical texel, in the first iteration: orientations
 # must not follow the map's noise
-LAB_ITERATIONS, LAB_FRAMES = 3, 32  # in which one light in the lab is estimated, and its instants
+LAB_ITERATIONS, LAB_FRAMES = 3, 32  # that estimate one light in the lab, and its instants
 # Share of the paint's expected smoothness while poses are sought: a smoother map shifts the position of a ball in one
 # place (0.041 degrees with all of it, 0.016 with this), a rougher one lets poses follow noise.
 LOOSE = 0.1
 BLUR_FRAMES = 32  # instants from which the blur is estimated, evenly spread
-BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
+BLUR_RATIO = 1.25  # between neighbouring trial blurs
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
-BATCH = 24  # instants at once
+BATCH = 24  # instants per batch
 LONGEST_RAD = 0.05  # joint step
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
-BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
-NOISE_EVERY = 4  # pixels from which the noise is estimated
+BEYOND = 0.2  # largest excess of the map over 0 .. 1 during iterations
+NOISE_EVERY = 4  # each n-th pixel, for the noise
 HELD = 1e12  # 1/mm^2, precision of a position that must not move
-OUTLIER2 = 25.0  # squared residuals over the noise expected are cut off here
+OUTLIER2 = 25.0  # largest squared residual over the expected noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +60,7 @@ class Iteration:
     """One iteration of orientations, light and map."""
 
     moved_rad: float  # rms move of the orientations
-    misfit: float  # chi^2 per pixel, before the map is solved anew
+    misfit: float  # chi^2 per pixel, before the new map
     blur_px: float
 
 
@@ -75,10 +75,10 @@ class State:
     R_lab_body: Tensor  # (n, 3, 3)
     texture: Tensor  # (H, 2 H) float32, spline coefficients of the map as the pictures blur it
     blur_px: float
-    fitter: Fitter  # of views and light; its own map is not used
+    fitter: Fitter  # for views and light; its own map is not used
     fixed: bool  # whether all instants share one position
     weight: Tensor | None = None  # (H, 2 H) float64, of the texels in the map's last solution, see `map_weight`
-    expected: Tensor | None = None  # (H, 2 H), paint without blur from which the map differs as little as it can
+    expected: Tensor | None = None  # (H, 2 H), paint without blur; the map's difference from it is penalised
 
     @property
     def blur_rad(self) -> float:
@@ -147,7 +147,7 @@ def first_state(
 ) -> State:
     """Return the initial state from orientations (n, 3, 3) of frames (n,) and a map; `extra_px`: added blur."""
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
-    table = optics_of(texture, crops.views, blur_px, grid.ROUGH_SIDE).fine.paint  # for its blur alone: see `State`
+    table = optics_of(texture, crops.views, blur_px, grid.ROUGH_SIDE).fine.paint  # only for its blur, see `State`
     fitter = first_fitter(crops.views, crops.radius_mm, table, blur_px)
     pixels, use = pixels_of(crops, fitter, frames, settings.pixels, extra_px), crops.seen[frames]
     X = crops.position_lab_mm[frames]
@@ -224,12 +224,12 @@ def _with_light(state: State) -> State:
 
 
 def _lit_in_the_lab(state: State) -> State:
-    """Return the state with one light in the lab for all cameras, unless that explains held-out instants less."""
+    """Return the state with one light in the lab for all cameras, unless it explains held-out instants less."""
     some, fitter = state.where(evenly_spread(torch.arange(len(state.use)), LAB_FRAMES)), state.map_fitter()
     fit = fitter.fit(some.pixels, some.start(), fitter.optics.fine, 1)
     if fitter.light.linear:
         lit = lit_in_the_lab(fitter, some.pixels, fit, some.use)[0]
-    else:  # known to be better
+    else:  # already tested
         lit = fitter.with_light_of(some.pixels, fit, some.use)
     return replace(state, fitter=replace(state.fitter, light=lit.light))
 
@@ -241,13 +241,13 @@ def _rescaled(state: State) -> State:
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
     light = state.fitter.light
-    if light.known:  # the light takes over the factor, so no picture changes
+    if light.known:  # the light takes the factor, so pictures do not change
         light = replace(light, difference=light.difference * step, black=light.black + light.difference * low)
     return replace(state, texture=(state.texture - low) / step, fitter=replace(state.fitter, light=light))
 
 
 def _better_blur(state: State) -> float:
-    """Return the blur, px, near the present one with which limb and slanted texture fit best."""
+    """Return the blur, px, near the present one, that fits limb and slanted texture best."""
     some = state.where(evenly_spread(torch.arange(len(state.use)), BLUR_FRAMES))
     expected = some.linearised_at()
     tried = (replace(some, blur_px=some.blur_px * BLUR_RATIO**k).linearised_at() for k in (-1, 0, 1))
@@ -257,14 +257,14 @@ def _better_blur(state: State) -> float:
 
 
 def lowest(before: float, here: float, after: float) -> float:
-    """Return where a parabola through values at -1, 0 and 1 is lowest, within these."""
+    """Return the minimum of a parabola through values at -1, 0 and 1, within these."""
     bend = before - 2 * here + after
     shift = 0.5 * (before - after) / bend if bend > 0 else (1.0 if after < before else -1.0)
     return min(max(shift, -1.0), 1.0)
 
 
 def _with_joint_step(state: State, smoothest: float) -> State:
-    """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
+    """Move all poses by one joint step; `with_map` then solves for the map exactly."""
     height = len(state.texture)
     parts = list(side_by_side(lambda some: linear_system(some.linearised_at(), height), state.batches()))
     weight = sum((grid.texel_sums(part.by_texel) for part in parts), np.zeros(2 * height * height))
@@ -276,13 +276,13 @@ def _with_joint_step(state: State, smoothest: float) -> State:
 
 
 def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
-    """Return the state with its best map, and chi2 per pixel before; `smoothest`: least tie over a typical texel's."""
+    """Return the state with its best map, and chi2 per pixel before; `smoothest`: least tie over a typical weight."""
     normal, right, chi2 = _map_equations(state)
     tie = max(smoothest * _typical(normal.diagonal()), state.tie)
-    # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
+    # Penalise the whole map, not the correction only: else noise grows with the iterations.
     right -= tie * (grid.stiffness(len(state.texture)) @ _unexpected(state).double().numpy().ravel())
     height = len(state.texture)
-    # Of conjugate gradients: what they leave, the next iteration finds.
+    # The next iteration corrects what conjugate gradients leave.
     texture = state.texture + grid.solve_map(normal, right, height, tie, 10).float()
     weight = torch.from_numpy(normal.diagonal().reshape(height, -1))
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND), weight=weight), chi2
@@ -301,7 +301,7 @@ def sharp_map(state: State) -> Tensor:
 
 
 def _unexpected(state: State) -> Tensor:
-    """Return the map less the expected one, of the same blur and levels; all of it where nothing is expected."""
+    """Return the map minus the expected one, of the same blur and levels; the map if none is expected."""
     if state.expected is None:
         return state.texture
     filmed, (gain, offset) = _as_filmed(state, state.expected)
@@ -309,7 +309,7 @@ def _unexpected(state: State) -> Tensor:
 
 
 def _as_filmed(state: State, paint: Tensor) -> tuple[Tensor, tuple[float, float]]:
-    """Return the coefficients of paint (H, 2 H) as the pictures blur it, and gain and offset to the state's map."""
+    """Return the coefficients of paint (H, 2 H) with the pictures' blur, and gain and offset to the state's map."""
     height = len(paint)
     table = texture_table(paint, grid.coefficients_blur_rad(state.blur_rad, height))
     filmed = table.sample(map_directions(height).reshape(-1, 3).float().T[None])[0].reshape(paint.shape)

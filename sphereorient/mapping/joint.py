@@ -1,4 +1,4 @@
-"""Linearise pictures about map and poses, and solve for one joint Gauss-Newton step of all."""
+"""Linearise pictures about map and poses, and solve for a joint Gauss-Newton step."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,12 +14,12 @@ from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, grey_by_pose, residuals
 
-DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
+DEPTH_MIN = 0.2  # least cosine of the slant of a pixel used for the map
 POSE = 6  # unknowns of a pose
-DAMPING = 1e-5  # of the diagonal: the body frame is free, the step along it zero
-RIDGE = 1e-7  # of the light's normal equations: rounding must not make them singular
-LONGEST_SHARE = 0.1  # typical length of a turn, rad, and of a move, radii
-STEPS = 12  # of conjugate gradients: each iteration linearises anew, and more of them fit the noise
+DAMPING = 1e-5  # of the diagonal, as the body frame is free
+RIDGE = 1e-7  # of the light's normal equations, against singularity by rounding
+LONGEST_SHARE = 0.1  # typical size of a rotation, rad, and of a motion, radii
+STEPS = 12  # of conjugate gradients; more would fit the noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,7 +27,7 @@ class Linearisation(Residuals):
     """L disks of P pixels, each linearised about one pose and the map."""
 
     reads: list[tuple[Tensor, Tensor]]  # of the inner and the outer pixels: texels and weights, (L, n * P', 16) each
-    inner: int  # number of first pixels that `reads[0]` is of
+    inner: int  # number of first pixels, those of `reads[0]`
 
     @cached_property
     def depth(self) -> Tensor:
@@ -58,7 +58,7 @@ class Linearisation(Residuals):
         entries = torch.cat([part.flatten(1) for part in values], dim=1).reshape(-1).float()
         shape = (count.numel(), 2 * height * height)
         found = csr_matrix((entries.numpy(), columns.numpy(), start), shape=shape)
-        found.sum_duplicates()  # look-ups of a pixel lie close together: a third of the texels are read twice
+        found.sum_duplicates()  # a third of a pixel's texels are read twice
         return found
 
 
@@ -66,7 +66,7 @@ def linearise(
     fitter: Fitter, paint: SplineTable, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
 ) -> Linearisation:
     """Linearise B * C disks, adjacent cameras, about a new table of a map of their blur and poses (B, 3) mm, (B, 3, 3).
-    The light of each frame is at its best; the fitter gives views and light, not the map.
+    The light of each frame is optimal; the fitter gives views and light, not the map.
     """
     model = replace(fitter.model(), paint=paint, blur_px=blur_px)
     at = residuals(pixels, position_lab_mm, R_lab_body, None, model)
@@ -86,12 +86,12 @@ class LinearSystem:
 def linear_system(at: Linearisation, height: int) -> LinearSystem:
     """Return the linear system of a linearisation; `height` is the map's H."""
     root = at.precision.sqrt()
-    # Orthonormal rows: the frame's own light is projected out along them.
+    # Orthonormal rows, to project out the frame's own light.
     rows = (at.design[:, POSE:] * root[:, None]).double()
     rows = rows / rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
     gram = rows @ rows.mT + RIDGE * torch.eye(rows.shape[1], dtype=rows.dtype)
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
-    # Near the limb the map is not learnt; it must not move the pose there.
+    # Near the limb the map is not learnt, and must not affect the pose.
     by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over) * root[:, None]
     return LinearSystem(by_texel=at.by_texel(height), by_pose=by_pose, by_light=basis, residual=at.residual * root)
 
@@ -149,7 +149,7 @@ def joint_step(
 
 
 def _shared(pose: Tensor, fixed: bool) -> Tensor:
-    """Sum over instants what they share: (N, 6), or (3 N + 3,) with one position for all."""
+    """Sum common unknowns over instants: (N, 6), or (3 N + 3,) with one position for all."""
     return torch.cat([pose[:, :3].reshape(-1), pose[:, 3:].sum(0)]) if fixed else pose
 
 

@@ -1,4 +1,4 @@
-"""The texture map, orientations and light from movies or photographs: start without a map, iterate, finish."""
+"""Texture map, orientations and light from movies or photographs: start without a map, iterate, finish."""
 
 import math
 from collections.abc import Sequence
@@ -33,19 +33,19 @@ from sphereorient.sphere.view import perspective_view
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
 SHOWN_MIN = 0.4
-FINER = 2  # rows of the sharpened map over those of the fitted one
-RECOVERY_AFTER = (3, 6)  # iterations after which instants that do not fit are searched again
-GOOD_SHARE = 0.85  # of the median score, from which on an instant fits
-POSITION_ITERATIONS = 4  # that find the position of a ball that stays in its place
-FEW_PIXELS = 250_000  # of photographs together
-PIXELS_A_TEXEL = 3.0  # of few photographs: pixels that determine a texel
+FINER = 2  # ratio of rows, sharpened over fitted map
+RECOVERY_AFTER = (3, 6)  # iterations after which ill-fitting instants are searched again
+GOOD_SHARE = 0.85  # of the median score; above, an instant fits
+POSITION_ITERATIONS = 4  # for the position of a fixed ball
+FEW_PIXELS = 250_000  # of all photographs
+PIXELS_A_TEXEL = 3.0  # pixels per texel, for few photographs
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
-HELD_EVERY = 5  # instants; the map of the others is compared with this one
-SEEN_MIN = 0.99  # share of a pixel on texels that other pictures show, below which it is not compared
-JUMP_RAD, JUMPS = math.radians(3.0), 10.0  # rotations so far off their neighbours', and so many times the usual
-WINDOW = 5  # rotations whose median is usual
+HELD_EVERY = 5  # each n-th instant is compared with the map of the others
+SEEN_MIN = 0.99  # least share of a compared pixel on texels that other pictures show
+JUMP_RAD, JUMPS = math.radians(3.0), 10.0  # least difference from neighbouring rotations, and over the usual one
+WINDOW = 5  # rotations of the median
 SCHEMA = "sphereorient-unfinished-map/1"  # of the file of an unfinished map
 STATE_PARTS = ("position_lab_mm", "R_lab_body", "texture")  # kept
 
@@ -53,7 +53,7 @@ STATE_PARTS = ("position_lab_mm", "R_lab_body", "texture")  # kept
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LearntMap:
     """A texture map learnt from movies or photographs; the body frame is the lab at the first known orientation.
-    Through a mirror it is mirrored, which one camera or parallel ones cannot detect: set `flip:` in the experiment.
+    A movie through a mirror gives a mirrored map, which one camera or parallel ones cannot detect: set `flip:`.
     """
 
     texture: Tensor  # (H, 2 H) float32, 0 black .. 1 white; NaN where never seen
@@ -65,8 +65,8 @@ class LearntMap:
     fitted: Tensor  # (N,) bool, frames that the map was fitted to; the others follow them
     score: Tensor  # (N, C), share of each picture's variance that the map explains; NaN where not fitted
     paint: Tensor  # (N, C), correlation with the paint in pictures held out of the map for it; NaN elsewhere
-    jumps: Tensor  # (J,) int64, frames from which the ball turns unlike before and after
-    views: Sequence[CameraView]  # with the scenes without the ball
+    jumps: Tensor  # (J,) int64, frames with a rotation unlike those before and after
+    views: Sequence[CameraView]  # with backgrounds
     light: Light
     blur_px: float  # estimated with the map
     closure: Closure
@@ -84,8 +84,8 @@ def fit_map(
     crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None, old: Tensor | None = None
 ) -> LearntMap:
     """Learn the texture map, all orientations and the light from the crops of opened movies.
-    `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
-    `old`: a map (h, 2 h) of the ball as it was, which noise does not change; the body frame is not that of it.
+    `kept`: file of the state after each iteration, from which an interrupted run continues to the same result.
+    `old`: an earlier map (h, 2 h) of the ball, to which noise ties the new one; its body frame is not used.
     Raises PaintError (too few frames, no rotation, no common patch, or different spheres), OutputError (for `kept`).
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
@@ -101,7 +101,7 @@ def fit_map(
     while len(done) < settings.rounds and not (len(done) > least and done[-1].moved_rad < arrived_rad):
         if kept is not None:
             write_kept(kept, _parts(start, state, done))
-        progress("map", len(done), 0)  # it may end at any: no time left can be said
+        progress("map", len(done), 0)  # it may end at any, so without a time left
         state, iteration = iterations.iterate(state, settings, len(done))
         if len(done) in RECOVERY_AFTER:
             state = recovered(start.crops, state, chain)
@@ -122,15 +122,15 @@ def fit_map(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    crops: Crops  # with the estimated position of a ball that stays in its place
-    frames: Tensor  # (M,) int64, of the crops, that have an orientation
-    rows: Tensor  # (n,) int64, of those, that the map is fitted to
+    crops: Crops  # with the estimated position of a fixed ball
+    frames: Tensor  # (M,) int64, crops with an orientation
+    rows: Tensor  # (n,) int64, those of them used for the map
     chain: PairwiseAttitudes  # of the M frames
     state: State  # of the n
 
 
 def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
-    """Return what `_resumed` needs beside the crops."""
+    """Return the input of `_resumed` except the crops."""
     chain, light = start.chain, state.fitter.light
     closure, rounds = astuple(chain.closure), [astuple(one) for one in done]
     numbers = {"closure": closure, "blur_px": state.blur_px, "done": rounds}
@@ -162,7 +162,7 @@ def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -
     start = _from_chain(crops, settings, progress)
     if not crops.fixed:
         return start
-    # The outline of the changes is 1 to 2 px off, as are the rotations: correct the position, restart the chain.
+    # The outline of changes errs by 1 to 2 px, and so do rotations: correct the position, restart the chain.
     state = start.state
     for k in counted("place", range(POSITION_ITERATIONS), POSITION_ITERATIONS, progress):
         state, _ = iterations.iterate(state, settings, k)
@@ -229,7 +229,7 @@ def _finished(
 ) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
-    state, fit = iterations.fitted(state, 2, crops)  # of each pose by itself with the final map
+    state, fit = iterations.fitted(state, 2, crops)  # each pose alone, by the final map
     state = replace(state, R_lab_body=so3.nearest_rotation(state.R_lab_body))
     all_R = interpolated(chain.R_lab_body, rows, state.R_lab_body)
     Q = all_R[0].clone()  # R_new = R Q^T, and new directions are Q times the old
@@ -241,7 +241,7 @@ def _finished(
 
     attitudes = spread(so3.nearest_rotation(all_R @ Q.mT), frames)
     used, numbers = frames[rows], torch.arange(len(crops))
-    found = crops.frames_with_ball()  # photographs without an orientation have a position all the same
+    found = crops.frames_with_ball()  # photographs without an orientation also have a position
     return LearntMap(
         texture=texture,
         seen=seen,
@@ -276,7 +276,7 @@ def interpolated(chain: Tensor, rows: Tensor, known: Tensor) -> Tensor:
 
 
 def recovered(crops: Crops, state: State, chain: Tensor) -> State:
-    """Restart instants that do not fit from the chain (n, 3, 3), corrected like their neighbours."""
+    """Restart ill-fitting instants from the chain (n, 3, 3), corrected like their neighbours."""
     score = _scores(iterations.fitted(state, 1)[1], state.use)
     good = score >= GOOD_SHARE * score.nanmedian()
     if good.all() or not good.any():
@@ -300,7 +300,7 @@ def _scores(fit: FittedPoses, use: Tensor) -> Tensor:
 def final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sharpen the map and rotate it by Q: texture, counts and sigma, (H, 2 H) each."""
     height = FINER * len(state.texture)
-    direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
+    direction = map_directions(height) @ Q  # Q^T d: direction of the new texel in the fitted map
     texture = look_up(iterations.sharp_map(state), direction).clamp(0, 1)
     weight = look_up(iterations.map_weight(state), direction)
     seen = times_seen(state, direction)
@@ -311,7 +311,7 @@ def final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tensor:
     """Return correlations (n, C) of pictures with a map to which they were not fitted; NaN where not compared.
-    Both are normalised as for pairs of pictures, so that shading counts for nothing.
+    Both are normalised as for pairs of pictures, to remove shading.
     """
     rows = torch.arange(HELD_EVERY // 2, len(state.use), HELD_EVERY)
     found = torch.full(state.use.shape, torch.nan, dtype=torch.float64)
@@ -319,7 +319,7 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
         return found
     others, _ = iterations.with_map(replace(state, use=state.use.index_fill(0, rows, False)))
     known = (iterations.map_weight(others) > 0).float()
-    one, _ = iterations.fitted(replace(others, use=state.use).where(rows), 2, crops)  # of the held poses with that map
+    one, _ = iterations.fitted(replace(others, use=state.use).where(rows), 2, crops)  # poses held out, by that map
     X = crops.position_lab_mm.index_put((one.frames,), one.position_lab_mm)
     filmed = disks_of(replace(crops, position_lab_mm=X), one.frames, settings)
     for c in range(found.shape[1]):
@@ -335,8 +335,8 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
 
 
 def jumps(R_lab_body: Tensor) -> Tensor:
-    """Return the frames (J,) from which a ball with orientations (N, 3, 3) turns unlike before and after; NaN: unknown.
-    A rotation is compared with the median of its neighbours': a lasting change of the rate is none.
+    """Return the frames (J,) with a rotation unlike those before and after, from orientations (N, 3, 3); NaN: unknown.
+    A rotation is compared with the median of its neighbours'; a lasting change of rate is no jump.
     """
     turn = so3.log((R_lab_body[1:] @ R_lab_body[:-1].mT).nan_to_num())
     turn = torch.where(R_lab_body.isfinite().flatten(1).all(1).unfold(0, 2, 1).all(1)[:, None], turn, torch.nan)
@@ -369,7 +369,7 @@ def times_seen(state: State, direction_body: Tensor) -> Tensor:
 
 
 def write_kept(path: Path, parts: dict[str, Tensor]) -> None:
-    """Write tensors by name, over a damaged file too: it lies in the run's own folder; may raise OutputError."""
+    """Write tensors by name, also over a damaged file, as the folder is the run's own; may raise OutputError."""
     with writing(force=True), whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA
         for name, part in parts.items():
@@ -377,7 +377,7 @@ def write_kept(path: Path, parts: dict[str, Tensor]) -> None:
 
 
 def read_kept(path: Path) -> dict[str, Tensor] | None:
-    """Return what `write_kept` wrote; None without a file, or if it is damaged: the run starts over."""
+    """Return the tensors of `write_kept`; None if the file is missing or damaged: the run restarts."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA:

@@ -1,4 +1,4 @@
-"""The paint of a ball in cells of directions, as pictures show it: a map that grows with every picture."""
+"""A map that grows with every picture: the paint of a ball in cells of directions."""
 
 import ctypes
 import math
@@ -16,19 +16,19 @@ from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, oc
 
 SOURCE = Path(__file__).with_suffix("")
 Growing = record(SOURCE, "Growing")
-LEAST_COSINE = 0.25  # of the slant at which a picture shows paint
-LEAST_WEIGHT = 0.05  # squared cosines: a cell with less is unseen
-ASIDE = 1.3  # cells from one to those beside it, by which its slope is measured
-SAMPLES = 9  # along each axis of a disk, from which a view's polynomial is found
+LEAST_COSINE = 0.25  # of the slant at which a picture counts
+LEAST_WEIGHT = 0.05  # sum of squared cosines; with less a cell is unseen
+ASIDE = 1.3  # cells to the neighbours that give the slope
+SAMPLES = 9  # along each axis of a disk, for a view's polynomial
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BallView:
-    """Where a camera's picture shows a ball at one place: the polynomial from lines of sight to pixels."""
+    """A camera's view of a ball at one position: a polynomial from lines of sight to pixels."""
 
     R_view_lab: Tensor  # (3, 3) float64; view: right, down, towards the camera
     distance_radii: float  # of the camera
-    place_px: Tensor  # (2, 10) float64, by the slopes of a line of sight times the distance
+    place_px: Tensor  # (2, 10) float64, in the slopes of a line of sight times the distance
 
     @classmethod
     def of(cls, camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> "BallView":
@@ -65,8 +65,8 @@ def _cells(side: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class PaintCells:
-    """The mean grey that pictures show in cells of directions, and its table for fits. `side` counts cells per axis;
-    `blur_rad` is the blur of the pictures, which the table has as well.
+    """Mean grey of pictures in cells of directions, and its table for fits. `side`: cells per axis; `blur_rad`: blur of
+    the pictures and of the table.
     """
 
     def __init__(self, side: int, blur_rad: float) -> None:
@@ -77,7 +77,7 @@ class PaintCells:
         self.table = TextureTable(torch.zeros(side * side, 4), blur_rad, self._unseen)
 
     def add(self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor) -> None:
-        """Add a picture's part (H, W) float32 whose first pixel is `corner`: left, top; `counts` (H, W) bool."""
+        """Add a part (H, W) float32 of a picture; `corner`: left, top of its first pixel; `counts` (H, W) bool."""
         turn, place = _seen_from(view, corner, R_lab_body)
         if (code := compiled(SOURCE, Growing)) is None:
             grown, cosine, _ = self._see(view, grey, counts, place, turn)
@@ -93,8 +93,8 @@ class PaintCells:
     def see(
         self, view: BallView, grey: Tensor, counts: Tensor, corner: tuple[int, int], R_lab_body: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what a picture's part shows of all cells: grey, the slant's cosine, 0 where it shows nothing, and the
-        number of the pixel; arguments as of `add`.
+        """Return grey, cosine of the slant (0: not visible) and pixel number of all cells in a part of a picture;
+        arguments as of `add`.
         """
         turn, place = _seen_from(view, corner, R_lab_body)
         if (code := compiled(SOURCE, Growing)) is None:
@@ -106,7 +106,7 @@ class PaintCells:
         return here, cosine, pixel
 
     def set(self, mean: Tensor, weight: Tensor) -> None:
-        """Replace what pictures showed: mean grey and weight of each cell."""
+        """Replace mean grey and weight of each cell."""
         self.mean, self.weight = mean.clone(), weight.clone()
         self._unseen.rows[:, 0] = 1.0
         self._write(weight >= LEAST_WEIGHT)
@@ -123,7 +123,7 @@ class PaintCells:
         return grey, unseen > 0.5
 
     def _write(self, changed: Tensor) -> None:
-        """Write the tables anew in some cells (cells,) bool."""
+        """Update the tables in some cells (cells,) bool."""
         _, beside, slope_by = _cells(self.side)
         known = self.weight >= LEAST_WEIGHT
         differs = torch.where(known[beside], self.mean[beside] - self.mean[:, None], 0.0)
@@ -134,7 +134,7 @@ class PaintCells:
     def _see(
         self, view: BallView, grey: Tensor, counts: Tensor, place_px: Tensor, turn: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Do what the compiled code does."""
+        """Reference of the compiled code."""
         D, (height, width) = view.distance_radii, grey.shape
         x, y, z = turn @ _cells(self.side)[0]
         cosine = (D * z - 1) / (D * D + 1 - 2 * D * z).sqrt()

@@ -16,12 +16,12 @@ from sphereorient.mapping.disks import Disks, disk_places
 from sphereorient.so3 import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement
-RIDGE = 1e-3  # of the trace: a pair without slopes does not turn
+RIDGE = 1e-3  # of the trace, for pairs without slopes
 BATCH = 64  # pairs compared at once
-LOOKS = 1 << 21  # look-ups at once, at most, in a search
-SCALE = 0.7  # residual, in deviations of a normalised picture, that counts half
-OVERLAP_MIN = 0.2  # share of a disk visible in both pictures, below which a correlation is half believed
-ARRIVED_RAD = 1e-6  # largest step of the graph that ends it
+LOOKS = 1 << 21  # most look-ups at once in a search
+SCALE = 0.7  # residual of half weight, in deviations of a normalised picture
+OVERLAP_MIN = 0.2  # share of a disk visible in both pictures at which a correlation has half weight
+ARRIVED_RAD = 1e-6  # largest last step of the graph
 Sampled = tuple[Tensor, Tensor, Tensor]
 
 
@@ -33,7 +33,7 @@ class RelativeRotations:
     second: Tensor  # (E,) int64, j
     R_ji: Tensor  # (E, 3, 3) float64: R_lab_body(j) R_lab_body(i)^T
     information: Tensor  # (E, 3, 3) float64, 1/rad^2, of delta in exp([delta]x) R_ji
-    score: Tensor  # (E,), correlation of what both show, -1 .. 1
+    score: Tensor  # (E,), correlation of common parts, -1 .. 1
     overlap: Tensor  # (E,), in disks
 
     def __len__(self) -> int:
@@ -62,7 +62,7 @@ class Closure:
     closed: int  # accepted and kept by the graph
     drift_before_rad: float  # rms error of the closed loops in the chain
     drift_after_rad: float  # and afterwards
-    moved_rad: float  # rms move of the orientations, the body frame's own turn removed
+    moved_rad: float  # rms change of the orientations, without a common rotation of the body frame
 
     @classmethod
     def of(cls, closed: RelativeRotations, before: Tensor, after: Tensor, *, pairs: int, loops: int) -> "Closure":
@@ -186,7 +186,7 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
             tried = some @ R
             views = _first_views(disks, i.expand(len(tried)), every)
             _, _, score, overlap = _normal_equations(disks, j.expand(len(tried)), tried, views, slopes=False)
-            # A correlation over a small overlap proves little.
+            # A correlation over a small overlap is weak evidence.
             scores.append(score * (overlap / (overlap + OVERLAP_MIN)))
         return grid[int(torch.cat(scores).argmax())] @ R
 
@@ -243,7 +243,7 @@ def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: T
     pulled = (weight @ residual[..., None])[..., 0]
     right = torch.zeros(count, 3, dtype=R.dtype).index_add(0, j, pulled)
     right = right.index_add(0, i, -(carry.mT @ pulled[..., None])[..., 0])
-    # The first orientation is fixed; unconnected ones stay.
+    # The first orientation is fixed; unconnected ones do not change.
     diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
     diagonal[:3] = 1e9
     every = torch.arange(3 * count)

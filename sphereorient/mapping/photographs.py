@@ -26,24 +26,24 @@ from sphereorient.mapping.pairs import Closure, RelativeRotations, refine_pairs,
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.search.candidates import distinct
 
-TILT_DEG = 75.0  # between lines of sight in the body, beyond which two disks share too little
-MODES, PEAKS = 96, 3  # best rotations of a pair, and distinct ones among them that are refined
-PEAK_DEG = 18.0  # between distinct ones
-FINER = 2.7  # detail, window and pixels of the disks in the last comparison, where the pictures have it
+TILT_DEG = 75.0  # between lines of sight in the body; beyond, two disks share too little
+MODES, PEAKS = 96, 3  # best rotations of a pair, and distinct ones to refine
+PEAK_DEG = 18.0  # least angle between distinct ones
+FINER = 2.7  # finer detail, window and pixels of the disks in the last comparison, if resolved
 DISK_PX_MAX = 128  # side of these disks, px: bounds time and memory
-CHANCE_PAIRS = 500  # pairs at random rotations, which show how well different patches correlate
+CHANCE_PAIRS = 500  # pairs at random rotations, for the correlation of different patches
 CHI2_MEDIAN = 0.4549  # of the square of a normal number
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
 LIKE_MAX = 0.98  # largest correlation that counts
 # Log-odds above which two sets are joined; the best wrong of 5 million rotations of 30 pictures has about 20.
 SURE = 25.0
-REACH_RAD = math.radians(10.0)  # by which a pair may differ from the orientations of the others
-SCALE_RAD = math.radians(2.0)  # scatter of pairs that share only slanted places, by errors of the outlines
-OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second set so large is another ball
+REACH_RAD = math.radians(10.0)  # largest difference of a pair from the orientations of the others
+SCALE_RAD = math.radians(2.0)  # scatter of pairs with only slanted places in common, by errors of the outlines
+OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: such a second set is another ball
 
 
 def finer_settings(settings: MapSettings, diameter_px: float) -> MapSettings:
-    """Return settings of finer disks, up to the pictures' resolution: coarse ones are 2 degrees off at slants."""
+    """Return settings of finer disks, up to the pictures' resolution: coarse ones err by 2 degrees at slants."""
     factor = min(max(diameter_px / settings.disk_px, 1.0), FINER, DISK_PX_MAX / settings.disk_px)
     finer = {"detail": settings.detail / factor, "window": settings.window / factor}
     return settings.model_copy(update={"disk_px": 2 * round(factor * settings.disk_px / 2), **finer})
@@ -51,10 +51,10 @@ def finer_settings(settings: MapSettings, diameter_px: float) -> MapSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
-    """How much likelier two disks show the same patch than different patches."""
+    """Odds of the same patch against different patches in two disks."""
 
     disks: Disks
-    cells: float  # independent places of a whole disk, from the correlation of different patches
+    cells: float  # independent places of a disk, by the correlation of different patches
     score_min: float
 
     def log_odds(self, pairs: RelativeRotations) -> Tensor:
@@ -68,18 +68,18 @@ class Evidence:
 
 
 def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
-    """Find orientations of N unordered photographs in disks, finally in `finer` ones; only the largest set gets any.
+    """Find orientations of N unordered photographs in disks, finally in `finer` ones, for the largest set only.
     Raises PaintError (fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres).
     """
     if len(disks) < FEWEST:
-        do = "take more pictures of the ball, of all its sides"
-        expected = f"{FEWEST} with the ball at least"
+        do = "take more pictures of the ball, from all sides"
+        expected = f"at least {FEWEST} with the ball"
         raise PaintError(refusal("photographs", expected=expected, got=f"{len(disks)}", do=do))
     rough = measured_evidence(disks, settings)
     label, joined_R = joined_sets(rough, all_pairs(disks))
     rows, R, pairs = _settled(rough, _largest(label), joined_R)
     fine = measured_evidence(finer, settings)
-    for _ in range(2):  # comparisons in fine detail, each from the orientations of all together
+    for _ in range(2):  # compare in fine detail, each time from the joint orientations
         rows, R, pairs = _settled(fine, rows, R)
     before, after = (so3.nearest_rotation(attitudes[rows] @ attitudes[rows[0]].mT) for attitudes in (joined_R, R))
     place = torch.full((len(R),), -1).index_put((rows,), torch.arange(len(rows)))
@@ -110,7 +110,7 @@ def all_pairs(disks: Disks) -> RelativeRotations:
 
 
 def _starts(small: Disks, grid: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield pairs (first, second) and their best rotations R_ji (E, 3, 3), disk after disk."""
+    """Yield pairs (first, second) and their best rotations R_ji (E, 3, 3), disk by disk."""
     cameras = range(small.layers.shape[1])
     R_lab_view = small.R_lab_view.double()
     for second in range(len(small)):
@@ -133,14 +133,14 @@ def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, T
     order = odds.argsort(descending=True, stable=True)
     order = order[odds[order] > 0]
     pairs, before = found.where(order[:0]), label + 1
-    while not torch.equal(label, before):  # larger sets may join what smaller ones could not
+    while not torch.equal(label, before):  # larger sets may join where smaller ones could not
         before = label
         for i, j, R_ji in zip(found.first[order], found.second[order], found.R_ji[order], strict=True):
             if label[i] == label[j]:
                 continue
             one, other = label == label[i], label == label[j]
             placed = torch.where(other[:, None, None], R @ (R[j].mT @ R_ji @ R[i]), R)
-            # Of the refinement of a pair between two sets.
+            # Starts of the refinement of pairs between two sets.
             between, gained = _compared_at(evidence, placed, one[:, None] & other, 4)
             if float(gained.sum()) > SURE:
                 pairs = RelativeRotations.joined([pairs, between.where(gained > 0)])
@@ -190,11 +190,11 @@ def _largest(label: Tensor) -> Tensor:
     size, order = label.bincount().sort(descending=True, stable=True)
     if int(size[0]) < FEWEST:
         got = f"{int(size[0]) if int(size[0]) > 1 else 'none'} among {len(label)}"
-        do = "take pictures of the same side, from 45 degrees apart at most"
-        raise PaintError(refusal("photographs", expected=f"{FEWEST} that share a patch", got=got, do=do))
+        do = "take pictures of the same side, at most 45 degrees apart"
+        raise PaintError(refusal("photographs", expected=f"{FEWEST} with a common patch", got=got, do=do))
     second = int(size[1]) if len(size) > 1 else 0
     if second >= max(OTHER_LEAST, OTHER_SHARE * int(size[0])):
-        got = f"{int(size[0])} pictures and {second} others that share no patch with them"
-        do = "check that all are of one ball, or take pictures of the sides between"
+        got = f"{int(size[0])} pictures and {second} others without a common patch"
+        do = "check that all show one ball, or take pictures of the sides between"
         raise PaintError(refusal("photographs", expected="one ball", got=got, do=do))
     return torch.nonzero(label == order[0])[:, 0]

@@ -9,11 +9,11 @@ class MapSettings(BaseModel, frozen=True, extra="forbid"):
     disk_px: int = Field(48, ge=24, le=128, description="side of the disks that are compared without a map, px; even")
     detail: float = Field(0.06, gt=0, lt=0.5, description="finer detail is blurred in these disks, radii")
     window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken as uniform, radii")
-    turn_max_deg: float = Field(30.0, gt=0, le=180, description="largest turn between neighbours; raise for fast spins")
+    turn_max_deg: float = Field(30.0, gt=0, le=180, description="rotation between neighbours, at most; more for spin")
     baselines: tuple[int, ...] = Field((1, 2, 4, 8, 16), description="frames between the members of compared pairs")
     keyframe_deg: float = Field(12.0, gt=0, description="rotation from one keyframe of the loops to the next")
     loop_reach_deg: float = Field(24.0, gt=0, le=180, description="largest drift of loops; 180: all rotations, slowly")
-    loop_pairs: int = Field(1500, ge=0, description="pairs of keyframes that are tried for loops, at most")
+    loop_pairs: int = Field(1500, ge=0, description="most pairs of keyframes that are tried for loops")
     score_min: float = Field(0.7, gt=0, lt=1, description="correlation above which two pictures show the same patch")
     frames_max: int = Field(400, ge=2, description="most frames, evenly spread, to fit the map to; the others follow")
     height: int | None = Field(None, ge=32, le=512, description="rows of the map; null: texels as large as pixels")
@@ -21,6 +21,6 @@ class MapSettings(BaseModel, frozen=True, extra="forbid"):
     blur_px: float | None = Field(
         None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null estimates it"
     )
-    rounds: int = Field(40, ge=1, description="iterations of attitudes, light and map, at most")
-    arrived_deg: float = Field(0.01, gt=0, description="stop when an iteration moves attitudes by less, degrees rms")
-    turned_min_deg: float = Field(8.0, gt=0, description="refuse a movie in which the sphere turns by less")
+    rounds: int = Field(40, ge=1, description="most iterations of orientations, light and map")
+    arrived_deg: float = Field(0.01, gt=0, description="stop when an iteration moves orientations by less, degrees rms")
+    turned_min_deg: float = Field(8.0, gt=0, description="refuse a movie in which the sphere rotates by less")

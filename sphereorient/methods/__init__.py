@@ -1,1 +1,1 @@
-"""The methods, a page each, and their settings."""
+"""The methods, one page each, and their settings."""

@@ -1,4 +1,4 @@
-"""The method of `sphereorient map`: learn the texture maps from movies in which the spheres rotate."""
+"""The method of `sphereorient map`: learn texture maps from movies of rotating spheres."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,9 +35,9 @@ class MapResult:
     learnt: LearntMap
     track: Trajectory  # the orientations of all frames
     remarks: tuple[str, ...]  # on the inputs
-    comparison: MapComparison | None = None  # with the old map, where one was given
-    kept_share: float = 0.0  # of the sphere with the old map's texture, because it was never seen
-    paint_of: str  # name of the first ball that wears this paint
+    comparison: MapComparison | None = None  # with the old map, if given
+    kept_share: float = 0.0  # of the sphere, unseen, with the old map's texture
+    paint_of: str  # name of the first ball with this paint
 
     @property
     def texture(self) -> Tensor:
@@ -62,16 +62,16 @@ def learn_map(
 ) -> MapResult | dict[str, MapResult]:
     """Learn the texture map and the orientations of a sphere from movies or photographs, without a known map.
 
-    Of several spheres (key `spheres`) the result is a MapResult for each, by name. Nothing but size and place tells
-    them apart: names of spheres of one size are given by chance. Those that wear one paint share one map.
+    Several spheres (key `spheres`) give a MapResult each, by name. Only size and position distinguish them: spheres of
+    one size get names at random. Spheres of the same paint share a map.
 
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
-        settings: the branches `paint` and `locate` are used; None: the defaults.
-        init: an old map (H, 2 H) of one sphere, or its file: gives the body frame, and the texture never seen here.
+        settings: uses the branches `paint` and `locate`; None: the defaults.
+        init: an old map (H, 2 H) of one sphere, or its file: defines the body frame, and fills unseen paint.
         cameras: names of the cameras to use; None: all.
         progress: called with stage, steps done, and all steps.
-        kept: file of an unfinished map, from which an interrupted run goes on; for `spheres` each has one beside it.
+        kept: file of an unfinished map, from which an interrupted run continues; `spheres` have one each beside it.
         command: recorded in the track's provenance.
 
     Raises SphereOrientError: missing, unreadable or inconsistent inputs, or movies from which no map can be learnt.
@@ -98,9 +98,7 @@ def learn_map(
 def first_map_of(
     experiment: Experiment, settings: Settings, cameras: Sequence[str] | None, progress: Progress
 ) -> tuple[TextureMap, list[str]]:
-    """Return the map of a ball of which there is none, and what the pictures contradict; see `first_adjustment`, and
-    raise as that does.
-    """
+    """Return a first map of a ball, and remarks on contradictions; see `first_adjustment`, also for errors."""
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         if recording.photograph:
             got, do = "a photograph and no map", "learn the map from several with `sphereorient map --photographs`"
@@ -113,8 +111,8 @@ def first_map_of(
             ratio, height = focal_ratio(found), camera.image_size[1]
             given, seen = (field_of_focal(height, float(camera.f_px) * one) for one in (1.0, ratio))
             if ratio != 1.0:
-                wrong = f"the pictures tell a vertical field of view of about {seen:.3g} degrees, not {given:.3g}"
-                remarks.append(f"{name}: {wrong}: turns and heading are wrong by it; correct vfov_deg, and learn again")
+                wrong = f"the pictures fit a vertical field of view of about {seen:.3g} degrees, not {given:.3g}"
+                remarks.append(f"{name}: {wrong}: this biases rotations and heading; correct vfov_deg, and learn again")
         return found.texture(), remarks
 
 
@@ -128,7 +126,7 @@ def _of_ball(progress: Progress, name: str, stage: str, done: int, total: int) -
 
 def _result(recording: Recording, one: SharedMap, old: Tensor | None, settings: Settings, command: str) -> MapResult:
     opened = recording.experiment
-    untextured = opened.with_sphere(texture_path=None)  # the file that it names may be the one to be written
+    untextured = opened.with_sphere(texture_path=None)  # its file may be the one to write
     origin = provenance(input_files(untextured, list(recording.cameras)), opened.folder, command)
     learnt, comparison, kept_share = (one.learnt, None, 0.0) if old is None else corrected(one.learnt, old)
     return MapResult(

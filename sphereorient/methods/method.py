@@ -1,6 +1,6 @@
-"""The interface between `run` and a method: the job, the stages, what the method learnt and measured, with their files.
+"""The interface between `run` and a method: job, stages, learnt and measured results, with their files.
 
-From what another run learnt, a run measures the same to the last bit.
+By the learnt results of another run, a run measures the same to the last bit.
 """
 
 import json
@@ -36,9 +36,9 @@ from sphereorient.trajectory import Trajectory
 SCHEMA, SCHEMA_OF_SEVERAL = "sphereorient-learnt/3", "sphereorient-learnt/4"
 SCHEMA_OF_POSES = "sphereorient-poses/1"
 SCORES, WHETHER = ("score_min", "right_score", "usual_apart_rad"), ("together", "second_ball", "sharper")
-OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn", "map_log_odds")  # fields that `Learnt` shares with it
+OF_APPEARANCE = (*SCORES, *WHETHER, "majority", "worn", "map_log_odds")  # fields common to both
 BLURS = ("blur_px", "limb_blur_px", "still_blur_px", "still_limb_blur_px")
-# Fields that are attributes of the file, and their types; tensors are datasets.
+# Fields stored as attributes of the file, and their types; tensors are datasets.
 KINDS: dict[str, Callable[[Any], Any]] = {
     **dict.fromkeys((*SCORES, *BLURS, "most_hidden", "widest_px", "acceleration_rad_s2", "map_log_odds"), float),
     **dict.fromkeys(WHETHER, bool),
@@ -47,19 +47,19 @@ KINDS: dict[str, Callable[[Any], Any]] = {
 }
 TENSORS = ("limb_px", "worn")
 LASTING = ("covariance", "own_rad2", "alone")
-NO_ROTATION = 1e-6  # of an entry of R R^T: the least deviation from the unit matrix
+NO_ROTATION = 1e-6  # deviation of an entry of R R^T from the unit matrix, at which R is no rotation
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Learnt:
-    """Everything that the precise method learns from the movies, before and after tracking; made by the pipeline."""
+    """All that the precise method learns from the movies, before and after tracking; made by the pipeline."""
 
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
     light: Light
     lasting: Lasting
     blur_px: float  # of the paint
     limb_blur_px: float
-    still_blur_px: float  # of frames whose motion is not known
+    still_blur_px: float  # of frames of unknown motion
     still_limb_blur_px: float
     widest_px: float
     score_min: float
@@ -75,13 +75,13 @@ class Learnt:
     worn: torch.Tensor | None = None  # see `Appearance`
     map_log_odds: float | None = None  # see `Appearance`
     process: ProcessNoise | None = None  # None: no track yet, or too short a one
-    acceleration_rad_s2: float | None = None  # that the path was chosen with
+    acceleration_rad_s2: float | None = None  # used for the choice of the path
 
     @classmethod
     def of(
         cls, appearance: Appearance, process: ProcessNoise | None = None, acceleration_rad_s2: float | None = None
     ) -> "Learnt":
-        """Return what was learnt before the first frame was measured, and the motion of the finished track."""
+        """Return the appearance, and the motion of the finished track."""
         fitter = appearance.fitter
         finite = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
         return cls(
@@ -102,14 +102,14 @@ class Learnt:
         )
 
     def appearance(self, recording: Recording) -> Appearance:
-        """Return the estimated appearance; raise TrackError for other cameras or another picture size."""
+        """Return the estimated appearance. Raises TrackError: other cameras or another picture size."""
         used = {stream.name: stream.movie.frame_shape for stream in recording.streams}
         known = {name: scene.background.mean.shape for name, scene in self.scenes.items()}
         if list(used.items()) != list(known.items()):
             other = {name: shape for name, shape in used.items() if known.get(name) != shape} or used
             expected, got = (", ".join(f"{name} {shape}" for name, shape in each.items()) for each in (other, known))
-            do = "pass that of the same cameras"
-            raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
+            do = "pass a file of the same cameras"
+            raise TrackError(refusal("learnt", expected=f"learnt results of {expected}", got=got, do=do))
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
         base = finest_table(recording.texture, widest, recording.unseen)
@@ -131,7 +131,7 @@ class Learnt:
 
 
 def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:
-    """Write what was learnt of each ball, by name, as HDF5, atomically; OutputError if the file cannot be written."""
+    """Write the learnt results of each ball, by name, as HDF5, atomically; may raise OutputError."""
     with whole_hdf5(path) as file:
         _write_scenes(next(iter(learnt.values())), file)
         for name, one in learnt.items():
@@ -141,10 +141,10 @@ def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:
 
 
 def load_learnt(path: Path) -> dict[str, Learnt]:
-    """Read what `save_learnt` wrote; raise TrackError if the file is missing, damaged or of another schema."""
+    """Read a file of `save_learnt`. Raises TrackError: missing, damaged, or another schema."""
     do = "write one with `sphereorient track --save-learnt FILE`"
     if not path.is_file():
-        raise TrackError(refusal(str(path), expected="a file of what was learnt", got="no such file", do=do))
+        raise TrackError(refusal(str(path), expected="a file of learnt results", got="no such file", do=do))
     try:
         with h5py.File(path, "r") as file:
             schema = file.attrs.get("schema")
@@ -155,7 +155,7 @@ def load_learnt(path: Path) -> dict[str, Learnt]:
             scenes = _read_scenes(file)
             return {name: _read(group, scenes) for name, group in ball_groups(file).items()}
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        expected, got = "a whole file of what was learnt", error_words(error)
+        expected, got = "a whole file of learnt results", error_words(error)
         raise TrackError(refusal(str(path), expected=expected, got=got, do=do)) from error
 
 
@@ -166,31 +166,31 @@ class Job:
     recording: Recording
     settings: Settings
     device: torch.device
-    given: Mapping[str, Learnt] | None = None  # what another run learnt of each ball
+    given: Mapping[str, Learnt] | None = None  # learnt by another run, by ball
 
     def of(self, name: str) -> "Job":
-        """Return the job of one ball alone; ExperimentError for an unknown name."""
+        """Return the job of one ball. Raises ExperimentError: unknown name."""
         given = None if self.given is None else {name: self.given[name]}
         return replace(self, recording=self.recording.of(name), given=given)
 
 
-Followed = Mapping[str, list[Poses]]  # of each ball, by name: its poses in the frames of a batch
+Followed = Mapping[str, list[Poses]]  # by ball: poses in the frames of a batch
 Joined = tuple[Trajectory, Learnt | None]  # of one ball
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Method:
-    """The stages of a method, in the order of `run`; without a follower, `join` does all (paper)."""
+    """The stages of a method, in order; without a follower, `join` does all (paper)."""
 
     learn: Callable[[Job, Progress], Follower | None]
-    # Instead of learn, with what is known of each ball; None: it learns nothing.
+    # Instead of `learn`, with learnt results of each ball; None: the method learns nothing.
     resume: Callable[[Job, Mapping[str, Learnt]], Follower] | None
     join: Callable[[Job, Follower | None, Iterable[Followed], Progress], dict[str, Joined]]
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch to one thread: its tensors here are small, and idle threads that spin slow down decoding."""
+    """Limit torch to one thread: tensors here are small, and waiting threads slow down decoding."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -252,7 +252,7 @@ def _read_scenes(file: h5py.File) -> dict[str, CameraScene]:
 
 
 def _read(file: h5py.Group, scenes: Mapping[str, CameraScene]) -> Learnt:
-    """Read what was learnt of one ball; of several, each has its own diameters and responses of the cameras."""
+    """Read the learnt results of one ball; each of several has its own diameters and camera responses."""
     responses = map(json.loads, file.attrs["response"])
     known = [one and Response(**one | {"table": tuple(map(tuple, one["table"]))}) for one in responses]
     own = zip(scenes.items(), file.attrs["diameter_px"], known, strict=True)
@@ -279,7 +279,7 @@ def _process(group: h5py.Group) -> ProcessNoise:
 
 
 def write_poses(poses: Followed, path: Path) -> None:
-    """Write the poses of each ball in one batch as HDF5, atomically; OutputError if the file cannot be written."""
+    """Write the poses of each ball in one batch as HDF5, atomically; may raise OutputError."""
     with whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA_OF_POSES
         for ball, of_ball in poses.items():
@@ -293,7 +293,7 @@ def write_poses(poses: Followed, path: Path) -> None:
 
 
 def read_poses(path: Path) -> Followed | None:
-    """Return what `write_poses` wrote; None if the file is not whole."""
+    """Return the poses of `write_poses`; None if the file is damaged."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA_OF_POSES or file.attrs.get("sha256") != digest(file):

@@ -1,4 +1,4 @@
-"""Paints of an experiment: how balls are looked for before their light is known, and the frames it is learnt from."""
+"""Paints of an experiment: search for balls before their light is known, and frames to learn it from."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,18 +28,18 @@ from sphereorient.pose.neighbours import spoilt
 from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
-MOSTLY_SEEN = 0.5  # share of a disk that others must leave to each camera, of the frames that light is learnt from
-MORE_FRAMES = 2  # times those of one ball: others hide it in some
+MOSTLY_SEEN = 0.5  # least share of a disk that is visible to each camera, in frames to learn light from
+MORE_FRAMES = 2  # times those of a single ball, as others hide it in some
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Paint:
-    """Balls of one map and diameter: no picture tells them apart."""
+    """Balls of one map and diameter, indistinguishable in pictures."""
 
     names: Sequence[str]
     base: TextureTable  # finest table of the map
     search: BlurMatchedSearch
-    first: Initialiser  # finds poses with an assumed blur and light
+    first: Initialiser  # with assumed blur and light
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,11 +49,11 @@ class PaintSample:
     first: Initialiser  # of this paint
     frames: Sequence[Sequence[Frame]]  # n of C
     places: Sequence[int]  # n, among the frames in use
-    among: Among | None = None  # poses of balls that others are beside
+    among: Among | None = None  # poses of balls with others beside them
 
 
 def alike(recording: Recording) -> list[list[str]]:
-    """Return the names of the balls, those of one map and diameter together."""
+    """Return the names of the balls, grouped by map and diameter."""
     kinds: list[list[str]] = []
     for name in recording.experiment.names:
         own = recording.of(name)
@@ -82,10 +82,10 @@ def open_views(
 
 
 def open_paints(job: Job, progress: Progress) -> list[Paint]:
-    """Estimate the cameras' backgrounds; build the finest table and the template bank of each paint meanwhile."""
+    """Estimate the backgrounds; at the same time build finest table and template bank of each paint."""
     recording, settings = job.recording, job.settings
     blur_px = settings.refine.blur_px or FIRST_BLUR_PX
-    with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
+    with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products release the interpreter lock
         opening = [pool.submit(open_views, recording, stream, settings, progress) for stream in recording.streams]
         tables, searches = [], []
         for names in (kinds := alike(recording)):
@@ -109,7 +109,7 @@ def open_paints(job: Job, progress: Progress) -> list[Paint]:
 
 def paint_samples(recording: Recording, refine: RefineSettings, paints: Sequence[Paint]) -> Iterator[PaintSample]:
     """Yield the frames from which the appearance of each paint is estimated.
-    Raises ExperimentError: no frame shows a ball that the others mostly leave to all cameras that see it.
+    Raises ExperimentError: no frame shows a ball mostly unhidden in all cameras that see it.
     """
     if recording.experiment.alone:
         yield _alone(recording, refine, paints[0])
@@ -121,7 +121,7 @@ def paint_samples(recording: Recording, refine: RefineSettings, paints: Sequence
     found = [start(frame, list(first), {}) for frame in frames]
     for paint in paints:
         rows = _mostly_seen(paint, first, found)
-        # Mixed: light is judged from halves of them, and any half should hold all balls at all times.
+        # Shuffled: light is judged from halves, and each half should contain all balls at all times.
         rows = [rows[k] for k in np.random.default_rng(0).permutation(len(rows))]
         if not rows:
             do = "check the texture and diameter of this ball, and whether it is in view"
@@ -139,7 +139,7 @@ def paint_samples(recording: Recording, refine: RefineSettings, paints: Sequence
 
 
 def _alone(recording: Recording, refine: RefineSettings, paint: Paint) -> PaintSample:
-    """Return frames that show an only ball; where no blur is given, the search is for the blur that they have."""
+    """Return frames with the only ball; unless a blur is given, the search uses their blur."""
     first = replace(paint.first, score_min=UNPROVEN, known={})
     assert first.known is not None
     views = first.fitter.views
@@ -159,7 +159,7 @@ def _alone(recording: Recording, refine: RefineSettings, paint: Paint) -> PaintS
 def _mostly_seen(
     paint: Paint, first: Mapping[str, Initialiser], found: Sequence[Mapping[str, Poses]]
 ) -> list[tuple[int, str]]:
-    """Return frames and names of balls of a paint that the others mostly leave to all cameras that see them."""
+    """Return frames and names of balls of a paint that are mostly unhidden in all cameras that see them."""
     rows = []
     for k, there in enumerate(found):
         for name in paint.names:
@@ -177,7 +177,7 @@ def _mostly_seen(
 
 
 def following(recording: Recording, sample: PaintSample, exposure_s: float) -> Following | None:
-    """Return the frames beside those studied, that tell the motion in the exposure, s; None where that is unknown."""
+    """Return the neighbours of the frames of a study, for the motion in the exposure, s; None: unknown exposure."""
     clock, places = recording.clock, sample.places
     if not exposure_s > 0 or len(clock) < 2:
         return None

@@ -24,17 +24,17 @@ from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
 from sphereorient.search import Candidates, Proposer, crop_disk
 
-CHUNK = 64  # frames held at once; a result does not depend on it
+CHUNK = 64  # frames in memory; no effect on results
 
 
 def _learn(job: Job, progress: Progress) -> None:
-    """Learn nothing: the stages look at the whole movie."""
+    """Learn nothing: the stages use the whole movie."""
 
 
 def track_paper(
     job: Job, follower: Follower | None, measured: Iterable[Followed], progress: Progress
 ) -> dict[str, Joined]:
-    """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are not used."""
+    """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are unused."""
     settings = job.settings
     grid, place = job.recording.gridded()
     cameras, clock = grid.cameras, grid.clock
@@ -90,14 +90,14 @@ def propose_orientations(
     settings: Settings,
     progress: Progress,
 ) -> Candidates:
-    """Propose orientations, lab, where a camera has the sphere; `proposer_of`: the proposer for disks of a size, px."""
+    """Propose orientations, lab, in frames with the sphere; `proposer_of`: the proposer for disks of a size, px."""
     stage = f"{stream.name}: orient"
     total = len(stream)
     progress(stage, 0, total)
     if not sightings.placed.any():
         return in_the_lab(Candidates.none(sightings.reason), stream.camera, sightings.centre_px)
     proposer = proposer_of(locate.size_of(sightings, settings.orient.size_px))
-    # An interpolated position is of no use without a picture.
+    # An interpolated position without a picture is useless.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable
     proposals: list[Candidates] = []

@@ -53,13 +53,13 @@ def _of_place(found: Follower, name: str) -> Appearance:
 
 
 def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:
-    """Return the follower of `learn`, from what another run or process learnt."""
+    """Return the follower of `learn`, from learnt results of another run or process."""
     _check(job)
     names = job.recording.experiment.names
     if set(learnt) != set(names):
-        do = "pass what was learnt of this experiment"
+        do = "pass a file of this experiment"
         got, expected = ", ".join(sorted(learnt)), ", ".join(names)
-        raise ExperimentError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
+        raise ExperimentError(refusal("learnt", expected=f"learnt results of {expected}", got=got, do=do))
     appearances = {name: learnt[name].appearance(job.recording.of(name)) for name in names}
     searches: dict[str, BlurMatchedSearch] = {}
     for same in alike(job.recording):
@@ -69,7 +69,7 @@ def resume(job: Job, learnt: Mapping[str, Learnt]) -> Follower:
 
 
 def follower(job: Job, appearances: Mapping[str, Appearance], searches: Mapping[str, BlurMatchedSearch]) -> Follower:
-    """Choose how to follow frames: all balls in all cameras together, or one by one the cameras that disagree."""
+    """Choose the follower: all balls in all cameras together, or each camera alone if they disagree."""
     balls: dict[str, BallTracker] = {}
     for name, one in appearances.items():
         begin = searches[name].start(one.still, one.fitter.optics.blur_px, score_min=one.clear_score)
@@ -85,13 +85,13 @@ def follower(job: Job, appearances: Mapping[str, Appearance], searches: Mapping[
 
 
 def exposure_of(job: Job) -> float:
-    """Return how long the shutter is open, s; 0 where that is not known, or where the given blur holds its motion."""
+    """Return the exposure, s; 0 if it is unknown, or if the given blur includes its motion."""
     return 0.0 if job.settings.refine.blur_px is not None else job.recording.experiment.exposure_s or 0.0
 
 
 def join(job: Job, follower: Follower | None, measured: Iterable[Followed], progress: Progress) -> dict[str, Joined]:
-    """Choose each ball's path through all frames' candidates and smooth it; return its track and what was learnt.
-    Balls of one paint keep their names over the movie.
+    """Choose each ball's path through the candidates of all frames and smooth it; return track and learnt results.
+    Balls of the same paint keep their names over the movie.
     """
     assert follower is not None  # `learn` and `resume` return one
     tables = pose_tables(measured, follower.appearances, len(job.recording.streams))
@@ -123,14 +123,14 @@ def join_ball(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Traje
         R_lab_body=picked["R_lab_body"],
         orientation_cov_rad2=picked["covariance"][:, :3, :3],
         segment=chosen.segment,
-        # Of a ball held in place all positions are one estimate: its path tells nothing more.
+        # All positions of a fixed ball are one estimate, so its path adds no information.
         coupling=None if job.recording.experiment.fixed else picked["covariance"][:, :3, 3:],
     )
     first, second = torch.combinations(torch.arange(len(job.recording.streams)), 2).unbind(1)
     turn, spread = picked["own_turn"], picked["own_covariance"]
     apart, spread = turn[:, first] - turn[:, second], spread[:, first] + spread[:, second]
     counts = table.use[:, first] & table.use[:, second] | (table.use.sum(1) < 2)[:, None]
-    apart = torch.where(counts[..., None], apart, torch.nan)  # a camera that contradicts those in use does not count
+    apart = torch.where(counts[..., None], apart, torch.nan)  # without a camera that contradicts those in use
     share = motion.lasting_share(apart, spread, chosen.segment, settings.smooth.slow_share)
     smooth = settings.smooth.model_copy(update={"slow_share": share})
     smoothed = motion.smooth_motion(poses, smooth, None if given is None else given.process)
@@ -139,7 +139,7 @@ def join_ball(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Traje
 
 
 def _named(tables: Sequence[PoseTable], job: Job, follower: Follower) -> tuple[Sequence[PoseTable], Sequence[Floats]]:
-    """Give K balls that look alike the same names in all frames; return how sure that is, see `same_balls`."""
+    """Give K balls that look alike consistent names in all frames; return the certainty, see `same_balls`."""
     if len(tables) == 1:
         return tables, [np.full(len(tables[0]), np.nan)]
     seen = np.stack([(table.mask[:, 0] & table.use.any(1)).numpy() for table in tables])
@@ -156,7 +156,7 @@ def _check(job: Job) -> None:
     spheres = job.recording.experiment.spheres
     fixed = [sphere.name for sphere in spheres if sphere.fixed]
     if fixed and not job.recording.experiment.alone:
-        do = "leave `fixed` out, or name it alone under `sphere`"
+        do = "remove `fixed`, or name this ball alone under `sphere`"
         raise ExperimentError(refusal(f"spheres.{fixed[0]}", expected="a ball that moves", got="fixed: true", do=do))
 
 

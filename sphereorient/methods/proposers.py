@@ -1,4 +1,4 @@
-"""The choice of proposer: the only place that knows both the template searches and the trained network."""
+"""The choice of proposer: template search or trained network."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -20,8 +20,8 @@ from sphereorient.search import FallbackProposer, GreySearch, Proposer, Template
 from sphereorient.search.settings import GreySearchSettings, ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable
 
-NEAR_RADII = 8.0  # of a ball that is farther, the bank's perspective errs by less than half a step of its grid
-DEFAULT = "default"  # the checkpoint that comes along
+NEAR_RADII = 8.0  # for a farther ball, the bank's perspective errs by less than half a grid step
+DEFAULT = "default"  # the bundled checkpoint
 Search = TypeVar("Search", GreySearch, TemplateBank)
 
 
@@ -35,7 +35,7 @@ def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> 
 
 
 def _with_bank(kind: str, inputs: Iterable[Tensor | str | float], make: Callable[..., Search]) -> Search:
-    """Return a template search whose bank, whole numbers -127 .. 127, is kept between runs; `make` may be given it."""
+    """Return a template search; its bank, whole numbers -127 .. 127, is cached between runs; `make` may be given it."""
     made: list[Search] = []
 
     def bank() -> dict[str, NDArray[Any]]:
@@ -47,14 +47,14 @@ def _with_bank(kind: str, inputs: Iterable[Tensor | str | float], make: Callable
 
 
 def finest_table(texture: Tensor, diameter_px: float, unseen: Tensor | None) -> TextureTable:
-    """Return `base_table`, kept between runs."""
+    """Return `base_table`, cached between runs."""
     inputs = texture, diameter_px, unseen
     return TextureTable.of(cached("table", inputs, lambda: base_table(texture, diameter_px, unseen).arrays()))
 
 
 class BlurMatchedSearch:
     """Proposers by blur for a map (H, 2 H): one template bank for sharp pictures, others made on demand.
-    `diameters_px`: expected diameter of the sphere, px, in each camera. The bank shows what a near camera sees.
+    `diameters_px`: expected diameter of the sphere, px, in each camera. The bank has the nearest camera's perspective.
     """
 
     def __init__(self, texture: Tensor, settings: Settings, diameters_px: Sequence[tuple[Camera, float]]) -> None:
@@ -71,7 +71,7 @@ class BlurMatchedSearch:
         return self._made[blur]
 
     def start(self, fitter: Fitter, blur_px: float, **more: Any) -> Initialiser:
-        """Return who finds poses without history in pictures of a blur, px; `more`: its other fields."""
+        """Return the initialiser for pictures of a blur, px; `more`: its other fields."""
         return Initialiser(
             fitter=fitter,
             proposers=dict.fromkeys((view.name for view in fitter.views), self.of(blur_px)),
@@ -82,8 +82,8 @@ class BlurMatchedSearch:
 
 
 def as_near(settings: GreySearchSettings, diameters_px: Sequence[tuple[Camera, float]]) -> GreySearchSettings:
-    """Return settings of a search whose bank shows what a camera as near as the nearest of these sees of the sphere,
-    each with the sphere's expected diameter, px; a given distance stays.
+    """Return settings of a search whose bank has the perspective of the nearest of these cameras, each with the
+    sphere's expected diameter, px; a given distance stays.
     """
     if settings.distance_radii is not None:
         return settings
@@ -92,7 +92,7 @@ def as_near(settings: GreySearchSettings, diameters_px: Sequence[tuple[Camera, f
 
 
 def _distance_radii(camera: Camera, diameter_px: float) -> float | None:
-    """Return the distance, radii, of a ball of this diameter in the middle of a picture; None without perspective."""
+    """Return the distance, radii, of a ball of this diameter at the centre of a picture; None without perspective."""
     middle = (torch.tensor(camera.image_size, dtype=torch.float64) - 1) / 2
     aside = torch.tensor([diameter_px / 2, 0.0], dtype=torch.float64)
     rim = camera.rays(torch.stack([middle - aside, middle + aside])).direction_lab
@@ -102,7 +102,7 @@ def _distance_radii(camera: Camera, diameter_px: float) -> float | None:
 
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
-    """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
+    """Return the proposer of the paper's method; templates are for disks of `size_px`."""
     make = partial(TemplateBank, texture, size_px, settings.orient)
     inputs = texture, size_px, settings.orient.model_dump_json()
     return _proposer(texture, settings.propose, lambda: _with_bank("templates", inputs, make))
@@ -119,7 +119,7 @@ def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | No
     """Return the network of a checkpoint; None if the settings name none."""
     if settings.checkpoint is None:
         return None
-    # Import late: most runs use no network.
+    # Late import: most runs use no network.
     from sphereorient.learn.checkpoint import check_texture, correlator_of, load_checkpoint
     from sphereorient.learn.network import LearnedProposer
 

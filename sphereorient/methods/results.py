@@ -1,4 +1,4 @@
-"""From the stages' results to the trajectory, one function for each method."""
+"""The trajectory from the stages' results, one function per method."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,28 +31,24 @@ from sphereorient.search import Candidates
 from sphereorient.trajectory import CameraTrack, Trajectory
 
 TWO_BALLS = (
-    "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "
-    "hide one by `masks:`"
+    "two balls have this texture map: identity is uncertain, and frames are marked as ambiguous; hide one by `masks:`"
 )
-SHARPER = (
-    "the pictures are sharper than the ball's motion in the exposure allows: it is taken for unknown; "
-    "correct `exposure:`, or the frame rate"
-)
+SHARPER = "the pictures are sharper than `exposure:` allows, so `exposure:` was ignored; correct it, or the frame rate"
 WORN = (
-    "the paint differs from the texture map on about {share:.0f} % of the ball: it is not used; "
-    "learn it anew with `sphereorient map --init`"
+    "the paint differs from the texture map on about {share:.0f} % of the ball and is not used there; "
+    "learn the map again with `sphereorient map --init`"
 )
 CODED = (
     "grey levels of {name} are not proportional to the light: {found} was learnt; "
-    "write `response:` where it is known (docs/movies.md)"
+    "set `response:` if it is known (docs/movies.md)"
 )
 RUNAWAY = (
-    "nearly every orientation explains each of {pictures} frames looked at equally well: method paper expects black "
+    "nearly every orientation explains each of {pictures} examined frames equally well: method paper expects black "
     "and white paint in even light; try `--method precise`"
 )
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
-SURE = 0.99  # probability from which a ball has its name
-EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
+SURE = 0.99  # probability from which a ball's name is certain
+EXCESS = 6.0  # of an error over that by noise; 1.3 for rendered pictures, 4 after compression (crf 28)
 
 
 def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
@@ -86,7 +82,7 @@ def paper_track(
     empty = _empty(experiment, clock, tracks)
     oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
     variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
-    # The weights are inverse variances. A repaired camera says something else than what counts.
+    # The weights are inverse variances. A repaired camera's own result is not the one used.
     share = {name: torch.where(fused.repaired[name], 0.0, weight) for name, weight in fused.weight.items()}
     own = {name: torch.where(one > 0, 1 / one, torch.nan)[:, None, None] * variance for name, one in share.items()}
     return replace(
@@ -143,7 +139,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
 def measured_track(
     experiment: Experiment, clock: Tensor, table: PoseTable, choice: Tensor, learnt: Appearance
 ) -> Trajectory:
-    """Collect poses as they were measured: those of a table at a choice (N,), -1 for none; no path, no smoother."""
+    """Collect measured poses: those of a table at a choice (N,), -1 for none, without path and smoother."""
     picked = table.rows(choice)
     covariance = picked["covariance"]
     margin, angle = table.margin(choice)
@@ -171,11 +167,11 @@ def measured_track(
 def precise_track(
     experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Appearance
 ) -> Trajectory:
-    """Collect all results of the precise method in a trajectory, poses in the middle of the exposure."""
+    """Collect all results of the precise method in a trajectory, poses at mid-exposure."""
     smoothed, move_mm = in_middle(smoothed, experiment.exposure_s or 0.0)
     track = measured_track(experiment, clock, table, chosen.choice, learnt)
     flags = chosen.flags | torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
-    # What all other frames say is far from it.
+    # Far from the smooth motion of all other frames.
     flags = flags | torch.where(smoothed.rejected, int(Flag.DOUBTFUL_FIT), 0)
     noticed = ((learnt.second_ball, TWO_BALLS), (learnt.sharper, SHARPER))
     provenance: dict[str, Any] = {"remarks": [text for there, text in noticed if there]}
@@ -204,9 +200,9 @@ def precise_track(
 
 
 def with_map_odds(chosen: Chosen, table: PoseTable, map_log_odds: float | None, least: float) -> Chosen:
-    """Return choices whose probability holds the odds of the map. Where a frame is the only one of its segment no other
-    one confirms its pose: there also those against the next pose by the scores, and NaN where the map's are not known.
-    Less than `least` is ambiguous.
+    """Return choices whose probability includes the odds of the map; for a single frame of a segment, which no other
+    confirms, also the odds against the next pose by the scores, and NaN if the map's are unknown. Less than `least` is
+    ambiguous.
     """
     number, count = np.unique(chosen.segment[chosen.present].numpy(), return_counts=True)
     alone = torch.from_numpy(np.isin(chosen.segment.numpy(), number[count == 1])) & chosen.present
@@ -226,8 +222,8 @@ def with_map_odds(chosen: Chosen, table: PoseTable, map_log_odds: float | None, 
 def with_errors(
     track: Trajectory, recording: Recording, lasting: Lasting | None, *, compared: bool
 ) -> tuple[Trajectory, list[str]]:
-    """Add the errors of calibration, of cameras that contradict each other, and of what lasts over frames; return also
-    what is to be remarked of the cameras. `compared`: whether these are compared, which takes all frames of a movie.
+    """Add the errors of calibration, of contradicting cameras, and those that last; return also remarks on the cameras.
+    `compared`: whether these are compared, which takes all frames of a movie.
     """
     cameras, radius_mm = recording.cameras, recording.experiment.radius_mm
     track, remarks = with_systematic_errors(track, cameras, recording.covariance, radius_mm), list[str]()
@@ -236,32 +232,30 @@ def with_errors(
         track, found = with_contradictions(track, cameras, 2 * radius_mm, recording.timeline.even, own_rad2)
         if found.contradicts:
             remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
-    if lasting is not None:  # after the others: only noise is scaled
+    if lasting is not None:  # last, as only noise is scaled
         track = with_lasting_errors(track, lasting.covariance, lasting.alone)
     return track, remarks
 
 
 def with_identity(track: Trajectory, certain: NDArray[np.float64]) -> Trajectory:
-    """Return a ball's track with the probability that it has kept its name, (N,), NaN: never in doubt; what is less
-    than sure is marked.
-    """
+    """Return a ball's track with the probability (N,) of its identity, NaN: never in doubt; mark uncertain frames."""
     doubtful = np.where(certain < SURE, np.uint32(Flag.IDENTITY), np.uint32(0))
     return replace(track, identity=certain, flags=track.flags | doubtful)
 
 
 def missed_text(track: Trajectory) -> list[str]:
-    """Return remarks on cameras that measure the sphere in none of their frames, one for all that miss it alike."""
+    """Return remarks on cameras that measure the sphere in no frame, one per cause."""
     cameras_of: dict[str, list[str]] = {}
     for name, lost in track.summary()["lost"].items():
         pictures = len(track) - lost.pop(Reason.MISSING, 0)
         usual = next(iter(lost), None)
         if usual not in (*MISSED, Reason.RUNAWAY) or sum(lost.values()) < pictures:
             continue
-        text = f"no ball found in {pictures} frames looked at"
+        text = f"no ball found in {pictures} frames examined"
         if usual == Reason.RUNAWAY:
             text = RUNAWAY.format(pictures=pictures)
         if usual == Reason.LOW_SCORE:
-            text = f"no pose of the map explains any of {pictures} frames looked at"
+            text = f"no pose of the map explains any of {pictures} frames examined"
             text += "" if track.valid.any() else f"; {LOOK_ALIKE}"
         cameras_of.setdefault(text, []).append(name)
     return [f"{', '.join(names)}: {text}" for text, names in cameras_of.items()]
@@ -274,7 +268,7 @@ def map_track(
     names = [view.name for view in learnt.views]
     empty = _empty(experiment, clock, names, method="map", settings=settings, provenance=provenance)
     position, R = learnt.position_lab_mm, learnt.R_lab_body
-    placed = torch.isfinite(position).all(1)  # photographs that share no paint with the others have a place only
+    placed = torch.isfinite(position).all(1)  # photographs without paint in common with the others have only a position
     reasons = tuple(
         str(Reason.OK if valid else Reason.LOW_SCORE if there else Reason.NOT_FOUND)
         for valid, there in zip(learnt.valid.tolist(), placed.tolist(), strict=True)
@@ -291,7 +285,7 @@ def map_track(
             score=learnt.score[:, c].numpy(),
             reason=reasons,
         )
-    # Frames to which the map was not fitted.
+    # Frames not used for the map.
     flags = torch.where(learnt.valid & ~learnt.fitted, int(Flag.EXTRAPOLATED), 0)
     return replace(
         empty,
@@ -311,8 +305,8 @@ def _empty(experiment: Experiment, clock: Tensor, cameras: Iterable[str], **abou
 
 
 def missed_by(view: CameraView, reason: Sequence[str], centre_px: Tensor, radius_px: Tensor) -> NDArray[np.bool_]:
-    """Return in which frames, (N,), a camera does not show the sphere whose whole disk, centre (N, 2) and radius (N,),
-    px, it should show where the others see it; `reason` says what became of it there.
+    """Return the frames (N,) in which a camera misses the sphere although its whole disk, centre (N, 2), radius (N,),
+    px, by the other cameras, should be visible; `reason`: of the camera.
     """
     missed: NDArray[np.bool_] = np.isin(reason, MISSED) & view.shows_whole(centre_px, radius_px).numpy()
     if view.background.shown is not None:
@@ -324,18 +318,18 @@ def missed_by(view: CameraView, reason: Sequence[str], centre_px: Tensor, radius
 def fit_flags(
     learnt: Appearance, use: Tensor, score: Tensor, excess: Tensor, missed: NDArray[np.integer]
 ) -> NDArray[np.uint32]:
-    """Return flags (N,) of frames that one camera alone measured, of poor fits, and of a movie of two balls, from the
-    use, score and excess (N, C) of each picture; frames without a picture in use have none.
-    Where as many other cameras should see the sphere and do not (`missed`, a number), half of the poses are wrong.
+    """Return flags (N,) of frames of a single camera, of poor fits, and of a movie of two balls, from use, score and
+    excess (N, C) of each picture; frames without a used picture have none. If as many other cameras miss the sphere
+    (`missed`, a number), half of the poses are wrong.
     """
     seen = use.numpy()
     count = seen.sum(-1)
     best = np.where(seen, score.numpy(), -np.inf).max(-1)
-    # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
+    # Errors so far above noise come from a wrong model, for example a wrong map.
     least = np.where(seen, excess.numpy(), np.inf).min(-1)
     outvoted = (missed > 0) & (missed >= count)
     one = (count == 1) & (use.shape[-1] > 1)
-    # No other camera stands by what one alone says, perhaps by a part of a disk: that must fit as right poses do.
+    # Without confirmation by another camera, a pose must fit as well as right poses do.
     poor = best < np.where(one, learnt.usual_score, learnt.poor_score)
     doubtful = poor | (least > EXCESS) | learnt.in_doubt | outvoted
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: np.full(len(use), learnt.second_ball)}

@@ -1,4 +1,4 @@
-"""The settings of all rooms in one tree: defaults, files, single overrides, and the commented file."""
+"""The settings of all rooms in one tree: defaults, files, overrides, and the commented file."""
 
 import difflib
 import math
@@ -25,28 +25,28 @@ DEFAULT_METHOD = "precise"
 
 
 def _branch(model: type[Model], what: str, *methods: str) -> Any:
-    """Return the field of a branch with the `methods` that read it, but for keys that name theirs."""
+    """Return the field of a branch and the `methods` that read it, except keys that name their own."""
     return Field(default_factory=model, description=what, json_schema_extra={"methods": list(methods)})
 
 
 class Settings(BaseModel, frozen=True, extra="forbid"):
     """All settings, one branch a stage."""
 
-    locate: LocateSettings = _branch(LocateSettings, "where is the sphere (both methods)", "precise", "paper", "map")
-    propose: ProposeSettings = _branch(ProposeSettings, "who proposes orientations (both methods)", "precise", "paper")
-    search: GreySearchSettings = _branch(GreySearchSettings, "where could it point (precise)", "precise")
-    refine: RefineSettings = _branch(RefineSettings, "poses to hundredths (precise)", "precise")
-    path: PathSettings = _branch(PathSettings, "which candidate is true (precise)", "precise")
-    smooth: SmoothSettings = _branch(SmoothSettings, "motion from the track (precise)", "precise")
-    orient: OrientSettings = _branch(OrientSettings, "where could it point (paper)", "paper")
-    assemble: AssembleSettings = _branch(AssembleSettings, "which candidate is true (paper)", "paper")
+    locate: LocateSettings = _branch(LocateSettings, "location of the sphere (both methods)", "precise", "paper", "map")
+    propose: ProposeSettings = _branch(ProposeSettings, "proposals of orientations (both methods)", "precise", "paper")
+    search: GreySearchSettings = _branch(GreySearchSettings, "search without history (precise)", "precise")
+    refine: RefineSettings = _branch(RefineSettings, "fit of the poses (precise)", "precise")
+    path: PathSettings = _branch(PathSettings, "choice among candidates (precise)", "precise")
+    smooth: SmoothSettings = _branch(SmoothSettings, "smoother (precise)", "precise")
+    orient: OrientSettings = _branch(OrientSettings, "search without history (paper)", "paper")
+    assemble: AssembleSettings = _branch(AssembleSettings, "choice among candidates (paper)", "paper")
     motion: MotionSettings = _branch(MotionSettings, "velocities, accelerations (paper)", "paper")
-    paint: MapSettings = _branch(MapSettings, "the map from the movies (`map`)", "map")
+    paint: MapSettings = _branch(MapSettings, "texture map from movies (`map`)", "map")
     statistics: StatisticsSettings = _branch(StatisticsSettings, "numbers of a report", "report")
 
 
 def _methods(model: type[BaseModel], name: str) -> Any:
-    """Return the methods that a field names as its readers; None: it names none."""
+    """Return the methods that a field names as its readers, or None."""
     extra = model.model_fields[name].json_schema_extra
     return extra.get("methods") if isinstance(extra, dict) else None
 
@@ -57,7 +57,7 @@ def _values(settings: Settings) -> dict[str, Any]:
 
 
 DEFAULTS = _values(Settings())
-# The methods that read each key `branch.name`: those that it names itself, or its branch's.
+# The methods that read each key `branch.name`: its own, or its branch's.
 READERS: dict[str, list[str]] = {
     f"{branch}.{name}": _methods(type(part), name) or _methods(Settings, branch)
     for branch, part in Settings()
@@ -77,7 +77,7 @@ def load_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
 def read_settings(
     path: Path | None = None, overrides: Iterable[str] = (), method: str | None = None
 ) -> tuple[Settings, list[str]]:
-    """Read settings from a file and single overrides; return remarks for the user too.
+    """Read settings from a file and single overrides; return also remarks for the user.
 
     Args:
         path: YAML as `sphereorient settings` writes it; missing keys keep their defaults. None: all defaults.
@@ -101,7 +101,7 @@ def read_settings(
         of_method = {key.partition(".")[0] for key in READERS if is_read(key, method)}
         aside = sorted({key if branch in of_method else branch for branch, key in given if not is_read(key, method)})
         if aside:
-            remarks.append(f"{path}: method {method} does not read {', '.join(aside)}: left aside")
+            remarks.append(f"{path}: method {method} does not read {', '.join(aside)}: ignored")
     return settings, remarks
 
 
@@ -118,7 +118,7 @@ def check_settings(settings: Settings, method: str, source: str = "settings") ->
 
 
 def _not_read(name: str, key: str, method: str) -> str:
-    """Return the message about a key that a method does not read, with the nearest one that it reads."""
+    """Return the message for a key that a method does not read, with the nearest one that it reads."""
     known = {read.partition(".")[2]: read for read in reversed(DEFAULTS) if is_read(read, method)}
     leaf = key.partition(".")[2]
     unit = [name for name in known if name.rpartition("_")[2] == leaf.rpartition("_")[2]]
@@ -142,7 +142,7 @@ def read_model(model: type[Model], path: Path | None = None, overrides: Iterable
 
 
 def _not_finite(value: Any) -> str:
-    """Return the key of a number that is infinite or NaN; "" if all are finite."""
+    """Return the key of an infinite or NaN number; "" if all are finite."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple | list) else ()
     for key, inner in items:
         if isinstance(inner, float) and not math.isfinite(inner):
@@ -161,13 +161,13 @@ def _read(path: Path | None) -> dict[str, Any]:
 
 
 def _depths(model: Any) -> set[int]:
-    """Return the numbers of names in the keys of a model: room.key has two."""
+    """Return the depths of a model's keys: room.key has two."""
     fields = model.model_fields.values() if isinstance(model, type) and issubclass(model, BaseModel) else ()
     return {1 + depth for field in fields for depth in _depths(field.annotation)} or {0}
 
 
 def _override(tree: dict[str, Any], text: str, depths: set[int]) -> None:
-    """Put `key=value` into a tree; the key begins with its room if there are rooms."""
+    """Put `key=value` into a tree; with rooms the key begins with its room."""
     key, value = parse_override(text)
     *rooms, leaf = key.split(".")
     if len(rooms) + 1 not in depths:
@@ -181,13 +181,13 @@ def _override(tree: dict[str, Any], text: str, depths: set[int]) -> None:
 
 
 def settings_yaml(settings: Settings | None = None, method: str | None = None) -> str:
-    """Write settings, of a method the keys that it reads, as YAML with each key's description as a comment above it."""
+    """Write settings (of a method: the keys that it reads) as YAML, each key below its description as a comment."""
     of = f", method {method}" if method else ""
     return model_yaml(f"Settings of sphereorient{of}", settings or Settings(), method)
 
 
 def model_yaml(title: str, settings: BaseModel, method: str | None = None) -> str:
-    """Write the settings of a model, with rooms or without, as `settings_yaml`."""
+    """Write the settings of a model, with or without rooms, as `settings_yaml`."""
     flat, also = 1 in _depths(type(settings)), " --set room.key=value overrides one."
     lines = [f"# {title}; any key may be left out.{'' if flat else also}", ""]
     if flat:

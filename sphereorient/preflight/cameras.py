@@ -1,4 +1,4 @@
-"""Do the cameras agree? By the outlines of the ball in sampled frames, and by a short stretch that is tracked."""
+"""Agreement of the cameras, by outlines of the ball in sampled frames and by a short tracked stretch."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -24,19 +24,19 @@ from sphereorient.run import MemoryStore, Request
 from sphereorient.run.stages import opened, run_tracks
 from sphereorient.sphere.renderer import rim_directions
 
-GOOD_PX = 0.7  # median px between lines of sight: 0.2 to 0.5 for exact cameras; a fault from that of `OUTLINES`
-CLEARER = 0.2  # swapped or mirrored movies are reported if they leave this share of the gap
+GOOD_PX = 0.7  # median px between lines of sight, 0.2 to 0.5 for exact cameras; a fault from that of `OUTLINES` on
+CLEARER = 0.2  # swapped or mirrored movies are reported if correction leaves less than this share of the gap
 AROUND = 72  # points of the expected outline
 OUTLINE_PX = 0.4  # error of an outline's radius, by blur and a dark rim
 GOOD, BAD = 0.01, 0.04  # relative error of the size
-VOLUME = 0.4  # relative difference of nearer and farther balls from the middle one: what the tracker accepts
-ENOUGH = 60  # frames of a movie that gives its own background: a ghost in 50 turned poses by 0.3 degrees
+VOLUME = 0.4  # relative size difference of nearer and farther balls that the tracker accepts
+ENOUGH = 60  # least frames for a background from the movie: a ghost in one of 50 changed poses by 0.3 degrees
 SEE_BALL = "see the finding on the ball"
 TITLE = "cameras agree"
 
 
 def learn_appearance(experiment: Experiment, settings: Settings, cameras: tuple[str, ...] | None = None) -> Learnt:
-    """Learn light, blur and noise of the movies, None: of all, as `track` does; raise SphereOrientError as it does."""
+    """Learn light, blur and noise of these cameras (None: all) as `track` does, with the same errors."""
     with opened(Request(experiment=experiment, settings=settings, cameras=cameras), MemoryStore()) as work:
         assert work.follower is not None  # the precise method follows frames
         return Learnt.of(work.follower.appearance)
@@ -44,10 +44,10 @@ def learn_appearance(experiment: Experiment, settings: Settings, cameras: tuple[
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracked:
-    """The judgement of a short stretch that each camera alone tracked; made by `track_stretch`."""
+    """Findings of a short stretch, tracked in each camera alone; made by `track_stretch`."""
 
     findings: tuple[Finding, ...] = ()  # on the number of balls, then on the cameras
-    overrules: bool = False  # poses fitted to the paint tell more than outlines, which jump where paint is dark
+    overrules: bool = False  # poses fitted to the paint are more accurate than outlines, which jump at dark paint
 
 
 NOT_TRACKED = Tracked()
@@ -56,10 +56,10 @@ NOT_TRACKED = Tracked()
 def track_stretch(
     experiment: Experiment, settings: Settings, learning: Future[Learnt], stretch: Sequence[MovieSample], first: int
 ) -> Tracked:
-    """Track consecutive frames (of each camera) from the first one on with what was learnt; judge cameras and balls."""
+    """Track consecutive frames of each camera by the learnt appearance; judge cameras and number of balls."""
     try:
         learnt = learning.result()
-        # Each camera alone: a pose of both lies between what they say.
+        # Each camera alone: a joint pose would hide their difference.
         request = Request(
             experiment=replace(experiment, frames=(first, first + len(stretch[0].frame))),
             settings=settings,
@@ -69,7 +69,7 @@ def track_stretch(
     except SphereOrientError as error:
         measured, _, do = str(error).rpartition("; ")
         finding = judged(TITLE, f"a run stops: {measured}", (True, FAULT, do.rstrip(".")))
-        # The run stops whatever the cause is.
+        # The run stops for any cause.
         return Tracked(findings=(replace(unsure(finding, experiment, len(stretch[0].stream)), severity=FAULT),))
     seen, limits = said_alone(track, experiment.cameras, 2 * experiment.radius_mm, consecutive=True)
     position = torch.from_numpy(track.position)
@@ -100,11 +100,11 @@ def unsure(finding: Finding, experiment: Experiment, total: int) -> Finding:
 def camera_findings(
     experiment: Experiment, samples: Sequence[MovieSample], scans: Sequence[OffsetScan], tracked: Tracked
 ) -> Iterator[Finding]:
-    """Yield what outlines and the tracked stretch say of the cameras; where these tell, outlines raise no complaint."""
+    """Yield findings by outlines and tracked stretch; the stretch overrules complaints by outlines."""
     if not samples:
         return
     between, diameter_mm = [], experiment.diameter_mm
-    if scans and all(sample.balls for sample in samples):  # else the finding on the ball tells enough
+    if scans and all(sample.balls for sample in samples):  # else the finding on the ball suffices
         in_step_px = max(scan.in_step_px for scan in scans) if any(scan.shift for scan in scans) else None
         between = [lines_of_sight(samples, in_step_px), in_step(scans, experiment.start)]
         between += [] if diameter_mm is None else [ball_size(samples, diameter_mm)]
@@ -150,7 +150,7 @@ def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> 
     for cause, centre_px, _ in other_readings(seen.cameras, seen.centre_px, seen.R_lab_body):
         if (gap := max(seen.gaps(pair, centre_px).typical_px for pair in seen.pairs)) < limit:
             better.append((gap, f"{cause.words} (then it is {gap:.2f} px)"))
-    # At right angles, several of these can fit: all are reported.
+    # With cameras at right angles several causes can fit: all are reported.
     mended = ", or ".join(advice for _, advice in sorted(better))
     who = f"{' and '.join(wrong)} contradicts the others and" if wrong else "a camera"
     moved = f"calibrate again: {who} was moved or bumped, or cameras.yaml is of another set-up"
@@ -169,7 +169,7 @@ def expected_outline_px(camera: Camera, position_lab_mm: Tensor, radius_mm: floa
 
 
 def outline_stretch(sample: MovieSample, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-    """Return by how much wider the outlines (n,) are than those of a sphere at positions (n, 3), mm, relative."""
+    """Return the relative excess of the outlines' width (n,) over that of a sphere at positions (n, 3), mm."""
     measured = [math.nan if outline is None else outline.stretch for outline, _ in sample.found]
     rim = expected_outline_px(sample.camera, position_lab_mm, radius_mm)
     width, height = (rim - rim.mean(-2, keepdim=True)).square().mean(-2).sqrt().unbind(-1)
@@ -201,12 +201,12 @@ def ball_size(samples: Sequence[MovieSample], diameter_mm: float) -> Finding:
 
 
 def off_size(error: float, tolerance: float, advice: str) -> list[tuple[bool, Severity, str]]:
-    """Return the complaints of a size with a relative error, of outlines with this tolerance."""
+    """Return the complaints about a relative size error, for outlines with this tolerance."""
     return [(error > BAD + tolerance, FAULT, advice), (error > GOOD + tolerance, WARNING, advice)]
 
 
 def ball_size_px(sample: MovieSample) -> Finding:
-    """Report the size of the ball in one camera, which does not separate distance from size."""
+    """Report the size of the ball in one camera (distance and size are not separable)."""
     title, radius = f"size of the ball, {sample.name}", sample.sightings.radius_px
     seen = 2 * radius[torch.isfinite(radius)]
     if not len(seen):

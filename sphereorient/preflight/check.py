@@ -23,7 +23,7 @@ from sphereorient.preflight.scene import SceneView, look_at_scene
 from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture, load_unseen
 
-BRIEF = {"appearance_frames": 8, "chunks": 1}  # of the settings: enough for a short stretch
+BRIEF = {"appearance_frames": 8, "chunks": 1}  # settings that suffice for a short stretch
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,12 +36,12 @@ class Preflight:
     closer: tuple[tuple[MovieSample, ...], ...] = ()  # consecutive frames: by stretch, then by camera
     scans: tuple[OffsetScan, ...] = ()  # of each other camera against the first
     texture: Tensor | None = None  # (H, 2 H)
-    unseen: Tensor | None = None  # (H, 2 H) bool, texels that are no paint; None: all are
+    unseen: Tensor | None = None  # (H, 2 H) bool, texels of unseen paint; None: all are seen
     measures: texture_map.TextureMeasures | None = None
     similar: texture_map.ViewPair | None = None
     tracked: cameras.Tracked = cameras.NOT_TRACKED  # a short stretch; no findings with one camera or without a map
     matches: tuple[texture_map.TextureMatch, ...] = ()
-    fitted: tuple[str, ...] = ()  # cameras whose pictures a tracker fits the map to, though outlines show none of it
+    fitted: tuple[str, ...] = ()  # cameras in which the tracker fits the map, but the search by outlines fails
     scene: tuple[SceneView, ...] = ()  # of several balls: a picture of each camera
     findings: tuple[Finding, ...] = ()
 
@@ -59,7 +59,7 @@ def preflight(
     """
     settings = settings or Settings()
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
-        # Threads: decoding, outlines and products release the interpreter.
+        # Threads: decoding, outlines and matrix products release the interpreter lock.
         experiment = recording.experiment
         if not experiment.alone:
             scene, found = look_at_scene(recording, settings, progress)
@@ -110,13 +110,13 @@ def preflight(
 
 def _sample(recording: Recording, stream: CameraStream, size_px: float | None, settings: Settings) -> MovieSample:
     scene, empty = None, given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
-    with suppress(SphereOrientError):  # what a tracker would refuse is reported by the findings
+    with suppress(SphereOrientError):  # the findings report what a tracker would refuse
         (scene,) = find_scenes(recording, stream, settings.refine.background_frames, settings.locate).values()
     return sample_movie(stream, size_px, settings.locate, empty, scene, recording.experiment.sphere.in_place)
 
 
 def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:
-    """Yield all findings; those that are told `first` are known."""
+    """Yield all findings, `first` those that are known."""
     yield movies.frames(seen.experiment, seen.timeline)
     yield from movies.outside(seen.experiment)
     yield from first
@@ -137,15 +137,15 @@ def _findings(seen: Preflight, first: Sequence[Finding]) -> Iterator[Finding]:
 def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     if seen.measures is None or seen.similar is None:
         path = seen.experiment.texture_path
-        measured = "no texture map is given" if path is None else f"no texture map yet: {path.name} is not there"
+        measured = "no texture map is given" if path is None else f"no texture map yet: {path.name} does not exist"
         target = path or seen.experiment.folder / "texture.png"
         do = f"track learns one; a finer one: sphereorient map {seen.experiment.path} --out {target}"
-        yield warning("paint", measured, do if path else f"{do}; then write it under sphere: as texture:")
+        yield warning("paint", measured, do if path else f"{do}; then add it under sphere: as texture:")
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
     least_px = min((r for r in radii if not math.isnan(r)), default=seen.samples[0].diameter_px / 2)
     yield (paint := texture_map.judge_contrast(seen.measures, least_px))
-    if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
+    if paint.severity is FAULT:  # a map of one colour makes the other checks meaningless
         return
     yield texture_map.look_alikes(seen.similar)
     if seen.unseen is not None:

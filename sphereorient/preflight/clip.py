@@ -22,25 +22,25 @@ from sphereorient.methods.settings import Settings
 from sphereorient.movies import Grey, flipped_picture
 from sphereorient.pose.poses import supported
 
-FRAMES, APART, TOGETHER = 200, 4, 50  # of the clip; of it that show a circle, each so many; that are adjusted together
+FRAMES, APART, TOGETHER = 200, 4, 50  # frames of the clip; step of those used for the circle; adjusted together
 
 
 class Clip:
-    """The first frames of an experiment's movies, kept in memory; a ball that moves is refused (ExperimentError)."""
+    """The first frames of an experiment's movies, in memory. Raises ExperimentError: the ball moves."""
 
     def __init__(self, experiment: Experiment) -> None:
         if not experiment.alone or not experiment.fixed:
             do = "track it with `sphereorient track`"
-            raise input_error(f"{experiment.path}, sphere.fixed", "one ball that stays in its place", "another", do)
+            raise input_error(f"{experiment.path}, sphere.fixed", "one fixed ball", "another", do)
         with open_recording(experiment, textured=False) as recording:
             self._frame_s = recording.timeline.frame_s
             read = {one.name: one.pictures(0, FRAMES) for one in recording.streams}
             self._pictures = {name: [one for one, _ in each if one is not None] for name, each in read.items()}
 
     def tracked(self, experiment: Experiment) -> Json:
-        """Track the clip with the circles, masks, response and cameras of another experiment, without a map, by the
-        first pass of `track` and `live`; adjust place and map. Return the numbers for the page. Raises
-        SphereOrientError: nothing is found, or the ball does not turn.
+        """Track the clip with circles, masks, response and cameras of another experiment, by the first pass without
+        a map; adjust position and map. Return the numbers for the page. Raises SphereOrientError: no ball, or no
+        rotation.
         """
         begun, settings = time.perf_counter(), Settings()
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""config.txt of FicTrac, whose users film an animal on a ball."""
+"""config.txt of FicTrac, for an animal on a ball."""
 
 import math
 import re
@@ -24,7 +24,7 @@ from sphereorient.trajectory.walk import FicTracAxes
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 DO = "name the config.txt with which FicTrac ran"
-# Keys that change the picture: values that are taken over, what is expected, and what to do.
+# Keys that change the picture: accepted values, their description, and what to do.
 CHOICES = {
     "fisheye": (("n", "y", "0", "1", ""), "y or n", "correct it"),
     "thr_rgb_tfrm": (("grey", "gray", ""), "grey, all colours", "write a movie of this colour alone, in grey"),
@@ -36,13 +36,13 @@ SQUARES = {
     "yz": ((0, -0.5, -0.5), (0, 0.5, -0.5), (0, 0.5, 0.5), (0, -0.5, 0.5)),
     "xz": ((0.5, 0, -0.5), (-0.5, 0, -0.5), (-0.5, 0, 0.5), (0.5, 0, 0.5)),
 }
-SURE = 4.5  # half of 3^2: a square's tilt is sure at three sigmas of corners that are right to a pixel
+SURE = 4.5  # half of 3^2: three sigmas for the tilt of a square with corner errors of one pixel
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FicTracConfig:
-    """What a config.txt says of camera, ball and animal."""
+    """Camera, ball and animal of a config.txt."""
 
     source: Path | int  # a movie, or the number of a camera
     rate_hz: float | None  # None: that of the file
@@ -51,10 +51,10 @@ class FicTracConfig:
     ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
     circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
     limb_px: Floats  # (n, 2), u, v of the points of the limb
-    ahead_cam: Floats | None  # (3,), towards the ball's middle, where the file states it: `roi_c` goes before the limb
+    ahead_cam: Floats | None  # (3,), towards the ball's centre, if stated: `roi_c` has priority over the limb
     turn: Floats  # (3,), rad, from camera to animal; of c2a_r, or (4, 2), px: the corners of the square of c2a_src
     plane: str | None  # of the square: xy, yz or xz of the animal; None: `turn` is a rotation
-    unread: tuple[str, ...]  # keys of the file that change nothing here
+    unread: tuple[str, ...]  # keys that are ignored
 
     def R_animal_cam(self, image_size: tuple[int, int]) -> Tensor:
         """Return the rotation (3, 3) to the animal's axes: x ahead, y right, z down; ExperimentError: corners do not
@@ -81,8 +81,8 @@ class FicTracConfig:
 
 
 def read_fictrac_config(path: Path) -> FicTracConfig:
-    """Read config.txt; ExperimentError: another file, no movie, field of view or animal's frame, or a colour not
-    supported.
+    """Read config.txt. Raises ExperimentError: not such a file; no movie, field of view or animal's frame; a colour
+    that is not supported.
     """
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
     pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith(("#", "%")))
@@ -100,7 +100,7 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
     if len(vfov) != 1 or not 0 < vfov[0] < widest:
         raise input_error(f"{path}, vfov", f"degrees, 0 to {widest}", f"'{values['vfov'][:40]}'", "correct it")
     used, turn, plane = USED, np.array(_numbers(values.get("c2a_r", ""))), None
-    if len(turn) != 3:  # FicTrac then takes the corners
+    if len(turn) != 3:  # FicTrac then uses the corners
         corners = values.get("c2a_src", "")
         turn, plane = np.array(_numbers(values.get(corners, ""))), corners[-2:]
         if len(turn) != 8 or plane not in SQUARES:
@@ -125,9 +125,9 @@ def read_fictrac_config(path: Path) -> FicTracConfig:
 
 
 def _R_of_square(square: Floats, seen: Floats, pixel_rad: float) -> Tensor:
-    """Return the rotation (3, 3) from camera to animal where the corners (4, 3) of a square are seen along unit vectors
-    (4, 3). Source: FicTrac's SquareRT: the least sum of squared differences between unit vectors. ExperimentError where
-    corners that are off by a pixel could be those of the square's mirror image, tilted the other way.
+    """Return the rotation (3, 3) from camera to animal, from corners (4, 3) of a square and unit vectors to them
+    (4, 3): least squares between unit vectors. Source: FicTrac's SquareRT. Raises ExperimentError: within a pixel the
+    corners also fit the square tilted the other way.
     """
 
     def off(pose: Floats) -> Floats:
@@ -150,9 +150,9 @@ def _R_of_square(square: Floats, seen: Floats, pixel_rad: float) -> Tensor:
 
 
 def fictrac_axes(camera: Camera, config: Path | None) -> FicTracAxes:
-    """Return the axes of FicTrac's table for a camera: the experiment's lab, or with a config.txt FicTrac's own: its
-    "camera" looks at the ball's middle, and c2a_r turns that frame to its "lab". Raise ExperimentError: no such file,
-    or no limb in it. Source: FicTrac 2.1.2, Trackball.cpp (roi_to_cam_r, updatePath), geometry.cpp
+    """Return the axes of FicTrac's table for a camera: the experiment's lab, or with a config.txt FicTrac's: its
+    "camera" looks at the ball's centre, and c2a_r rotates that frame to its "lab". Raises ExperimentError: no such
+    file, or no limb in it. Source: FicTrac 2.1.2, Trackball.cpp (roi_to_cam_r, updatePath), geometry.cpp
     (circleFit_camModel).
     """
     R_cam_lab = camera.R_cam_lab.numpy()
@@ -179,11 +179,11 @@ def _numbers(text: str) -> list[float]:
 
 
 def _points(text: str) -> Floats:
-    """Return numbers as points (n, 2); an odd last one is left out, as FicTrac does."""
+    """Return numbers as points (n, 2); an odd last number is dropped, as in FicTrac."""
     numbers = _numbers(text)
     return np.array(numbers[: len(numbers) // 2 * 2]).reshape(-1, 2)
 
 
 def _polygons(text: str) -> list[Floats]:
-    """Return the innermost { ... } of a text as polygons (n, 2); those of less than three points hide nothing."""
+    """Return the innermost { ... } of a text as polygons (n, 2) of at least three points."""
     return [points for group in re.findall(r"\{([^{}]+)\}", text) if len(points := _points(group)) >= 3]

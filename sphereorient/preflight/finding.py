@@ -6,7 +6,7 @@ class Severity(StrEnum):
     """How bad a finding is."""
 
     OK = "ok"
-    WARNING = "warning"  # the run works, but less well than it could
+    WARNING = "warning"  # the run works, with lower quality
     FAULT = "fault"  # the run fails, or its numbers are wrong
 
 
@@ -24,7 +24,7 @@ class Finding:
 
 
 def judged(title: str, measured: str, *complaints: tuple[bool, Severity, str]) -> Finding:
-    """Return a finding with the first complaint that holds; each is whether it holds, how bad it is, and the advice."""
+    """Return a finding with the first complaint that holds; each is (whether it holds, severity, advice)."""
     severity, advice = next((complaint[1:] for complaint in complaints if complaint[0]), (OK, ""))
     return Finding(title=title, severity=severity, measured=measured, advice=advice)
 

@@ -1,4 +1,4 @@
-"""A first look at movies of which nothing is known, and their experiment.yaml, which asks for what was not measured."""
+"""A first look at unknown movies, and their experiment.yaml, with open keys for what was not measured."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,38 +26,36 @@ from sphereorient.movies import Movie, movie_files, open_movie
 from sphereorient.movies.stamps import rate_of
 from sphereorient.preflight.sample import sample_movie
 
-WIDE_DEG = 30.0  # field of view that is the example
-STAYS, NEAR = 0.15, 1.0  # of the radius: a ball whose outlines scatter, or lie apart, by less stays in its place
-FIRM = 0.05  # likewise, where the pictures together show no outline
-PARTS, LEAST = 5, 4  # of the pictures, in which the outline of a ball that stays is found again; pictures of one
-SURE_PX, SURE_SHARE = 1.0, 0.03  # px, of the radius: outlines of parts that lie apart by more than both are doubtful
+WIDE_DEG = 30.0  # field of view in the example
+STAYS, NEAR = 0.15, 1.0  # of the radius: a ball is fixed if its outlines scatter, or lie apart, by less
+FIRM = 0.05  # likewise, if all pictures together show no outline
+PARTS, LEAST = 5, 4  # of the pictures, for the outline of a fixed ball; least pictures of a part
+SURE_PX, SURE_SHARE = 1.0, 0.03  # px, share of the radius: outlines of parts that differ by more than both are doubtful
 AGREES = 0.05  # of the radius: a given circle that differs by less
-SEEN, ALWAYS = 0.4, 0.99  # share of the frames in which a ball is found at least, that moves, or that sinks slowly
-PICTURES, SLOW_PICTURES = 40, 100  # all over the movie, for a ball that stays, or sways
-EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
+SEEN, ALWAYS = 0.4, 0.99  # least share of the frames with a ball that moves; that sinks slowly
+PICTURES, SLOW_PICTURES = 40, 100  # spread over the movie, for a ball that is fixed, or sways
+EXPOSURE = "s, how long the shutter is open; separates motion blur from the blur of the optics"
 DEVICE = {"trigger": "Line1", "exposure_ms": 0.4, "rate_hz": 600.0, "pixel_format": "Mono8", "offset": [0, 0]}
 FLOW = {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FirstLook:
-    """What a movie shows; made by `look_at`."""
+    """Findings of a first look at a movie; made by `look_at`."""
 
     name: str  # of its camera
     movie: Movie
     rate_hz: float | None  # by exact time stamps; None: the file has none
     diameter_px: float | None  # None: no ball was found
-    stays: bool | None  # whether the ball stays in its place; None: not known
-    sways: bool = False  # whether it does not stay exactly there
-    found: (
-        int  # frames with a ball, of `looked`; parts of the movie, where its outline is that of all pictures together
-    )
+    stays: bool | None  # whether the ball is fixed; None: not known
+    sways: bool = False  # whether it moves a little in its place
+    found: int  # of `looked`, with a ball: frames, or parts of the movie if the outline is of all pictures together
     looked: int
-    apart_px: float = math.nan  # by how much these outlines differ in u, v or radius
+    apart_px: float = math.nan  # largest difference of these outlines in u, v or radius
     together: bool = False  # whether the outline is that of all pictures together, as `track` finds it
-    given: tuple[float, float, float] | None = None  # a circle of others: u, v, radius, px
-    frame: int  # one in which the ball was found, where there is one
-    picture: NDArray[Any]  # (H, W), of it
+    given: tuple[float, float, float] | None = None  # a given circle: u, v, radius, px
+    frame: int  # one with the ball, if found
+    picture: NDArray[Any]  # (H, W), of this frame
     outline: Outline | None  # of the ball in it
     vfov_deg: float | None = None  # field of view, by the tags of a photograph
 
@@ -75,7 +73,7 @@ class FirstLook:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the outline of a ball that stays is not sure, and nobody gave the same."""
+        """Whether the outline of a fixed ball is uncertain, and no given circle agrees."""
         if not self.stays or self.sways or self.photograph or self.outline is None:
             return False
         alone = not self.together or self.found < self.looked - 1
@@ -83,24 +81,24 @@ class FirstLook:
         return self.differs or ((alone or apart) and self.given is None)
 
     def words(self) -> str:
-        """Return what is known of the ball."""
+        """Describe the ball."""
         if self.diameter_px is None or self.outline is None:
-            return "no ball was found: light, or more than one thing that moves?"
+            return "no ball was found: check the light, and whether anything else moves"
         seen = f"found in {self.found} of {self.looked} {'parts of the movie' if self.together else 'frames'}"
         seen += f", {self.apart_px:.1f} px apart" if math.isfinite(self.apart_px) else ""
-        seen = "as given, since the movie shows none surely" if self.given == self.outline.circle else seen
-        stays = "sways in its place" if self.sways else f"stays in its place, outline {seen}"
+        seen = "as given, as the movie shows none clearly" if self.given == self.outline.circle else seen
+        stays = "sways in its place" if self.sways else f"fixed, outline {seen}"
         where = "one picture" if self.photograph else stays if self.stays else f"moves, {seen}"
         words = f"ball of {self.diameter_px:.{int(bool(self.stays))}f} px, {where}"
         if self.given is not None and self.given != self.outline.circle:
             u, v, radius = self.given
             words += f"; the given circle, {2 * radius:.1f} px about ({u:.1f}, {v:.1f}), "
-            words += "differs: the outline found is used" if self.differs else "agrees"
+            words += "differs: the found outline is used" if self.differs else "agrees"
         return f"{words}; DOUBTFUL: see the picture, draw it with `sphereorient mark`" if self.doubtful else words
 
 
 def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> FirstLook:
-    """Return a look at a fixed ball with a given circle (u, v, radius, px), used where the pictures show none."""
+    """Return a look at a fixed ball with a given circle (u, v, radius, px), used if the pictures show none."""
     if circle is None or look.together:
         return replace(look, stays=True, given=circle)
     return replace(look, stays=True, given=circle, outline=given_outline(circle), diameter_px=2 * circle[2])
@@ -109,16 +107,14 @@ def with_circle(look: FirstLook, circle: tuple[float, float, float] | None) -> F
 def look_at(
     paths: Sequence[Path | str], progress: Progress = silent, shown: NDArray[np.bool_] | None = None
 ) -> list[FirstLook]:
-    """Look at the movies of one ball; `shown` (H, W): False where something hides the ball of a single movie.
-    MovieError.
-    """
+    """Look at the movies of one ball; `shown` (H, W): False where a single movie's ball is hidden. Raise MovieError."""
     movies = [open_movie(path) for path in paths]
     each = side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies)))
     return agreed(list(counted("look", each, len(movies), progress)))
 
 
 def agreed(looks: Sequence[FirstLook]) -> list[FirstLook]:
-    """Return looks at one ball: where it moves in a movie, it moves in all; a short one may show little of that."""
+    """Return consistent looks at one ball: if it moves in one movie, it moves in all (a short movie may hide it)."""
     moves = not all(one.stays for one in looks)
     return [replace(one, stays=None, sways=False, together=False) if moves and one.sways else one for one in looks]
 
@@ -153,7 +149,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
             stays = None
     if not (stays or stream.photograph) and near and (not seen or len(outlines) > ALWAYS * looked):
         with suppress(ExperimentError, MovieError):
-            # Of a ball that sinks: in a few frames it nearly stays.
+            # A ball that sinks slowly hardly moves in a few frames.
             outline, _ = swaying_ball(stream.spread(SLOW_PICTURES), settings, shown=shown)
             seen, stays, sways, together, radius_px = True, True, True, True, outline.radius_px
     if stays is None and firm:
@@ -183,9 +179,7 @@ def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = Non
 def _again(
     pictures: NDArray[Any], outline: Outline, settings: LocateSettings, shown: NDArray[np.bool_] | None
 ) -> tuple[int, int, float]:
-    """Return in how many parts of pictures (n, H, W) a fixed ball is found, of how many, and their largest distance,
-    px.
-    """
+    """Return parts of pictures (n, H, W) with a fixed ball, number of parts, and largest difference of outlines, px."""
     parts, circles = max(1, min(PARTS, len(pictures) // LEAST)), []
     for k in range(parts):
         with suppress(ExperimentError):
@@ -194,7 +188,7 @@ def _again(
 
 
 def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraStream:
-    """Return a movie with a camera that stands for one not known: a ball sought in pictures alone needs none."""
+    """Return a movie with a dummy camera: the search in pictures alone needs none."""
     height, width = movie.frame_shape
     pose: dict[str, Any] = {"R_cam_lab": torch.eye(3, dtype=torch.float64), "T_cam_lab_mm": (0.0,) * 3}
     lens: dict[str, Any] = {"f_px": 2.0 * height, "centre_px": middle_of_picture((width, height))}
@@ -215,13 +209,13 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
     circles = {one.name: [round(part, 1) for part in one.outline.circle] for one in looks if one.stays and one.outline}
     lost = any(one.stays and not one.together for one in looks)  # without a circle `track` does not find it
     taken = lost and all(one.given for one in looks)
-    found = "DOUBTFUL, `sphereorient mark` draws it" if any(one.doubtful for one in looks) else "found without this key"
+    found = "DOUBTFUL, draw it: `sphereorient mark`" if any(one.doubtful for one in looks) else "found without this key"
 
     def key(name: str, comment: str, value: Any = ..., example: Any = None) -> DraftKey:
         return DraftKey(name=name, value=value, comment=comment, example=example)
 
-    empty = "the scene without the ball, of the movie's size: better for short movies"
-    hidden = "black where something that does not move hides the ball: `sphereorient mark` draws them"
+    empty = "the scene without the ball, in the movie's size: better for short movies"
+    hidden = "black where a static object hides the ball: `sphereorient mark` draws them"
     return [
         key("name", "free", folder.resolve().name),
         *_rate_keys(looks),
@@ -239,21 +233,21 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
             asked=lost,
         ),
         key("start", "frame of each movie that is the experiment's frame 0", example=each(0)),
-        key("frames", "first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]),
+        key("frames", "first, last + 1; default: all", example=[0, min(len(one.movie) for one in looks)]),
         key("flip", "mirrored movies: vertical, horizontal, both, transpose", example=each("vertical")),
-        key("response", "of the cameras: linear, srgb, {gamma: 2.2}, or a table; learnt without it", example="srgb"),
+        key("response", "of the cameras: linear, srgb, {gamma: 2.2}, or a table; default: learnt", example="srgb"),
         key("flow", "SI, for reports", example=FLOW),
-        key("camera", "what `live` sets on each device; trigger: none runs freely", example=each(DEVICE)),
+        key("camera", "settings of each device for `live`; trigger: none runs freely", example=each(DEVICE)),
     ]
 
 
 def _rate_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
     if all(one.photograph for one in looks):
-        return [DraftKey(name="frame_rate", value=1.0, comment="Hz; any, of one picture")]
+        return [DraftKey(name="frame_rate", value=1.0, comment="Hz; any value, for one picture")]
     rate = looks[0].rate_hz
     if rate is not None and all(one.rate_hz for one in looks):
         times = DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz")
-        units = f"of these stamps, not stated in the files: s, or by their size {looks[0].movie.likely_units}"
+        units = f"of these stamps, not stated in the files: s, or, judged by their size, {looks[0].movie.likely_units}"
         asked = DraftKey(name="time_unit", comment=units, example="ms", asked=True)
         return [times, asked] if looks[0].movie.likely_units else [times]
     played = next((f"; players show it at {one.movie.played_hz:g}" for one in looks if one.movie.played_hz), "")
@@ -264,13 +258,13 @@ def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
     stays: bool | str = all(one.stays for one in looks)
     sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
     photograph = len(looks) == 1 and looks[0].photograph
-    unknown = "; null where it is not known: lengths are then in radii" if len(looks) == 1 and stays else ""
+    unknown = "; null if unknown: lengths are then in radii" if len(looks) == 1 and stays else ""
     size = f"mm{unknown} ({sizes or 'no ball was found'})"
-    fixed = f"whether the ball only turns, in its place: {'' if stays else 'not '}so in these movies"
+    fixed = f"whether the ball only rotates, in its place: {'yes' if stays else 'no'} in these movies"
     if stays and any(one.sways for one in looks):
-        stays, fixed = "sways", "true, false, or sways: it turns in its place, but sways or sinks there in these movies"
+        stays, fixed = "sways", "true, false, or sways: it rotates in its place, but sways or sinks in these movies"
     if looks[0].photograph:
-        stays, fixed = False, "whether the ball only turns, in its place: no matter, in one picture"
+        stays, fixed = False, "whether the ball only rotates, in its place: irrelevant for one picture"
     return [
         DraftKey(name="sphere.diameter", value=None if photograph else ..., comment=size, example=18.0, asked=True),
         DraftKey(name="sphere.texture", value="texture.png", comment="`sphereorient track` learns it from the movies"),
@@ -279,11 +273,11 @@ def _sphere_keys(looks: Sequence[FirstLook]) -> list[DraftKey]:
 
 
 def field_key(look: FirstLook, vfov_deg: float | None) -> DraftKey:
-    """Return the field of view of a single camera as a key to ask for, with what a wrong one does to this ball."""
+    """Return the field of view of a single camera as an open key; the comment gives the effect of a wrong value."""
     known, height = vfov_deg or look.vfov_deg, look.movie.frame_shape[0]
     focal_px = focal_of_field(height, WIDE_DEG)
     limb_deg = math.degrees(math.atan((look.diameter_px or height / 2) / 2 / focal_px))
-    wrong = f"{WIDE_DEG:g} in place of 1 moves paint at this ball's limb by {limb_deg:.0f} degrees"
+    wrong = f"{WIDE_DEG:g} instead of 1 moves paint at this ball's limb by {limb_deg:.0f} degrees"
     comment = f"field of view, degrees, top to bottom of the picture: 2 atan(height of the sensor / 2 f); {wrong}"
     name = f"cameras.{look.name}.vfov_deg"
     return DraftKey(name=name, value=known or ..., comment=comment, example=WIDE_DEG, asked=True)

@@ -1,4 +1,4 @@
-"""Are the movies in step? The gap between the lines of sight at each offset, in stretches with much motion."""
+"""Synchronisation of the movies: gap between the lines of sight by offset, in stretches with much motion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -49,7 +49,7 @@ class OffsetScan:
 
 
 def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
-    """Choose stretches of consecutive frames with much motion, then different: a late movie's gap varies."""
+    """Choose stretches of consecutive frames with much, and different, motion: a late movie's gap varies."""
     count = len(samples[0].stream)
     starts = pair_starts(count)
     if not starts:
@@ -57,7 +57,7 @@ def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
     first, second = samples[:2]
     gaps = gaps_between((first.camera, second.camera), (first.sightings.centre_px, second.sightings.centre_px))
     across_px = (gaps.position_lab_mm * gaps.across_lab).sum(-1) * gaps.per_mm_px
-    index = np.searchsorted(samples[0].frame, starts)  # the next frame is the next one of the sample
+    index = np.searchsorted(samples[0].frame, starts)  # the next frame follows in the sample
     moved = torch.nan_to_num(across_px[index + 1] - across_px[index])
     liveliest = int(moved.abs().argmax())
     order = (moved - moved[liveliest]).abs().argsort(descending=True).tolist()
@@ -141,7 +141,7 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
         return judged(title, f"unknown: the ball moves {moved_px:.2f} px a frame across the lines of sight")
     scans = [scan for scan in scans if scan.moved_px > MOVES_PX]
     late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
-    # Two movies: against the first; more: against most of them.
+    # Two movies: late against the first; more: against the majority.
     usual = median_low(value for value in late.values() if not math.isnan(value)) if len(scans) > 1 else 0.0
     late = {name: value - usual for name, value in late.items()}
     if any(math.isnan(value) for value in late.values()):
@@ -154,14 +154,14 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
     shifted = [scan for scan in scans if scan.shift]
     if not shifted:
         which = "both" if len(scans) == 1 else "all"
-        advice = f"trigger {which} cameras by one signal: start: cannot correct a part of a frame"
+        advice = f"trigger {which} cameras by one signal: start: cannot correct part of a frame"
         return judged(title, measured, (abs(late[name]) > IN_STEP, WARNING, advice))
     now = max(float(scan.gap_px[LATEST]) for scan in shifted)
     best = max(float(scan.gap_px.min()) for scan in shifted)
     measured += f"; the gap falls from {now:.2f} to {best:.2f} px"
     begins = ", ".join(f"{one}: {first}" for one, first in starts_in_step(start, late).items())
     weak = (now < CLEARLY * best, WARNING, "look at one event in both movies: this evidence is weak")
-    return judged(title, measured, weak, (True, FAULT, f"write start: {{{begins}}}"))
+    return judged(title, measured, weak, (True, FAULT, f"set start: {{{begins}}}"))
 
 
 def starts_in_step(start: Mapping[str, int], late: Mapping[str, float]) -> dict[str, int]:

@@ -1,5 +1,5 @@
 "use strict";
-// What the pages of `sphereorient mark` share: a picture that fills a canvas, and talk with the server.
+// Shared by the pages of `sphereorient mark`: a picture on a canvas, and requests to the server.
 const $ = id => document.getElementById(id), canvas = $("canvas"), context = canvas.getContext("2d");
 let shown = null, zoom = 1, left = 0, up = 0;  // shown: { width, height } of the picture; each page has a draw()
 
@@ -33,7 +33,7 @@ function fromEvent(event) {
   const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
   return [((event.clientX - box.left) * scale - left) / zoom - .5, ((event.clientY - box.top) * scale - up) / zoom - .5];
 }
-canvas.onwheel = event => {  // zooms about the place under the mouse
+canvas.onwheel = event => {  // zoom about the mouse
   event.preventDefault();
   if (!shown) return;
   const [u, v] = fromEvent(event), least = Math.min(canvas.width / shown.width, canvas.height / shown.height);

@@ -1,6 +1,4 @@
-"""The server of the pages on which people mark what pictures show: masks, or fiducials of a plate. It answers this
-machine alone, to requests with the random token of its address.
-"""
+"""Server of the pages for marking masks or fiducials; it answers local requests with the token of its address only."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -21,7 +19,7 @@ HERE, SHARED = Path(__file__).parent, ("mark.css", "mark.js")  # beside the page
 
 
 class Marking(ABC):
-    """A YAML file in which a page writes what is marked; the handler of requests calls it from several threads."""
+    """A YAML file and the page that writes marks into it; called from several threads."""
 
     page: ClassVar[str]  # name of its file
     error: ClassVar[type[SphereOrientError]]
@@ -32,7 +30,7 @@ class Marking(ABC):
         self.lock = Lock()
 
     def shown(self, steps: Sequence[str]) -> Answer:
-        """Return what lies at a path behind the token: here the files of the page; None: nothing."""
+        """Return the content at a path behind the token: here the files of the page; None: nothing."""
         match steps:
             case [""]:
                 return HERE / self.page
@@ -42,22 +40,22 @@ class Marking(ABC):
 
     @abstractmethod
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
-        """Do what is asked for at a path, and return what was done; None: nothing is done there."""
+        """Execute the request at a path and return its result; None: no such request."""
 
     def refused(self, name: str, expected: str, got: str, do: str) -> SphereOrientError:
         """Return an error of the file's kind, worded by `refusal`."""
         return self.error(refusal(name, expected=expected, got=got, do=do))
 
     def read(self) -> Any:
-        """Return the values of the file as it is now."""
+        """Return the present values of the file."""
         return read_yaml(self.path, self.error)
 
     def write(self, place: Sequence[str | int], value: Any, by_hand: str) -> None:
-        """Write a value in one line of the file, whose other lines stay, see `with_value`; `by_hand`: else to do."""
+        """Write a value in one line of the file, see `with_value`; `by_hand`: what the user does if that fails."""
         old = read_text(self.path, TEXT_BYTES, "a YAML file", self.error, "correct the path")
         text = with_value(old, place, value)
         if text is None:
-            expected = f"a key {place[-1]} in one line, or a place for it"
+            expected = f"a key {place[-1]} in one line, or room for it"
             raise self.refused(str(self.path), expected, "another form", by_hand)
         with writing(force=True):
             write_text(self.path, text)

@@ -1,4 +1,4 @@
-"""Fiducials of a plate that people click in the browser, where `calibrate` does not find them."""
+"""Fiducials of a plate, clicked in the browser where `calibrate` does not find them."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,7 +35,7 @@ class FiducialMarking(Marking):
         self.dots: dict[Photo, Dots] = {}
 
     def shown(self, steps: Sequence[str]) -> Answer:
-        """Return the state, a picture, or what is found in it."""
+        """Return the state, a picture, or its detected dots."""
         match steps:
             case ["state"]:
                 return self.state()
@@ -57,7 +57,7 @@ class FiducialMarking(Marking):
         return None
 
     def state(self) -> Json:
-        """Return what the page begins with."""
+        """Return the initial state of the page."""
         width, height = self.document.keys.image_size
         return {
             "file": str(self.path),
@@ -91,8 +91,8 @@ class FiducialMarking(Marking):
         }
 
     def save(self, picture: Photo, points: Any) -> Json:
-        """Write clicked places into the file; return the view with them. Raises CameraError (impossible places, places
-        that do not tie the picture, or a file that cannot be changed safely), OutputError (the file cannot be written).
+        """Write clicked places into the file; return the view with them. Raises CameraError (impossible or insufficient
+        places, or a file that cannot be changed safely), OutputError (the file cannot be written).
         """
         clicked = self._checked(picture, points).round(1)
         view = self.view(picture, clicked)
@@ -112,7 +112,7 @@ class FiducialMarking(Marking):
         return view
 
     def _entries(self) -> list[Mapping[str, Any]]:
-        content = self.read()  # a person may have changed it since
+        content = self.read()  # the user may have changed it
         entries = content.get("pictures") if isinstance(content, dict) else None
         return [entry if isinstance(entry, dict) else {} for entry in entries] if isinstance(entries, list) else []
 

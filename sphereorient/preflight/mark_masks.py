@@ -1,4 +1,4 @@
-"""Masks that people draw in the browser, what hides the ball, and other keys that are tried there on a short clip."""
+"""Masks drawn in the browser, and other keys tried there on a short clip."""
 
 import base64
 import tempfile
@@ -31,12 +31,12 @@ from sphereorient.search import GreySearch, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
 
 Bools = NDArray[np.bool_]
-MOST_SHAPES = 200  # of a mask: far more than anyone draws
+MOST_SHAPES = 200  # of a mask
 FAR_PX = 1e5
 
 
 class MaskMarking(Marking):
-    """An experiment whose masks are drawn, and whose circle, light and field of view are tried."""
+    """An experiment with masks to draw, and circle, light and field of view to try."""
 
     page = "mark_masks.html"
     error = ExperimentError
@@ -49,13 +49,13 @@ class MaskMarking(Marking):
 
     @cached_property
     def looks(self) -> dict[str, FirstLook]:
-        """What each movie shows without any mask drawn here."""
+        """First looks at the movies, without the masks drawn here."""
         looks = agreed([look_at_movie(name, movie, self.masks[name]) for name, movie in self.movies.items()])
         return {look.name: look for look in looks}
 
     @cached_property
     def clip(self) -> Clip:
-        """The first frames, which are tracked again."""
+        """The first frames, to be tracked again."""
         return Clip(self.experiment)
 
     def shown(self, steps: Sequence[str]) -> Answer:
@@ -74,7 +74,7 @@ class MaskMarking(Marking):
         return super().shown(steps)
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Json | None:
-        """Save the mask of a camera, of `shapes` and `keep`; track a clip with these and other keys, or save those."""
+        """Save a camera's mask of `shapes` and `keep`; or track a clip with these and other keys; or save those."""
         match steps:
             case ["save" | "track" | "adopt" as what, name]:
                 if not {"shapes", "keep"} <= set(asked):
@@ -85,7 +85,7 @@ class MaskMarking(Marking):
         return None
 
     def state(self) -> Json:
-        """Return what the page begins with."""
+        """Return the initial state of the page."""
         return {
             "experiment": str(self.path),
             "cameras": [
@@ -117,9 +117,9 @@ class MaskMarking(Marking):
         return tried
 
     def adopt(self, name: str, asked: Mapping[str, Any]) -> Json:
-        """Write what `track` would be asked into mask, experiment.yaml and cameras.yaml, whose other lines stay."""
+        """Write the values of `track` into mask, experiment.yaml and cameras.yaml; other lines stay."""
         with self.lock, tempfile.TemporaryDirectory() as folder:
-            tried = self._changed(name, asked, Path(folder))  # all of it is possible
+            tried = self._changed(name, asked, Path(folder))  # checks all of it first
         keys: Json = {}
         if asked.get("circle") is not None:
             keys["circles"] = {one: [round(part, 2) for part in circle] for one, circle in tried.circles.items()}
@@ -135,7 +135,7 @@ class MaskMarking(Marking):
                 with writing(force=True):
                     write_text(tried.cameras_path, self._cameras(name, asked["vfov_deg"]))
                 files.append(str(tried.cameras_path))
-        if asked["shapes"]:  # last: it is least likely to be refused
+        if asked["shapes"]:  # last: least likely to fail
             files.append(self.save(name, asked["shapes"], keep=bool(asked["keep"]))["file"])
         self.experiment = load_experiment(self.path)
         return {"files": [*files, str(self.path)]}
@@ -160,7 +160,7 @@ class MaskMarking(Marking):
         return new
 
     def frame(self, name: str, number: int) -> bytes:
-        """Return a frame as PNG, 8 bit, its brightest level white; MovieError where it cannot be decoded."""
+        """Return a frame as PNG, 8 bit, the brightest level white. Raises MovieError if it cannot be decoded."""
         movie = self._movie(name)
         if number >= len(movie):
             expected = f"0 .. {len(movie) - 1}"
@@ -169,14 +169,14 @@ class MaskMarking(Marking):
             return png(eight_bits(movie.sample([number])[0]))
 
     def mask(self, name: str) -> bytes:
-        """Return what is hidden now as PNG: red, half transparent, where the mask is black."""
+        """Return the present mask as PNG: red, half transparent, where it hides."""
         picture = np.zeros((*self._movie(name).frame_shape, 4), np.uint8)
         if (shown := self.masks[name]) is not None:
             picture[~shown] = (0, 0, 255, 110)
         return png(picture)
 
     def outline(self, name: str) -> Json:
-        """Return the ball as a first look finds it in this movie: where, how large, and whether it stays."""
+        """Return outline, size and rest of the ball by a first look at this movie."""
         self._movie(name)
         with self.lock:
             look = self.looks[name]
@@ -186,19 +186,19 @@ class MaskMarking(Marking):
         return circle | {"found": True, "stays": look.stays, "frame": look.frame, "words": look.words()}
 
     def rendered(self, name: str) -> Json:
-        """Return the ball of `outline` as the texture map says it looks: a picture, and how much of it is explained.
-        Raises ExperimentError (no map, no ball, or none that the map explains), TextureError (the map cannot be read).
+        """Render the ball of `outline` from the texture map; return the picture and the share that it explains. Raises
+        ExperimentError (no map, no ball, or the map does not fit), TextureError (the map cannot be read).
         """
         ball = self.outline(name)
         if not ball["found"]:
-            raise self.refused(name, "a ball", "none in this movie", "draw what hides it, or choose another camera")
+            raise self.refused(name, "a ball", "none in this movie", "mask what hides it, or choose another camera")
         with self.lock:
             look, search = self.looks[name], self._search
             u, v, radius = ball["u"], ball["v"], ball["radius"]
             disk = torch.from_numpy(crop_disk(look.picture, u, v, radius, search.size_px))
             found = search.propose(disk[None])
             if not len(found.score):
-                do = "another ball, or the map of another one, looks like this"
+                do = "check sphere.texture: the map may be of another ball"
                 raise self.refused(name, "a ball that the map explains", "none", do)
             size = max(2, round(2 * radius))
             view = orthographic_view(size)
@@ -226,9 +226,9 @@ class MaskMarking(Marking):
         return GreySearch(self._texture)
 
     def save(self, name: str, shapes: Sequence[Mapping[str, Any]], *, keep: bool) -> Json:
-        """Write the mask of a camera and name it in experiment.yaml. Shapes hide (`hide`) or are all that is shown
-        (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px; `keep`: the old mask counts too. Raises
-        ExperimentError (impossible shapes, or nothing is shown), OutputError (a file cannot be written).
+        """Write the mask of a camera and name it in experiment.yaml. Shapes hide their inside (`hide`) or outside
+        (`show`): polygons (`points`) or circles (`u`, `v`, `radius`), px; `keep`: add to the old mask. Raises
+        ExperimentError (impossible shapes, or all is hidden), OutputError (a file cannot be written).
         """
         shown = drawn_mask(self._movie(name).frame_shape, shapes, self.masks[name] if keep else None)
         file = self.path.parent / f"{name}_mask.png"
@@ -252,7 +252,7 @@ def _vfov_deg(camera: Camera) -> float | None:
 
 
 def drawn_mask(size: tuple[int, int], shapes: Sequence[Mapping[str, Any]], old: Bools | None) -> Bools:
-    """Return what a mask (H, W) shows after shapes are drawn, see `MaskMarking.save`; ExperimentError for others."""
+    """Return a mask (H, W), True: shown, with shapes drawn, see `MaskMarking.save`. Raises ExperimentError."""
     if not isinstance(shapes, list | tuple) or len(shapes) > MOST_SHAPES:
         raise _refused("shapes", f"at most {MOST_SHAPES} of them", "another thing")
     hidden, region = np.zeros((2, *size), np.uint8)

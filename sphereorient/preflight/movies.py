@@ -25,7 +25,7 @@ INSIDE = 0.9  # of the radius: the disk whose grey levels count
 SATURATED, MUCH_SATURATED = 0.03, 0.2  # share of the ball's pixels; reflections are 1 % in a good movie
 BLACK = 0.2  # share of the ball's pixels at level 0
 RANGE = 0.12  # of full scale: the least distance of black and white paint
-SIGNAL = 10.0  # white less black paint, in standard deviations of the noise
+SIGNAL = 10.0  # white minus black paint, in standard deviations of the noise
 SOFT_PX, SOFT_SHARE = 1.3, 0.035  # standard deviation of the limb's blur: px, and as share of the radius
 SMEAR_PX = 2.0  # motion of the ball during an exposure
 INTERPOLATION_PX2 = 1 / 6  # variance that linear interpolation adds: that of a triangle two pixels wide
@@ -65,7 +65,7 @@ def movie_file(sample: MovieSample) -> Finding:
     height, width = movie.frame_shape
     brightest = f"brightest level {sample.background.full_scale:.0f}"
     measured = f"{movie.path.name}: {len(movie)} pictures of {width} x {height} px, {brightest}"
-    complaint = (bool(movie.remarks), WARNING, "record or export the movie again if this is not meant")
+    complaint = (bool(movie.remarks), WARNING, "record or export the movie again if this is not intended")
     return judged(f"movie {sample.name}", "; ".join([measured, *movie.remarks]), complaint)
 
 
@@ -74,7 +74,7 @@ def pictures(samples: Sequence[MovieSample]) -> Finding:
     seen: dict[int, Reason] = {}
     for sample in samples:
         for row, reason in zip(sample.row.tolist(), sample.screen, strict=True):
-            # A frame in two samples is repeated if either sample has its neighbour.
+            # A frame in two samples counts as repeated if it repeats its neighbour in either.
             if row != NONE and seen.get(row, Reason.OK) is Reason.OK:
                 seen[row] = reason
     title = f"pictures {samples[0].name}"
@@ -89,11 +89,11 @@ def pictures(samples: Sequence[MovieSample]) -> Finding:
 
 
 def ball(sample: MovieSample) -> Finding:
-    """Count the frames with a ball, and the reasons for those without; name the frames that show none."""
+    """Count the frames with a ball and the reasons for the others; name the frames without a ball."""
     title, none = f"ball {sample.name}", np.array([why is Reason.NOT_FOUND for _, why in sample.found])
     usable = [k for k, reason in enumerate(sample.screen) if reason in (Reason.OK, Reason.REPEATED)]
     if sample.in_place is not None:
-        return judged(title, f"stays in its place: one outline for {len(usable)} frames")
+        return judged(title, f"fixed: one outline for {len(usable)} frames")
     reasons = Counter(sample.found[k][1] for k in usable)
     seen, absent = reasons.pop(Reason.OK, 0), 0
     if seen:
@@ -109,17 +109,15 @@ def ball(sample: MovieSample) -> Finding:
 
 
 def background(sample: MovieSample, experiment: Experiment) -> Finding:
-    """Report whether the movie itself shows the background of the ball."""
+    """Report the source of the background: given, learnt from the movie, or guessed."""
     title = f"background {sample.name}"
     if sample.name in experiment.background_paths:
         return judged(title, f"given: {experiment.background_paths[sample.name].name}")
-    advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
+    advice = f"add backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
     if experiment.sphere.in_place:
-        return warning(
-            title, "none given: the background of a ball in its place is guessed from its surroundings", advice
-        )
+        return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
     if sample.stream.photograph:
-        return judged(title, "of one picture: guessed from the surroundings of the ball")
+        return judged(title, "one picture: guessed from the surroundings of the ball")
     balls = [outline.circle for _, outline in sample.balls]
     covers = (sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in balls) / len(balls) for u, v, _ in balls)
     share = max(covers, default=0.0)
@@ -209,7 +207,7 @@ def _profiles(
 def motion_blur(sample: MovieSample, exposure_s: float | None, frame_s: float) -> Finding:
     """Judge the motion of the ball during an exposure, measured between consecutive frames."""
     title = f"motion blur {sample.name}"
-    # The centre of a disk that the border cuts is not known well enough to tell its motion.
+    # The centre of a disk cut by the border is too uncertain to measure motion.
     centre = sample.sightings.centre_px.where(sample.whole[:, None], torch.nan)
     neighbours = np.flatnonzero(np.diff(sample.frame) == 1)
     moved = (centre[neighbours + 1] - centre[neighbours]).norm(dim=-1).numpy()

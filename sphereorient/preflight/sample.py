@@ -28,9 +28,9 @@ from sphereorient.locate.background import measure_background
 from sphereorient.locate.outline import Outline, find_blobs
 from sphereorient.locate.scene import SMALLEST_PX, CameraScene, measured_size_px
 
-SPREAD = 25  # frames all over the movie: enough for a background
-EVERY = 3  # of these, each third one is read with the next frame, for motion and repeated frames
-MORE = (4, 16)  # times as many are read where none of them shows the ball
+SPREAD = 25  # frames spread over the movie, enough for a background
+EVERY = 3  # each third of these is read with the next frame, for motion and repeated frames
+MORE = (4, 16)  # times as many are read if none shows the ball
 FEW = 0.2  # share of the frames; if the ball is found in fewer, other sizes are tried
 LARGEST = 0.9  # of the picture's shorter side: the first diameter tried
 BALLS = 12  # frames in which a ball of unknown size is searched
@@ -48,8 +48,8 @@ class MovieSample:
     background: Background
     diameter_px: float  # searched
     expected_px: float | None  # by cameras and diameter; None: unknown
-    in_place: Outline | None = None  # of a ball that stays in its place
-    screen: tuple[Reason, ...] = ()  # n, whether the picture as a whole can show a ball
+    in_place: Outline | None = None  # of a fixed ball
+    screen: tuple[Reason, ...] = ()  # n, whether the whole picture is usable
     found: tuple[Found, ...] = ()  # n
 
     @property
@@ -74,7 +74,7 @@ class MovieSample:
 
     @cached_property
     def whole(self) -> Tensor:
-        """Frames whose picture holds the whole disk of the ball, (n,) bool."""
+        """Frames that show the whole disk of the ball, (n,) bool."""
         return holds_disk(self.camera, self.sightings.centre_px, self.sightings.radius_px)
 
     @property
@@ -90,7 +90,7 @@ def pair_starts(count: int, spread: int = SPREAD) -> list[int]:
 
 
 def frames_to_sample(count: int, spread: int = SPREAD) -> list[int]:
-    """Return the frames of a timeline to read first: evenly spread ones, some with their next frame."""
+    """Return the frames to read first: evenly spread, some with the next frame."""
     return sorted({*spread_frames(range(count), spread), *(k + 1 for k in pair_starts(count, spread))})
 
 
@@ -102,8 +102,8 @@ def sample_movie(
     scene: CameraScene | None = None,
     stays: bool = False,
 ) -> MovieSample:
-    """Sample one camera's frames, background and ball; measure its diameter if None. `empty`: a picture without it;
-    `scene`: background and size by the tracker; `stays`: the ball is in its place. Raises MovieError: no frame can be
+    """Sample one camera's frames, background and ball; measure the diameter if None. `empty`: a picture without the
+    ball; `scene`: background and size by the tracker; `stays`: the ball is fixed. Raises MovieError: no frame can be
     decoded.
     """
     read = _read(stream, frames_to_sample(len(stream)))
@@ -131,13 +131,13 @@ def sample_movie(
             "in_place": scene.outline,
         }
         first = _searched(MovieSample(**read, **look, stream=stream, expected_px=diameter_px), settings)
-        for times in MORE:  # it may pass by in a few frames
+        for times in MORE:  # the ball may pass in a few frames
             if first.balls or len(first.frame) >= len(stream):
                 break
             first = sample_more(first, frames_to_sample(len(stream), times * SPREAD), settings)
     if (scene is not None or diameter_px is not None) and len(first.balls) > FEW * len(shown):
         return first
-    # The size is unknown or wrong: take whatever is as round as a ball.
+    # The size is unknown or wrong: take any round region.
     chosen = [shown[k] for k in spread_frames(range(len(shown)), BALLS)]
     size_px = measured_size_px(chosen, first.background, settings, LARGEST)
     other = first if size_px is None else at_size(size_px)
@@ -175,7 +175,7 @@ def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
         screen.append(reason)
         found.append(ball or (None, reason))
     seen = np.array([outline is not None for outline, _ in found])
-    if seen.any():  # fainter things are not the ball
+    if seen.any():  # fainter blobs are not the ball
         least = FAINT * float(np.median(merits[seen]))
         faint = (merits < least) & ~seen & np.isin(screen, (Reason.OK, Reason.REPEATED))
         found = [(None, Reason.NOT_FOUND) if none else one for none, one in zip(faint, found, strict=True)]

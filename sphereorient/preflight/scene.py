@@ -30,7 +30,7 @@ from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warn
 from sphereorient.preflight.movies import BALL_SEEN
 from sphereorient.sphere.compare import compare_maps
 
-WHOLE = 0.7  # share of the rim of a disk that tells the size of a ball
+WHOLE = 0.7  # least share of the rim from which a ball's size is measured
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,15 +96,15 @@ def _no_map(ball: Sphere) -> Finding:
 
 
 def same_paint(maps: Mapping[str, Tensor], progress: Progress) -> Iterator[Finding]:
-    """Tell maps of two files that show one paint, in any body frames: balls that wear it look alike."""
+    """Yield a warning for maps of two files that show the same paint, in any body frames."""
     pairs = list(combinations(maps, 2))
     for one, other in counted("maps", pairs, len(pairs), progress):
         try:
             alike = compare_maps(maps[one], maps[other]).correlation
         except PaintError:
             continue
-        measured = f"both show one paint (correlation {alike:.2f})"
-        do = "name one of them for all balls that wear it; else `track` may exchange these balls without a word"
+        measured = f"both show the same paint (correlation {alike:.2f})"
+        do = "name one map for all balls of this paint; else `track` may exchange these balls without a warning"
         yield warning(f"paint of {one} and {other}", measured, do)
 
 
@@ -131,8 +131,8 @@ def disk_counts(disks: Sequence[Sequence[Sequence[Outline]]], balls: Mapping[str
     for c, view in enumerate(next(iter(balls.values())).fitter.views):
         counts = [len(one[c]) for one in disks]
         measured = f"{median(counts):g} disks in the usual frame ({min(counts)} to {max(counts)}), {len(balls)} named"
-        more = "name the other balls under `spheres`; mask what is round and no ball (`sphereorient mark`)"
-        fewer = "leave out of `spheres` what is not there; give backgrounds: where the balls hardly move"
+        more = "name the other balls under `spheres`; mask round objects that are no balls (`sphereorient mark`)"
+        fewer = "remove absent balls from `spheres`; give backgrounds: if the balls hardly move"
         complaints = (median(counts) > len(balls), WARNING, more), (max(counts) < len(balls), WARNING, fewer)
         yield judged(f"balls {view.name}", measured, *complaints)
 
@@ -141,8 +141,8 @@ def found_balls(found: Sequence[SceneFound], balls: Mapping[str, Initialiser]) -
     """Count the frames in which each ball is found by its paint."""
     for name in balls:
         count = sum(len(one[name]) > 0 for one in found)
-        none = f"check texture and diameter under spheres.{name}, or leave it out where it is not there"
-        few = "it is hidden, out of the pictures, or wears another map than the one named"
+        none = f"check texture and diameter under spheres.{name}, or remove it if it is absent"
+        few = "it is hidden, out of view, or its paint is not the named map"
         measured = f"found by its paint in {count} of {len(found)} frames"
         complaints = (not count, FAULT, none), (count < BALL_SEEN * len(found), WARNING, few)
         yield judged(f"ball {name}", measured, *complaints)
@@ -180,6 +180,6 @@ def ball_sizes(
 
 
 def _exchanged(one: str, other: str, measured: Mapping[str, float], named: Mapping[str, float]) -> bool:
-    """Return whether two balls of unlike diameters each have about that of the other."""
+    """Return whether the measured diameters of two balls are those named for the other."""
     swapped = all(abs(measured[a] / named[b] - 1) < BAD for a, b in ((one, other), (other, one)))
     return swapped and abs(named[one] / named[other] - 1) > BAD

@@ -23,14 +23,14 @@ from sphereorient.sphere.texture_table import texture_table
 ROWS = 32  # of the reduced map on which views are averaged: 5.6 degrees
 ONE_COLOUR, FAINT = 0.02, 0.12  # standard deviation of the map, 0 black .. 1 white
 LOPSIDED = (0.1, 0.9)  # limits of a view's brightness
-FINE_PX, COARSE_DEG = 5.0, 70.0  # smaller patches are not resolved; with larger ones, many views have hardly a border
+FINE_PX, COARSE_DEG = 5.0, 70.0  # smaller patches are not resolved; larger ones leave many views without a border
 DRAWS = 4000  # random points that are compared with their neighbourhood
 STEP_DEG = 15.0  # of the grid of rotations with which views are compared
-VIEWS = 300  # directions of view, 8 degrees apart; a rotation of the picture makes no other view
+VIEWS = 300  # directions of view, 8 degrees apart; rotation of the picture makes no new view
 APART_DEG = 20.0  # nearer rotations show the same view
 REFINED = 40  # pairs whose rotation is refined
 BATCH = 64  # views that are normalised at once
-ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: single frames are doubtful, useless
+ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: above, single frames are doubtful, useless
 FRAMES = 8  # spread over the movies, compared with the map
 FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains
 CLEARLY = 0.08  # difference of this share between the picture and its mirror image
@@ -79,8 +79,8 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
 
 
 def unknown_paint(unseen: Tensor) -> Finding:
-    """Report texels (H, 2 H) bool that are no paint."""
-    measured = f"{100 * unseen_share(unseen):.0f} % of the ball is unseen: it weighs nothing"
+    """Report unseen paint, texels (H, 2 H) bool."""
+    measured = f"{100 * unseen_share(unseen):.0f} % of the ball is unseen: it has no weight"
     return warning("unseen paint", measured, "learn the map from movies that show all of it, with `sphereorient map`")
 
 
@@ -109,15 +109,15 @@ def judge_contrast(measures: TextureMeasures, radius_px: float) -> Finding:
     measured += f"{patch_px:.0f} px; contrast {measures.contrast:.2f}"
     lopsided = low < LOPSIDED[0] or high > LOPSIDED[1]
     faint = "paint with more contrast, or check that the map was exported from black to white"
-    fine = "paint larger patches, or bring the ball larger into the picture: such detail is blurred away"
+    fine = "paint larger patches, or film the ball larger: the blur removes such detail"
     return judged(
         "paint",
         measured,
         (measures.contrast < ONE_COLOUR, FAULT, "check the map: it has one colour, which shows no orientation"),
         (measures.contrast < FAINT, WARNING, faint),
         (patch_px < FINE_PX, WARNING, fine),
-        (patch_deg > COARSE_DEG, WARNING, "paint smaller patches: many views show hardly a border"),
-        (lopsided, WARNING, "balance black and white: some views show hardly more than one of them"),
+        (patch_deg > COARSE_DEG, WARNING, "paint smaller patches: many views show hardly any border"),
+        (lopsided, WARNING, "balance black and white: some views are nearly of one colour"),
     )
 
 
@@ -154,7 +154,7 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
 
 
 def views_towards(direction_body: Tensor) -> Tensor:
-    """Return R_view_body (n, 3, 3) that turn body directions (n, 3) towards the viewer, against z of V."""
+    """Return R_view_body (n, 3, 3) that rotate body directions (n, 3) to the viewer, -z of the view."""
     back = -direction_body
     helper = torch.eye(3, dtype=back.dtype)[back.abs().argmin(-1)]
     right = torch.nn.functional.normalize(torch.linalg.cross(helper, back), dim=-1)
@@ -166,14 +166,14 @@ def look_alikes(pair: ViewPair) -> Finding:
     measured = f"the worst pair, {math.degrees(pair.angle_rad):.0f} degrees apart: one explains "
     measured += f"{100 * pair.score:.0f} % of the other"
     measured += ": single frames are unambiguous" if pair.score < ALIKE else ""
-    same = "break the paint's symmetry: add a patch that exists only once; these two views cannot be told apart"
-    alike = "add a patch where the two views are alike: there a single frame is ambiguous without its history"
+    same = "break the paint's symmetry: add a patch that exists only once; these two views are indistinguishable"
+    alike = "add a patch where the two views are alike: single frames of them are ambiguous"
     complaints = (pair.score >= SAME, FAULT, same), (pair.score >= ALIKE, WARNING, alike)
     return judged("views that look alike", measured, *complaints)
 
 
 def match_texture(search: GreySearch, samples: Sequence[MovieSample]) -> list[TextureMatch]:
-    """Search the map in some frames in which every camera shows the ball, the whole of it if there are any."""
+    """Search the map in some frames that show the ball in every camera, whole if possible."""
     placed = torch.stack([sample.sightings.placed for sample in samples]).all(0)
     whole = torch.stack([sample.whole for sample in samples]).all(0)
     seen = (whole if bool(whole.any()) else placed).nonzero()[:, 0].tolist()
@@ -194,12 +194,12 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
 
 
 def shows_no_map(match: TextureMatch) -> bool:
-    """Return whether neither the pictures nor their mirror images show the map to a search by outlines."""
+    """Return whether the search by outlines finds the map neither in the pictures nor in their mirror images."""
     return bool(max(np.median(match.score), np.median(match.mirrored)) < POOR)
 
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch], fitted: bool) -> Finding:
-    """Judge the match of the map with one camera's pictures; `fitted`: a tracker can fit it all the same."""
+    """Judge the match of the map with one camera's pictures; `fitted`: the tracker fits it nevertheless."""
     score, mirrored = np.median(match.score), np.median(match.mirrored)
     measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
     flip = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"

@@ -32,7 +32,7 @@ from sphereorient.statistics.behaviour import Behaviour
 from sphereorient.statistics.cameras import camera_distances
 from sphereorient.trajectory import Trajectory
 
-KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, and what is in them
+KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, suffixes of files
 MOST_STRIPS = 8  # tracks shown frame by frame
 PICTURES = 120  # frames of a report with pictures
 FLOW_KEYS = {
@@ -54,8 +54,8 @@ def write_report(
     command: str = "",
     behaviours: Mapping[str, Behaviour] | None = None,
 ) -> list[Verdict]:
-    """Write the report of tracks, by file name, whole or not at all, and return its findings. `behaviours`: those of
-    tracks that have a reference. Raises TrackError (no valid frame, or tracks of kernels and of smoothers together),
+    """Write the report of tracks, by file name, whole or not at all; return its findings. `behaviours`: of tracks with
+    a reference. Raises TrackError (no valid frame, or a mixture of tracks by kernels and by smoothers),
     ExperimentError (see `match_experiments`, `surroundings_of`), OutputError (see `check_report_folder`).
     """
     known = match_experiments(tracks, experiments)
@@ -85,8 +85,8 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track, of its sphere alone, or None; a single one belongs to a single track.
-    Raises ExperimentError: one without a track or without its sphere, or two of one name.
+    """Return the experiment of each track, with its sphere only, or None; a single one belongs to a single track.
+    Raises ExperimentError: an experiment without track or sphere, or two of one name.
     """
     if len(tracks) == 1 and len(experiments) == 1:
         return {name: experiments[0].of(track.sphere) for name, track in tracks.items()}
@@ -97,7 +97,7 @@ def match_experiments(
         if name in known:
             do = "give them different names (key `name`), or report them one by one"
             got = f"{known[name].path} and {experiment.path}"
-            raise ExperimentError(refusal(f"--experiment '{name}'", expected="one of a name", got=got, do=do))
+            raise ExperimentError(refusal(f"--experiment '{name}'", expected="different names", got=got, do=do))
         if name not in wanted:
             do = "pass the experiment.yaml that the track was measured from"
             expected = f"the name of one of {', '.join(sorted(wanted)[:5])}"
@@ -110,8 +110,8 @@ def match_experiments(
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
-    """Return the properties of sphere and flow; ExperimentError: contradictions. Spheres of one recording that differ
-    in size have no diameter here.
+    """Return the properties of sphere and flow, without a diameter if spheres of one recording differ. Raises
+    ExperimentError: contradictions.
     """
     known: dict[str, float] = {}
     sizes = {(one.path, one.diameter_mm) for one in experiments}
@@ -121,7 +121,7 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
             found["diameter_mm"] = experiment.diameter_mm
         for key, value in found.items():
             if known.setdefault(key, value) != value:
-                do = "report spheres and flows of one kind together, the others by themselves"
+                do = "report spheres and flows of each kind separately"
                 label, got = f"{experiment.path}, {key}", f"{value:g}"
                 raise ExperimentError(refusal(label, expected=f"{known[key]:g} as before", got=got, do=do))
     return Surroundings(**known)
@@ -156,7 +156,7 @@ def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[d
         figure = draw()
         write_figure(figure, folder / name)
         png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
-        width = round(120 * figure.get_figwidth())  # on the page, the same for all figures: so is their text
+        width = round(120 * figure.get_figwidth())  # on the page; one scale for all figures, so texts have equal size
         drawn.append({"name": name, "title": title, "caption": caption, "png": png, "width": width})
     return drawn
 
@@ -164,7 +164,7 @@ def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[d
 def _strips(
     tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None], progress: Progress
 ) -> Iterator[str]:
-    """Yield the quality strips of the tracks; if there are too many, those with the most bad frames."""
+    """Yield the quality strips of the tracks, at most those with the most bad frames."""
     bad = {name: sum(one.frames for one in bad_stretches(track)) for name, track in tracks.items()}
     worst = sorted(tracks, key=lambda name: -bad[name])[:MOST_STRIPS]
     chosen = [name for name in tracks if name in worst]
@@ -181,14 +181,14 @@ def _strips(
 @contextmanager
 def _folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes the report at the end, or is removed after an error."""
-    out = out.resolve()  # a linked folder is followed
+    out = out.resolve()  # follow links
     check_report_folder(out)
     aside, old = unfinished(out), unfinished(out)
     try:
         for part in KINDS:
             (aside / part).mkdir(parents=True)
         yield aside
-        check_report_folder(out)  # again: it may have changed meanwhile
+        check_report_folder(out)  # again, as it may have changed
         if out.exists():
             out.replace(old)
         aside.replace(out)
@@ -203,10 +203,10 @@ def _folder(out: Path) -> Iterator[Path]:
 
 
 def check_report_folder(out: Path) -> None:
-    """Raise OutputError if a folder has more in it than an older report, whose page carries the mark."""
+    """Raise OutputError if a folder contains more than an older report (its page carries the mark)."""
     page, found = out / "index.html", set(out.rglob("*"))
     ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}")}
     whole = has_mark(page) and found <= ours | {page, *(out / part for part in KINDS)}
     if (out.exists() and not out.is_dir()) or (found and not whole):
-        expected, do = "a new folder, or one that holds an older report only", "choose a new folder"
-        raise OutputError(refusal(f"--out {out}", expected=expected, got="something else in it", do=do))
+        expected, do = "a new folder, or one with an older report only", "choose a new folder"
+        raise OutputError(refusal(f"--out {out}", expected=expected, got="other files in it", do=do))

@@ -24,7 +24,7 @@ FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadshe
 
 
 def to_arrow(track: Trajectory) -> "pa.Table":
-    """Return a track as an Arrow table, a row a frame, with units and descriptions; OutputError without pyarrow."""
+    """Return a track as an Arrow table, a row per frame, with units and descriptions. OutputError without pyarrow."""
     arrow = package("pyarrow", "table")
     parts = list(columns(track))
     text = arrow.string()
@@ -63,7 +63,7 @@ def to_xarray(track: Trajectory) -> "xr.Dataset":
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """A dataset of the file with a row for each frame, or one column of it; made by `frame_wise` and `columns`."""
+    """A dataset of the file with a row per frame, or one column of it; made by `frame_wise` and `columns`."""
 
     name: str
     units: str
@@ -134,7 +134,7 @@ def safe_names(track: Trajectory) -> dict[str, CameraTrack]:
 
 
 def plain_names(names: Iterable[str], kind: str) -> dict[str, str]:
-    """Return unique names of letters, digits and _ by name; one that begins with no letter begins with the kind."""
+    """Return unique names of letters, digits and _, by name; one without a leading letter gets the kind in front."""
     known: dict[str, str] = {}
     for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -168,7 +168,7 @@ def as_text(value: Any) -> str:
 
 
 def plain_cell(value: Any) -> Any:
-    """Return a cell of a table for CSV: a text that a spreadsheet program would compute gets an apostrophe."""
+    """Return a cell for CSV; text that a spreadsheet program would compute gets an apostrophe."""
     return f"'{value}" if isinstance(value, str) and FORMULA.match(value) else value
 
 

@@ -1,4 +1,4 @@
-"""A track for other programs: tables, MATLAB; of poses FicTrac's table, TUM's, VTK for ParaView, NWB, netCDF."""
+"""A track for other programs: tables, MATLAB, FicTrac's table, TUM's poses, VTK for ParaView, NWB, netCDF."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,8 +28,8 @@ def export_track(
     axes: FicTracAxes | None = None,
 ) -> None:
     """Write a track for other programs, whole or not at all; NaN stays NaN.
-    `to` is a key of `FORMATS`; None: by the suffix. `axes`: those of FicTrac's table, see `fictrac_axes`. Raise
-    OutputError for an unknown format, a package that is not installed, or a file that cannot be written.
+    `to` is a key of `FORMATS`; None: by the suffix. `axes`: of FicTrac's table, see `fictrac_axes`. Raises
+    OutputError: unknown format, missing package, or a file that cannot be written.
     """
     write, *_ = FORMATS[format_of(path, to)]
     with put_aside(path) as aside:
@@ -41,14 +41,14 @@ def format_of(path: Path, to: str | None) -> str:
     suffixes = {suffix: name for name, (_, *own) in FORMATS.items() for suffix in own}
     by_name, known = suffixes.get(path.suffix.lower()), ", ".join(FORMATS)
     if to is not None and to not in FORMATS:
-        do = "write --to with one of these"
+        do = "choose one of these with --to"
         raise OutputError(refusal("--to", expected=f"one of {known}", got=repr(to)[:60], do=do))
     if to is None and by_name is None:
         do = f"add --to with one of {known}, or end the name in one of these"
         got = f"'{path.suffix}'"
         raise OutputError(refusal(f"--out {path}", expected=" ".join(suffixes), got=got, do=do))
     if to is not None and by_name not in (None, to):
-        do = "let --to and the name agree"
+        do = "make --to and the suffix agree"
         raise OutputError(refusal(f"--out {path}", expected=f"a name for {to}", got=f"'{path.suffix}'", do=do))
     return to or str(by_name)
 
@@ -59,7 +59,7 @@ def _write_csv(track: Trajectory, path: Path, progress: Advance, _: object) -> N
     lines = [f"{key}: {' '.join(table.as_text(value).split())}" for key, value in about.items()]
     lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
     lines = ["made by sphereorient", *lines, *(f"  {line}" for line in settings.splitlines())]
-    # Every program reads 1 and 0.
+    # 1 and 0, which every program reads.
     values = [part.values.astype(np.int8) if part.values.dtype == bool else part.values for part in parts]
     with path.open("w", encoding="utf-8", newline="\n") as file:
         for line in lines:
@@ -110,7 +110,7 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
 
 def fictrac_table(track: Trajectory, axes: FicTracAxes) -> Floats:
     """Return the 25 columns of FicTrac's table, (N, 25); its lab is the animal's frame, x ahead, y right, z down.
-    Column 5, an error of its own, is the root mean square of the stated errors, rad. NaN where there is no pose.
+    Column 5 (FicTrac's error) is the root mean square of the stated errors, rad. NaN without a pose.
     """
     R, ms = axes.R_own_lab @ track.posed, 1e3 * track.time
     walk = walk_of(track.time, R)
@@ -139,7 +139,7 @@ def fictrac_table(track: Trajectory, axes: FicTracAxes) -> Floats:
 
 def _write_fictrac(track: Trajectory, path: Path, _: object, axes: FicTracAxes | None) -> None:
     if axes is None:
-        do = "add --experiment experiment.yaml: the table has the camera's axes"
+        do = "add --experiment experiment.yaml, for the camera's axes"
         raise OutputError(refusal("--to fictrac", expected="the experiment of the track", got="none", do=do))
     np.savetxt(path, fictrac_table(track, axes), fmt="%.14g", delimiter=", ")
 
@@ -178,7 +178,7 @@ def _write_vtk(track: Trajectory, path: Path, *_: object) -> None:
         steps["Values"] = track.time[some]
         steps["PartOffsets"], steps["NumberOfParts"] = frame, np.ones(count, np.int64)
         steps["PointOffsets"] = frame
-        # Each part has one vertex, and nothing else.
+        # Each part has one vertex only.
         vertex = np.stack([frame, zeros, zeros, zeros], axis=1)
         steps["CellOffsets"], steps["ConnectivityIdOffsets"] = vertex, vertex
         for topology in ("Vertices", "Lines", "Polygons", "Strips"):
@@ -198,7 +198,7 @@ def _write_nwb(track: Trajectory, path: Path, *_: object) -> None:
 
     walk = track.walk()
     about = f"{track.title}: {track.method} method of sphereorient"
-    # The recording's date is not in a track: the epoch says so.
+    # A track lacks the recording's date: the epoch stands for it.
     begin = datetime(1970, 1, 1, tzinfo=UTC)
     file = pynwb.NWBFile(session_description=about, identifier=track.title, session_start_time=begin)
     module = file.create_processing_module(name="behavior", description="pose of the ball; frames without one are NaN")
@@ -227,7 +227,7 @@ def _write_netcdf(track: Trajectory, path: Path, *_: object) -> None:
     data.to_netcdf(path, engine="scipy")
 
 
-FORMATS: dict[str, tuple[Any, ...]] = {  # what writes it, of track, path, progress and axes; the suffixes of its files
+FORMATS: dict[str, tuple[Any, ...]] = {  # writer (of track, path, progress, axes), then suffixes of files
     "csv": (_write_csv, ".csv"),
     "parquet": (_write_parquet, ".parquet", ".pq"),
     "mat": (_write_mat, ".mat"),

@@ -1,4 +1,4 @@
-"""Quality of the frames of a track: warnings as text, the worst frames, stretches of bad ones, the data of the page."""
+"""Quality of the frames of a track: warnings, worst frames, stretches of bad frames, data of the page."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -15,11 +15,11 @@ from sphereorient.trajectory.rotations import Floats, distance_deg
 
 FLAG_WORDS = {
     Flag.POSITION_INTERPOLATED: "position interpolated over a gap",
-    Flag.POSITION_OUTLIER_REPLACED: "position was off and was replaced",
+    Flag.POSITION_OUTLIER_REPLACED: "position was an outlier and was replaced",
     Flag.ONE_CAMERA: "one camera only",
     Flag.REPAIRED_FROM_OTHER_CAMERA: "the cameras disagreed; one was repaired from the other",
     Flag.AMBIGUOUS: "another orientation fits nearly as well",
-    Flag.DOUBTFUL_FIT: "picture explained less well than usual, or another camera does not show the ball",
+    Flag.DOUBTFUL_FIT: "fit worse than usual, or another camera does not show the ball",
     Flag.RECOVERED: "found again after a loss",
     Flag.SPIKE: "the orientation jumps",
     Flag.EXTRAPOLATED: "not measured; the smoother's value",
@@ -36,7 +36,7 @@ REASON_WORDS: dict[str, str] = {
     Reason.RUNAWAY: "too many possible orientations",
     Reason.LOW_SCORE: "no orientation explains the picture",
     Reason.AMBIGUOUS: "orientation ambiguous",
-    Reason.UNSEEN: "shows paint that the map does not know",
+    Reason.UNSEEN: "shows paint that the map lacks",
     Reason.CONTRADICTS: "contradicts the other cameras",
     Reason.SECOND_BALL: "may show the second ball",
     Reason.HIDDEN: "hidden by another ball",
@@ -47,15 +47,15 @@ FAR = 4.0  # robust standard deviations from the usual value: an outlier
 APART_FRAMES = 3  # frames nearer than this show the same problem
 STRETCH_FRAMES = 10  # stretches with fewer frames between them are one
 MOST_BINS = 20_000  # frames of longer tracks are binned, so that a browser can show the page
-DIGITS = 4  # of the numbers on the page
+DIGITS = 4  # significant digits on the page
 GOOD, NO_BALL, DOUBTFUL, NOT_VALID = range(4)
 STATUS_WORDS = ("good", "no ball", "doubtful", "not valid")
 Ints = NDArray[np.int64]
-Ranked = Iterator[tuple[int, str]]  # rows with the reason, worst first
+Ranked = Iterator[tuple[int, str]]  # rows and reasons, worst first
 
 
 def shown_flags(track: Trajectory, rows: Any = slice(None)) -> NDArray[np.uint32]:
-    """Return the flags of some rows that have words, without ONE_CAMERA in an experiment of one camera."""
+    """Return the flags of some rows that have a text, without ONE_CAMERA in an experiment of one camera."""
     alone = len(track.cameras) < 2
     known = sum(flag for flag in FLAG_WORDS if not (alone and flag == Flag.ONE_CAMERA))
     flags: NDArray[np.uint32] = track.flags[rows] & np.uint32(known)
@@ -83,13 +83,13 @@ def frame_warnings(track: Trajectory, k: int) -> list[str]:
 
 
 def stated_error(cov: Floats) -> Floats:
-    """Return sigma along or about an axis, (N,), the mean of three, of covariances (N, 3, 3)."""
+    """Return sigma along or about an axis, (N,), mean over three axes, of covariances (N, 3, 3)."""
     return np.asarray(np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3), np.float64)
 
 
 def choose_worst(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
-    """Choose at most `count` of the worst frames; return the reasons by row, worst first, the kinds of problem in turn.
-    Of frames less than three apart one is taken. If fewer frames are bad, those with the lowest scores follow.
+    """Choose at most `count` of the worst frames; return the reasons by row, worst first, alternating the kinds of
+    problem. Chosen frames are at least three apart. If fewer are bad, those with the lowest scores follow.
     """
     kinds = [list(ranked) for ranked in _kinds(track)]
     why: dict[int, list[str]] = {}
@@ -115,7 +115,7 @@ def _kinds(track: Trajectory) -> Iterator[Ranked]:
         for name, camera in track.cameras.items()
     )
     off = distance_deg(track.orientation, track.orientation_smooth)
-    yield _outliers(off, "{:.2g}\u00b0 off the smooth motion, usually {:.2g}\u00b0")
+    yield _outliers(off, "{:.2g}\u00b0 from the smooth motion, usually {:.2g}\u00b0")
     unit = track.length_unit
     degrees, lengths = np.rad2deg(stated_error(track.orientation_cov)), stated_error(track.position_cov)
     yield chain(
@@ -125,8 +125,8 @@ def _kinds(track: Trajectory) -> Iterator[Ranked]:
 
 
 def _gaps(track: Trajectory) -> Ranked:
-    """Yield the first frame of every gap with a ball in view, longest gap first, and the first one after it."""
-    gaps = ~track.valid & ~(track.without_ball & track.valid.any())  # of a track without any pose all of it
+    """Yield the first frame of every gap with a ball in view, longest first, and the first frame after it."""
+    gaps = ~track.valid & ~(track.without_ball & track.valid.any())  # all of a track without poses
     for first, last in sorted(runs_of(gaps), key=lambda run: run[0] - run[1]):
         lasts = "1 frame" if last - first == 1 else f"{last - first} frames"
         found = [words for words in frame_warnings(track, first) if words != "not valid"]
@@ -136,7 +136,7 @@ def _gaps(track: Trajectory) -> Ranked:
 
 
 def _flags(track: Trajectory) -> Ranked:
-    """Yield flagged valid frames, the rarest flags first; of each run the one with the lowest score."""
+    """Yield flagged valid frames, rarest flags first; from each run the frame with the lowest score."""
     score = np.nan_to_num(_score(track), nan=np.inf)
     flags = shown_flags(track)
     for _, flag in sorted((int((flags & flag > 0).sum()), flag) for flag in FLAG_WORDS):
@@ -160,7 +160,7 @@ def _outliers(values: Floats, words: str, sign: int = 1) -> Ranked:
         return
     usual = float(np.median(values[there]))
     spread = 1.4826 * float(np.median(np.abs(values[there] - usual)))
-    # If most values are equal the spread is zero; rounding errors are no outliers.
+    # If most values are equal, the spread is zero; then rounding errors are no outliers.
     far = np.where(there, (values - usual) / max(spread, 1e-3 * abs(usual), 1e-12), -np.inf)
     for k in np.argsort(-far, kind="stable").tolist():
         if far[k] < FAR:
@@ -176,7 +176,7 @@ def _score(track: Trajectory) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class BadStretch:
-    """Frames that are doubtful or not valid, with at most nine good ones in a row among them."""
+    """Doubtful or invalid frames, with at most nine good ones in a row among them."""
 
     first: int  # row of the track
     last: int  # row, included
@@ -191,8 +191,8 @@ class BadStretch:
 
 
 def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
-    """Return the quality of n bins of frames, each represented by its worst one, for JSON; None where unknown.
-    `numbers` (N,) are the experiment's; None: by the times. A bin is one frame, or more of a long track.
+    """Return the quality of n bins of frames, each represented by its worst frame, for JSON; None: unknown. `numbers`
+    (N,): the experiment's; None: by the times. A bin is one frame, or several of a long track.
     """
     size = max(1, -(-len(track) // MOST_BINS))
     rows, starts = np.arange(len(track)), np.arange(0, len(track), size)
@@ -214,7 +214,7 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
         "frames": len(track),
         "per_bin": size,  # the last bin may have fewer
         "counts": np.bincount(status, minlength=len(STATUS_WORDS)).tolist(),  # frames by status
-        "row": row.tolist(),  # (n), row of the track: the first of those of the bin's status
+        "row": row.tolist(),  # (n), row of the track: the bin's first with its status
         "number": numbers[row].tolist(),  # the experiment's number of that frame
         "time_s": _short(track.time[row], 9),  # of that frame
         "status": status[row].tolist(),  # index in status_words
@@ -226,12 +226,12 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
             {
                 "name": name,
                 "score": _short(-largest(-camera.score)),  # the lowest of the bin
-                # Index in reason_words, 0: measured; of a bin the first other one.
+                # Index in reason_words, 0: measured; the first other one in the bin.
                 "reason": codes[name][first(codes[name] != 0)].tolist(),
             }
             for name, camera in track.cameras.items()
         ],
-        # Between two cameras' own orientations, the largest; None without two cameras.
+        # Largest angle between two cameras' own orientations; None for one camera.
         "apart_deg": None if apart is None else _short(largest(apart)),
         "flags": np.bitwise_or.reduceat(shown_flags(track), starts).tolist(),  # those of all frames of the bin
         "status_words": STATUS_WORDS,
@@ -285,7 +285,7 @@ def frame_numbers(track: Trajectory) -> Ints:
     if not np.isfinite(at).all():
         return rows
     number = np.rint(at).astype(np.int64)
-    # Times of a table or a camera's clock do not give numbers.
+    # Irregular times give no numbers.
     even = bool((np.abs(at - number) < 0.1).all() and (np.diff(number) > 0).all())
     return number if even else rows
 

@@ -28,7 +28,7 @@ BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
 TO_COMPARE = "good; to compare with"
 TILE, GAP, HEAD, TITLE, LINE, LINES = 152, 6, 54, 22, 17, 3  # px; lines of text under a frame
 BETWEEN = 18  # px, between frames
-PICTURES = 12  # side by side in a row, at most
+PICTURES = 12  # most in a row
 SUFFIXES = (".png", ".pdf", ".jpg")
 Advance = Callable[[int, int], None]
 Rows = NDArray[np.int64]
@@ -57,7 +57,7 @@ class GalleryFrame:
 class Gallery:
     """Pictures of some frames; made by `gallery`, read by the page."""
 
-    frames: tuple[GalleryFrame, ...]  # in the order of the choice, the worst first
+    frames: tuple[GalleryFrame, ...]  # in order of choice, the worst first
     numbers: Rows  # (N,), the experiment's numbers of all frames of the track
     cameras: tuple[str, ...]  # from left to right
     size: tuple[int, int]  # width and height of every picture, px
@@ -77,7 +77,7 @@ def gallery(
         for done, (k, pictures) in enumerate(pictures_by_row(streams, rows, parts), start=1):
             canvas, jpeg = Canvas(*_pairs_size(page)), io.BytesIO()
             _draw_pairs(canvas, page, k, pictures, (0, 0))
-            # No subsampling: it blurs thin coloured lines.
+            # No subsampling, which blurs thin coloured lines.
             Image.fromarray(canvas.finished()).save(jpeg, "JPEG", quality=85, subsampling=0, optimize=True)
             frames[k] = GalleryFrame(k=k, words=why[k], jpeg=jpeg.getvalue())
             progress(done, len(rows))
@@ -86,8 +86,8 @@ def gallery(
 
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
-    """Choose at most `count` frames to show; return the reasons by row, in the order of the choice: the worst frame,
-    the middles of the longest stretches, other bad frames, two thirds in all; then good ones, spread evenly.
+    """Choose at most `count` frames to show; return the reasons by row, in order of choice: the worst frame, middles of
+    the longest stretches, other bad frames, together two thirds; then evenly spread good ones.
     """
     status = quality.status_of(track)
     good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status >= quality.DOUBTFUL)
@@ -101,7 +101,7 @@ def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
             if k not in why and len(why) < upto:
                 why[k] = words
 
-    # At most half are middles, so that frames of `choose_worst` are shown too.
+    # At most half are middles, to leave room for frames of `choose_worst`.
     fill(dict(_middles(track, bad)), -(-bad_room // 2))
     fill({k: words for k, words in worst.items() if not words[0].startswith("not in doubt")}, bad_room)
     left = np.setdiff1d(bad, list(why))
@@ -112,7 +112,7 @@ def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
 
 
 def _middles(track: Trajectory, bad: Rows) -> Iterator[tuple[int, tuple[str, ...]]]:
-    """Yield the bad frame nearest to the middle of each stretch."""
+    """Yield the bad frame nearest the middle of each stretch."""
     for stretch in quality.bad_stretches(track):
         inside = bad[np.searchsorted(bad, stretch.first) : np.searchsorted(bad, stretch.last, "right")]
         k = int(inside[np.abs(inside - (stretch.first + stretch.last) / 2).argmin()])

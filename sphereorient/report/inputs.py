@@ -1,4 +1,4 @@
-"""Pictures of what a measurement starts from: a movie's frames, a calibration, and the check before a run."""
+"""Figures of the inputs: a movie's frames, a calibration, and the check before a run."""
 
 import math
 import textwrap
@@ -27,19 +27,19 @@ from sphereorient.report.texture_map import draw_map
 Floats = NDArray[np.float64]
 EXPECTED, FOUND, USED = AXIS_COLOURS
 OUTLIER = "#CC79A7"
-# Shape and colour both: readable without colours, and by colour-blind readers.
+# Shape and colour: readable without colours, and by colour-blind readers.
 MARKS = {Severity.OK: ("\u25cf", FOUND), Severity.WARNING: ("\u25b2", "#E69F00"), Severity.FAULT: ("\u2716", EXPECTED)}
-WIDTH = 13.0  # inches, of the figures; so are:
+WIDTH = 13.0  # inches, of the figures, and of:
 COLUMNS, TITLE, HEAD = 6, 0.27, 0.8  # of a contact sheet: frames in a row; the line above a frame, the title
 PICTURE, LINE = 3.3, 0.165  # of a check: a row of pictures, a line of text
 SHOWN = 3  # pictures of each camera
-NEAR = 1.4  # of the radius: half the side of a picture of the ball alone
+NEAR = 1.4  # of the radius: half the side of a picture of the ball
 CHARACTERS = 145  # in a line of the list
 
 
 @in_style
 def contact_sheet(movie: Movie, seen: Survey, path: Path) -> None:
-    """Draw the frames of a survey of a movie side by side, on one scale of grey, into a PNG or PDF."""
+    """Draw the frames of a survey of a movie, on one scale of grey, into a PNG or PDF."""
     rows = math.ceil(len(seen.frames) / COLUMNS)
     height, width = movie.frame_shape
     figure = new_figure(WIDTH, HEAD + rows * ((WIDTH / COLUMNS) * height / width + TITLE))
@@ -77,7 +77,7 @@ def _draw_frame(ax: Any, frame: SurveyedFrame, movie: Movie, black: float, white
 
 @in_style
 def calibration_figure(result: Calibrated, path: Path) -> None:
-    """Draw the pictures, read again, with points found and expected, and all residuals; into a PNG or PDF."""
+    """Draw the pictures with points found and expected, and all residuals, into a PNG or PDF."""
     names = list(result.cameras)
     figure = new_figure(4.2 * (SHOWN + 2), 4.3 * len(names))
     if result.verdict:
@@ -119,19 +119,19 @@ def _draw_picture(ax: Any, one: PictureReport) -> None:
 
 def _draw_residuals(ax: Any, place: Floats, missed: Floats, image_size: tuple[int, int]) -> None:
     usual = float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else 1.0
-    # The arrow of the usual length is a fortieth of the picture long.
+    # An arrow of the usual length spans a fortieth of the picture.
     times = image_size[0] / 40 / max(usual, 1e-9)
     style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.002, "color": EXPECTED, "alpha": 0.7}
     ax.quiver(*place.T, *(times * missed.T), **style)
     ax.set(xlim=(0, image_size[0]), ylim=(image_size[1], 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
-    ax.set_title(f"found less expected, {times:.0f} times", fontsize=9)
+    ax.set_title(f"found minus expected, {times:.0f} times", fontsize=9)
 
 
 def _draw_histogram(ax: Any, missed: Floats, rms_px: float) -> None:
     reach = 4 * max(rms_px, 1e-6) / np.sqrt(2)
     for part, colour, label in zip(missed.T, (FOUND, EXPECTED), ("u", "v"), strict=True):
         ax.hist(part, np.linspace(-reach, reach, 41), histtype="step", lw=1.5, color=colour, label=label)
-    ax.set(xlabel="found less expected (px)", ylabel="points")
+    ax.set(xlabel="found minus expected (px)", ylabel="points")
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_title(f"all pictures: rms {rms_px:.3f} px", fontsize=9)
     ax.legend()
@@ -139,7 +139,7 @@ def _draw_histogram(ax: Any, missed: Floats, rms_px: float) -> None:
 
 @in_style
 def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
-    """Draw a frame of each movie with the ball that was found, whole and near; into a PNG or PDF."""
+    """Draw a frame of each movie, whole and enlarged at the ball, into a PNG or PDF."""
     figure = new_figure(2.6 * PICTURE, PICTURE * len(looks) + 0.3)
     for look, (whole, near) in zip(looks, figure.subplots(len(looks), 2, squeeze=False), strict=True):
         for ax in (whole, near):
@@ -152,7 +152,7 @@ def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
         _outlined(near, look.outline.circle, near=True)
         if look.differs and look.given is not None:
             _outlined(near, look.given, lw=1.0, ls="--", color=EXPECTED)
-        where, frame = ("stays", "") if look.stays else ("moves", f" in frame {look.frame}")
+        where, frame = ("is fixed", "") if look.stays else ("moves", f" in frame {look.frame}")
         doubt = "DOUBTFUL outline" if look.doubtful else "outline"
         whole.set_title(f"{look.name}, {Path(look.movie.path).name}: the ball {where}", fontsize=9)
         dashed = f"; given (dashed): {2 * look.given[2]:.1f} px" if look.differs and look.given else ""
@@ -161,14 +161,14 @@ def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
 
 
 def _show(ax: Any, picture: NDArray[Any]) -> None:
-    """Show a whole picture: black is 0, white nearly its brightest level, so that a few glints do not darken it."""
+    """Show a whole picture: black is 0, white nearly the brightest level, so that glints do not darken it."""
     height, width = picture.shape
     ax.imshow(picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(picture, 99.8))))
     ax.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 
 def _outlined(ax: Any, circle: tuple[float, float, float], near: bool = False, **style: Any) -> None:
-    """Draw an outline: its middle and radius, px; `near`: with the ball alone in view."""
+    """Draw an outline by centre and radius, px; `near`: enlarged at the ball."""
     angle, style = np.linspace(0, 2 * np.pi, 181), {"lw": 1.4, "color": FOUND} | style
     u, v, radius = circle
     ax.plot(u + radius * np.cos(angle), v + radius * np.sin(angle), **style)
@@ -256,18 +256,18 @@ def _draw_gap(ax: Any, result: Preflight) -> None:
     ax.set_xlim(-LATEST - 0.5, LATEST + 0.5)
     ax.xaxis.set_major_locator(MaxNLocator(9, integer=True))
     ax.legend(fontsize=7, framealpha=0.8)
-    ax.set_title("are the movies in step", fontsize=9)
+    ax.set_title("synchronisation of the movies", fontsize=9)
 
 
 def _draw_texture(ax: Any, result: Preflight) -> None:
     if result.texture is None or result.measures is None:
         ax.set_axis_off()
-        say_empty(ax, "no map of the paint")
+        say_empty(ax, "no texture map")
         return
     seen = 100 * result.measures.view_brightness.numpy()
     longitude = (np.arange(seen.shape[1]) + 0.5) * (360 / seen.shape[1]) - 180
     latitude = 90 - (np.arange(seen.shape[0]) + 0.5) * (180 / seen.shape[0])
-    title = f"the map; lines: brightness of the view from there, {seen.min():.0f} to {seen.max():.0f} %"
+    title = f"texture map; lines: brightness of the view from there, {seen.min():.0f} to {seen.max():.0f} %"
     draw_map(ax, result.texture, title, interpolation="nearest")
     ax.title.set_fontsize(9)
     ax.tick_params(labelsize=7)
@@ -290,7 +290,7 @@ def _draw_pair(ax: Any, result: Preflight) -> None:
 
 
 def _lines(result: Preflight) -> list[tuple[Finding | None, str, str]]:
-    """Return the findings line by line, faults first: the finding that begins, text, font style."""
+    """Return the findings line by line, faults first: the finding that starts there, text, font style."""
     lines: list[tuple[Finding | None, str, str]] = []
     order = list(Severity)
     for finding in sorted(result.findings, key=lambda one: -order.index(one.severity)):

@@ -11,14 +11,14 @@ from torch import Tensor
 from sphereorient.learn.metrics import WITHIN_DEG, Example
 from sphereorient.report.plots.style import ALL, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure, note
 
-RIGHT, WRONG = "#1A7F37", "#B42318"  # frames of proposals; the titles have a tick too
+RIGHT, WRONG = "#1A7F37", "#B42318"  # borders of proposals; titles also have a tick
 SIDE_IN = 1.12  # of a picture of the sheet
 UNLIKELY = 0.005  # proposals with a lower probability are not shown
 
 
 @in_style
 def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -> Figure:
-    """Draw loss and recall against the steps, from the rows of metrics.csv; the weights of `best_step` were kept."""
+    """Draw loss and recall against the steps, from the rows of metrics.csv; `best_step`: that of the kept weights."""
     figure = new_figure(WIDTH_IN, 2.7)
     left, right = figure.subplots(1, 2)
     _curve(left, rows, "train_nll", "training", {**SECOND.drawn, "marker": "x"})
@@ -43,7 +43,7 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
 def _curve(axes: Axes, rows: Sequence[Mapping[str, float]], key: str, label: str, look: dict[str, Any]) -> None:
     there = [(row["step"], row[key]) for row in rows if key in row]
     steps, values = np.array(there, np.float64).reshape(-1, 2).T
-    # A marker for each row, fewer if there are many.
+    # A marker per row, fewer if there are many.
     axes.plot(steps, values, label=label, markevery=max(len(steps) // 12, 1), **look)
 
 

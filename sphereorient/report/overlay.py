@@ -25,8 +25,8 @@ from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.datasets import nearest_rows
 
-SAMPLE = 16  # frames from which light and brightness are taken
-DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures that are shown black and white
+SAMPLE = 16  # frames for light and brightness
+DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures shown as black and white
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 Rows = NDArray[np.int64]
 Advance = Callable[[int, int], None]
@@ -39,7 +39,7 @@ class FrameSelection:
     cameras: Sequence[str] | None = None  # names; None: those of the track
     first: int | None = None  # the experiment's number; None: from the first frame
     last: int | None = None  # + 1; None: to the last frame of the track
-    every: int = 1  # one of so many frames is shown
+    every: int = 1  # show every n-th frame
 
     def rows(self, numbers: Rows) -> Rows:
         """Return the rows to show, from the experiment's numbers of all frames (N,); TrackError if there are none."""
@@ -61,9 +61,9 @@ def overlay_movie(
     fps: float = 25.0,
     progress: Advance = lambda done, total: None,
 ) -> int:
-    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual, all spheres in the same frames;
-    return the number of pictures. Raise the errors of `prepared` and `write_video`, and TrackError if no frame of the
-    track is in the range.
+    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual of all spheres; return the count
+    of pictures. Raises the errors of `prepared` and `write_video`, and TrackError if no frame of the track is in the
+    range.
     """
     check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
@@ -85,8 +85,8 @@ def prepared(
     cameras: Sequence[str] | None,
     opened: ExitStack,
 ) -> tuple[OverlayPage, dict[str, CameraStream]]:
-    """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them.
-    Raise ExperimentError for a camera that track or experiment do not have, TrackError for a track of another one.
+    """Return the common data of all pictures (light, brightness, sizes), and the streams by camera; `opened` closes
+    them. Raises ExperimentError (a camera missing in track or experiment), TrackError (track of another experiment).
     """
     known = list(Tracks.of(tracks).values())
     names = list(known[0].cameras) if cameras is None else list(cameras)
@@ -94,7 +94,7 @@ def prepared(
         if name not in known[0].cameras:
             raise ExperimentError(refuse_unknown(name, known[0].cameras, "cameras of the track"))
     if not names:
-        got, do = "none", "write --cameras cam1, or leave it out"
+        got, do = "none", "add e.g. --cameras cam1, or leave it out"
         raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
     numbers, streams = streams_of(known[0], experiment, names, opened)
     balls = []
@@ -136,7 +136,7 @@ def streams_of(
 def pictures_by_row(
     streams: Mapping[str, CameraStream], rows: Rows, read: Callable[[Movie, Rows], Iterator[Any]] = pictures_of
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield increasing rows of a track with the picture of each camera as `read` yields it, None for missing ones."""
+    """Yield increasing rows of a track with the picture of each camera, as `read` yields it; None: missing."""
     readers = [read(stream.movie, stream.rows[rows]) for stream in streams.values()]
     for k, *found in zip(rows.tolist(), *readers, strict=True):
         yield k, dict(zip(streams, found, strict=True))
@@ -190,6 +190,6 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -
             container.mux(stream.encode(frame))
             count += 1
         if not count:
-            raise OutputError(refusal(str(path), expected="pictures to write", got="none", do="ask for more frames"))
+            raise OutputError(refusal(str(path), expected="pictures to write", got="none", do="choose more frames"))
         container.mux(stream.encode(None))
     return count

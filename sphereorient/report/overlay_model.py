@@ -1,4 +1,4 @@
-"""The measured sphere in a camera's picture: outline, axes, and the re-rendered picture under the light of `pose`."""
+"""The measured sphere in a camera's picture: outline, axes, and the re-rendered picture with the light of `pose`."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ from sphereorient.trajectory import Trajectory
 Floats = NDArray[np.float64]
 MARGIN = 1.3  # half the side of a crop, in radii of the sphere
 FINE = 2  # samples along each side of a pixel
-NEAR = 1.1  # radii about the disk's middle, within which the sphere is, also by a distorted picture
+NEAR = 1.1  # radii about the disk's centre that contain the sphere, even with distortion
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Path3D:
-    """Position and orientation of N frames, from the smoother where the frame's own is missing; made by `path_of`."""
+    """Position and orientation of N frames; the smoother's where the measured one is missing; made by `path_of`."""
 
     position_mm: Floats  # (N, 3), lab
     R_lab_body: Floats  # (N, 3, 3)
@@ -77,7 +77,7 @@ class CropWindow:
 
     @property
     def known(self) -> bool:
-        """Whether centre and size are."""
+        """Whether centre and size are known."""
         return bool(np.isfinite(self.centre_px).all() and np.isfinite(self.half_px))
 
     def grid_px(self, fine: int = 1) -> Floats:
@@ -115,17 +115,17 @@ class OverlayModel:
     """A camera, the texture map and the poses; renders the expected picture."""
 
     camera: Camera
-    texture: Tensor | None  # (H, 2 H), as fine as the window shows it; None: nothing can be rendered
+    texture: Tensor | None  # (H, 2 H), at the window's resolution; None: no rendering
     path: Path3D
 
     def look(self, k: int, window: CropWindow) -> SeenDisk:
         """Return paint and places in a window of frame k, the mean of finer samples, ports included."""
-        assert self.texture is not None  # without a map no light is fitted, and nothing is rendered
+        assert self.texture is not None  # without a map there is no light and no rendering
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
         middle_px, radius_px = sphere_disk_px(self.camera, centre, self.path.radius_mm)
         grid_px = torch.from_numpy(window.grid_px(FINE)).reshape(window.side, FINE, window.side, FINE, 2)
         grid_px = grid_px.transpose(1, 2).flatten(2, 3)
-        near = ~((grid_px.mean(2) - middle_px).norm(dim=-1) > NEAR * radius_px + 1)  # the rest shows no sphere
+        near = ~((grid_px.mean(2) - middle_px).norm(dim=-1) > NEAR * radius_px + 1)  # only near the sphere
         seen = see_sphere(rays := self.camera.rays(grid_px[near]), centre, R, self.texture, self.path.radius_mm)
         along = (seen.normal * rays.direction_lab).sum(-1, keepdim=True)
         across = (seen.normal - along * rays.direction_lab) @ self.camera.R_cam_lab[:2].mT
@@ -142,7 +142,7 @@ class OverlayModel:
 
 
 def contrast(light: DiskLight) -> float:
-    """Return white less black paint in the middle of the disk of one camera, grey levels."""
+    """Return white minus black paint at the centre of the disk of one camera, grey levels."""
     middle = light_basis(torch.zeros(1, 2, 1))[0, :, 0]
     return max(float(light.difference[0] @ middle), 1e-6)
 
@@ -155,14 +155,14 @@ def lit_picture(light: DiskLight, seen: SeenDisk, filmed: NDArray[np.float32] | 
     grey[there] = difference.numpy() * seen.paint[there] + black.numpy()
     if filmed is not None:
         good = there & np.isfinite(filmed)
-        # Ratio of sums: least squares would darken a sphere with a wrong orientation.
+        # Ratio of sums, as least squares darkens a sphere with a wrong orientation.
         grey = grey * np.clip(filmed[good].sum() / max(float(grey[good].sum()), 1e-9), 0.5, 2.0)
     return np.asarray(grey, np.float32)
 
 
 def fit_light(pairs: Iterable[tuple[SeenDisk, NDArray[np.float32]]]) -> DiskLight | None:
     """Fit one light to all frames of one camera (model, crop in grey levels); None if too few pixels are known."""
-    # One light for all frames: a fit of each frame would hide a part of a wrong orientation.
+    # One light for all frames: a light per frame would partly hide a wrong orientation.
     light, count = DiskLight.unknown(1, torch.zeros(1, 4)), 0
     unknowns = 2 * light.difference.shape[1]
     normal, right = torch.zeros(unknowns, unknowns, dtype=torch.float64), torch.zeros(unknowns, dtype=torch.float64)

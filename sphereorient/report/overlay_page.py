@@ -1,4 +1,4 @@
-"""The pictures of the overlay: each camera's frame, and crop, re-rendered picture and residual of each sphere."""
+"""Pictures of the overlay: each camera's frame; crop, re-rendered picture and residual of each sphere."""
 
 import math
 import textwrap
@@ -35,18 +35,18 @@ GOOD: Colour = (43, 224, 168)
 SHIFT = 4  # bits of a pixel's fraction
 DOT, SPACE = 3.0, 3.5  # px, of dotted lines
 HEAD, FOOT, GAP, TITLE = 62, 40, 10, 24  # px: bands above and below, between panels, titles
-SIDE = 310  # px, of square panels, at most
-STRIP = 16  # px, from strip to strip
-NAME = 14  # letters of a sphere's name that are shown
-TRAIL_FRAMES = 40  # whose path is drawn
-OWN_PX = 1.5  # a camera's own centre further off than this is drawn
-LINE, LETTER = 18, 8  # px, of text: from line to line, and a letter's usual width
-RESIDUAL_REACH = 0.5  # of the contrast of white and black: the ends of the residual's scale
+SIDE = 310  # px, largest side of square panels
+STRIP = 16  # px, between strips
+NAME = 14  # shown letters of a sphere's name
+TRAIL_FRAMES = 40  # in the drawn path
+OWN_PX = 1.5  # least distance of a camera's own centre to be drawn
+LINE, LETTER = 18, 8  # px, height of a text line and usual width of a letter
+RESIDUAL_REACH = 0.5  # of the contrast of white and black: limits of the residual's scale
 BLANK = 45  # grey of pixels without a residual
 
 
 class Canvas:
-    """An (H, W, 3) RGB picture; panels clip what is drawn in them."""
+    """An (H, W, 3) RGB picture; panels clip their content."""
 
     def __init__(self, width: int, height: int) -> None:
         self.pixels = np.full((height, width, 3), BACKGROUND, np.uint8)
@@ -69,7 +69,7 @@ class Canvas:
 
 
 class Panel:
-    """A rectangle of a canvas that shows a picture from pixel `first_px` (u, v) on; drawn in the picture's pixels."""
+    """A rectangle of a canvas that shows a picture from pixel `first_px` (u, v) on, in the picture's coordinates."""
 
     def __init__(
         self, canvas: Canvas, corner: tuple[int, int], size: tuple[int, int], first_px: ArrayLike, scale: float
@@ -93,7 +93,7 @@ class Panel:
     def line(self, uv_px: NDArray[np.float64], colour: Colour, width: int = 1, dotted: bool = False) -> None:
         """Draw a line through points (n, 2) of the picture, interrupted at NaN."""
         points = self.place(uv_px)
-        # Points too far away for integers interrupt it, too.
+        # So do points beyond the range of integers.
         for first, last in runs_of(np.asarray((np.abs(np.nan_to_num(points, nan=1e9)) < 1e5).all(-1))):
             run = points[first:last]
             for piece in _dots(run) if dotted else [run] if len(run) > 1 else []:
@@ -132,11 +132,11 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OverlayView:
-    """What all pictures of one sphere by one camera share; made by `overlay.prepared`, read by the page."""
+    """Common data of all pictures of one sphere by one camera; made by `overlay.prepared`, read by the page."""
 
     name: str
     model: OverlayModel
-    light: DiskLight | None  # of this camera alone; None: no frame to fit it to
+    light: DiskLight | None  # of this camera; None: no frame to fit it to
     black: float  # grey level shown black
     white: float
     half_px: float  # of the crop
@@ -144,8 +144,8 @@ class OverlayView:
 
     @property
     def why_unlit(self) -> str:
-        """Why nothing can be rendered without a light."""
-        return "no map of the paint" if self.model.texture is None else "no valid frame"
+        """The reason why there is no light."""
+        return "no texture map" if self.model.texture is None else "no valid frame"
 
     def shown(self, grey: NDArray[np.generic]) -> NDArray[np.uint8]:
         """Return grey levels (H, W) on the scale of the display, 0 .. 255; NaN is black."""
@@ -169,18 +169,18 @@ class OverlayView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ball:
-    """A sphere of the page: its track, and its view by each camera. Its name is empty where it is the only one."""
+    """A sphere of the page: its track and its view by each camera; a single one has an empty name."""
 
     track: Trajectory
     views: Sequence[OverlayView]
 
     @property
     def name(self) -> str:
-        """Its name, cut to what fits."""
+        """Its name, shortened."""
         return self.track.sphere[:NAME]
 
     def state(self, k: int) -> tuple[str, Colour]:
-        """Return the state of a frame as text, with a mark for colour-blind readers, and its colour."""
+        """Return the state of a frame as text with a symbol, and its colour."""
         flags = ", ".join(flag_words(self.track, k))
         if self.track.without_ball[k]:
             return "no ball in view", FAINT
@@ -280,11 +280,11 @@ class OverlayPage:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Panels:
-    """The panels of one sphere beside a camera's frame, and what is known of it in words below them."""
+    """The panels of one sphere beside a camera's frame, with text below."""
 
     ball: Ball
     view: OverlayView
-    others: Sequence[OverlayView]  # of the same camera, spheres that may hide it or stand behind it
+    others: Sequence[OverlayView]  # of the same camera: spheres before or behind it
     side: int  # px
 
     def draw(self, canvas: Canvas, k: int, picture: Grey | None, corner: tuple[int, int], height: int) -> None:
@@ -312,7 +312,7 @@ class Panels:
             around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, INK, 1, dotted=True)
         top, room = corner[1] + TITLE + side, height - side - TITLE
-        letters = int(2 * (side + GAP) / 9.6)  # px, the width of a letter below the panels, at most
+        letters = int(2 * (side + GAP) / 9.6)  # px, largest width of a letter below the panels
         wrapped = [(part, colour) for text, colour in self._words(k, seen) for part in textwrap.wrap(text, letters)]
         for row, (text, colour) in enumerate(wrapped[: max(1, room // LINE)]):
             canvas.text((corner[0], top + min(24, room - 6) + LINE * row), text, 14, colour)
@@ -329,16 +329,16 @@ class Panels:
         yield numbers, INK
         sigma = float(stated_error(track.orientation_cov[k : k + 1])[0])
         if np.isfinite(sigma):
-            yield f"error of the orientation, stated: {np.rad2deg(sigma):.3f}\u00b0 an axis", INK
+            yield f"stated error of the orientation: {np.rad2deg(sigma):.3f}\u00b0 per axis", INK
         off_px = own_distance_px(self.view, seen, k)
         if off_px > OWN_PX:
-            yield f"white circle: what it sees by itself, {off_px:.1f} px off", DOUBT
+            yield f"white circle: centre by this camera alone, {off_px:.1f} px off", DOUBT
         if self.view.model.path.smoothed[k]:
-            yield "outline and axes: of the smoother", DOUBT
+            yield "outline and axes by the smoother", DOUBT
 
 
 def state_strip(canvas: Canvas, track: Trajectory, k: int, corner: tuple[int, int], size: tuple[int, int]) -> None:
-    """Draw the states of all frames side by side, and a mark at frame k; a pixel shows the worst of its frames."""
+    """Draw the states of all frames side by side, with a mark at frame k; a pixel shows its worst frame."""
     (left, top), (width, height) = corner, size
     state = np.where(track.valid, shown_flags(track) != 0, 2)
     edges = np.linspace(0, len(state), width + 1)
@@ -351,7 +351,7 @@ def state_strip(canvas: Canvas, track: Trajectory, k: int, corner: tuple[int, in
 
 
 def crop_side(half_px: float) -> int:
-    """Return the samples along each side of a crop: the picture's own pixels, up to the panel's."""
+    """Return the samples along a crop's side: the picture's pixels, at most the panel's."""
     return max(48, min(SIDE, round(2 * half_px))) if np.isfinite(half_px) else SIDE
 
 
@@ -368,9 +368,7 @@ def draw_pictures(
     window: CropWindow,
     others: Sequence[OverlayView] = (),
 ) -> bool:
-    """Show crop, re-rendered sphere (with `others` of the camera) and, in a third panel, residual; return whether
-    rendered.
-    """
+    """Show crop, re-rendered sphere (with `others`) and, in a third panel, residual; return whether rendered."""
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
         panels[0].show(view.shown(grey))
@@ -387,7 +385,7 @@ def draw_pictures(
 def rendered(
     views: Sequence[OverlayView], k: int, filmed: NDArray[np.float32] | None, window: CropWindow
 ) -> NDArray[np.float32]:
-    """Return the spheres of one camera as they are seen, nearer before farther, (side, side); NaN beside them."""
+    """Return the spheres of one camera, nearer ones in front, (side, side); NaN outside them."""
     whole = np.full((window.side, window.side), np.nan, np.float32)
     known = [(view, view.light) for view in views if view.model.path.whole[k] and view.light is not None]
     for view, light in sorted(known, key=lambda one: one[0].depth_mm(k)):
@@ -435,7 +433,7 @@ def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: DiskLight 
     ramp = np.linspace(-RESIDUAL_REACH, RESIDUAL_REACH, width, dtype=np.float32)
     bar[:] = residual_colours(np.broadcast_to(ramp, bar.shape[:2]))
     reach = f"{100 * RESIDUAL_REACH:.0f} %"
-    for share, words, anchor in ((0, f"-{reach}", "ls"), (0.5, "filmed less model", "ms"), (1, f"+{reach}", "rs")):
+    for share, words, anchor in ((0, f"-{reach}", "ls"), (0.5, "filmed minus model", "ms"), (1, f"+{reach}", "rs")):
         canvas.text((at[0] + share * width, at[1] + 26), words, 13, FAINT, anchor)
-    words = "of white less black paint" + ("" if light is None else f" ({contrast(light):.0f} levels)")
+    words = "of white minus black paint" + ("" if light is None else f" ({contrast(light):.0f} levels)")
     canvas.text((at[0] + 0.5 * width, at[1] + 44), words, 13, FAINT, "ms")

@@ -22,7 +22,7 @@ from sphereorient.trajectory import Trajectory
 
 MOST_STRETCHES = 200  # rows of the table
 UNFOLDED = 12  # pictures that are visible without JavaScript
-Cell = tuple[str, str]  # a number or words, and the interval
+Cell = tuple[str, str]  # a number or text, and its interval
 Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells; the files have all digits
 
 
@@ -56,7 +56,7 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
 
 @cache
 def _template(name: str) -> Template:
-    """Compile a template; it refuses numbers that JSON does not have."""
+    """Compile a template; numbers that JSON lacks raise an error."""
     trimmed = name == "strip.html.j2"
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=trimmed, lstrip_blocks=trimmed)
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
@@ -74,7 +74,7 @@ def strip_assets() -> tuple[str, str]:
 
 def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     """Return the HTML section (text escaped) with the quality of every frame of a track; needs `strip_assets`.
-    Without JavaScript it shows a table of the bad stretches and the pictures; with it, interactive strips.
+    It has interactive strips; without JavaScript, a table of the bad stretches and the pictures.
     """
     numbers = quality.frame_numbers(track) if gallery is None else gallery.numbers
     found = quality.bad_stretches(track)
@@ -138,7 +138,7 @@ def _each(tracks: Table) -> Grid:
         "duration_s": "duration, s",
     }
     cells = [[(row["file"], ""), *((_plain(row[name]), "") for name in shown)] for row in tracks.rows]
-    about = "Numbers below are of all of them together."
+    about = "The numbers below are of all tracks together."
     return {"title": "Tracks side by side", "about": about, "head": ["", *shown.values()], "rows": cells}
 
 
@@ -150,11 +150,11 @@ def _plain(value: object) -> str:
 
 def _moments(summary: Summary) -> list[Grid]:
     lost, done = {
-        "added": ("noise that the filter let through", "subtracted"),
-        "removed": ("motion that the smoother could not follow", "added"),
+        "added": ("noise that passes the filter", "subtracted"),
+        "removed": ("motion that the smoother removes", "added"),
     }[summary.ensemble.error]
     by_errors = f"With {lost} {done}, by the track's own error bars."
-    shown = {  # by field of Moments; those by the errors are unknown for the norm
+    shown = {  # by field of Moments; the corrected ones are unknown for the norm
         "mean": ("Mean", "Of components and norm."),
         "rms": ("Rms", "About the mean, as measured."),
         "corrected_rms": ("Rms, corrected", by_errors),
@@ -193,7 +193,7 @@ def _flow(tables: Mapping[str, Table]) -> Grid:
 
 
 def _behaviour(tables: Mapping[str, Table]) -> Grid:
-    shown = {"heading_rad": "heading, rad", "length_ratio": "path, ratio", "end_share": "ends apart, of the path"}
+    shown = {"heading_rad": "heading, rad", "length_ratio": "path, ratio", "end_share": "distance of ends, of the path"}
     rows = tables["behaviour"].rows if "behaviour" in tables else ()
     cells = []
     for row in rows:

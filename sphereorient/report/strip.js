@@ -1,5 +1,5 @@
-// The strip of every frame's quality: draws it, and shows the frame that is pointed at. Each section.strip of the page
-// is by itself; its data, made by frame_warnings.py, lies in it as JSON. A bin is one frame, or `per_bin` of a long track.
+// The strip of every frame's quality: draws it, and shows the chosen frame. Each section.strip of the page is independent
+// and contains its data as JSON, made by frame_warnings.py. A bin is one frame, or `per_bin` of a long track.
 (() => {
   "use strict";
   const DETAIL = { least: 40, most: 200, share: 1 / 5 }; // bins shown large: a share of all, within limits
@@ -72,7 +72,7 @@
         const from = this.first + Math.floor((cell * (this.last - this.first)) / count);
         const to = this.first + Math.floor(((cell + 1) * (this.last - this.first)) / count);
         const width = (this.right - this.left) / count;
-        const gap = this === this.owner.detail && width > 4 ? 1 : 0; // single frames are told apart where large
+        const gap = this === this.owner.detail && width > 4 ? 1 : 0; // separate single frames if large
         const [x, end] = [this.left + cell * width, this.left + (cell + 1) * width];
         const right = gap ? Math.floor(end) - gap : Math.ceil(end);
         draw(Math.floor(x), right - Math.floor(x), from, Math.max(to, from + 1));
@@ -204,7 +204,7 @@
       const bottom = this.axisTop - 1;
       if (this.box) {
         const x = this.xOf(this.box.first);
-        const width = Math.max(this.xOf(this.box.last) - x, 5); // to be seen in long tracks
+        const width = Math.max(this.xOf(this.box.last) - x, 5); // visible in long tracks
         ink.strokeStyle = owner.colours.ink;
         ink.lineWidth = 1.5;
         ink.strokeRect(x, 2, width, bottom - 2);
@@ -336,7 +336,7 @@
       this.bin = clamp(bin, 0, this.bins - 1);
       const { detail } = this;
       const size = Math.min(Math.round(clamp(this.bins * DETAIL.share, DETAIL.least, DETAIL.most)), this.bins);
-      this.find(".strip__whole").hidden = size === this.bins; // it would be the same once more
+      this.find(".strip__whole").hidden = size === this.bins; // it would be the same
       const margin = Math.min(8, Math.floor(size / 4));
       let first = clamp(detail.first, this.bin - size + 1 + margin, this.bin - margin);
       if (centred) first = this.bin - Math.floor(size / 2);

@@ -46,8 +46,8 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
     """Return all non-empty tables of a report, from the statistics, the tracks by file name, and camera distances."""
     level = f"{100 * summary.settings.level:g} % intervals"
     found: list[tuple[str, str, Iterable[Row]]] = [
-        ("tracks", "the tracks, and the frames that each camera lost", _tracks(tracks)),
-        ("segments", "segments that count", _segments(summary, list(tracks))),
+        ("tracks", "the tracks, and the lost frames of each camera", _tracks(tracks)),
+        ("segments", "segments in use", _segments(summary, list(tracks))),
         ("moments", f"Table I of the paper, {level}", _moments(summary)),
         ("comparisons", "the sphere against its flow", _comparisons(summary)),
         ("camera_distance", "distance of the cameras' orientations", _distances(distances)),
@@ -72,7 +72,7 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
 
 
 def behaviour_tables(found: Mapping[str, Behaviour]) -> list[Table]:
-    """Return the table of gain, drift and walk against a reference, by file name; none where there is none."""
+    """Return the table of gain, drift and walk against a reference, by file name; none without a reference."""
     rows = [row for name, one in found.items() for row in _rows(file=name, **one.columns())]
     about = "gain, drift and walk against the reference, 95 %"
     return [Table(name="behaviour", about=about, rows=rows)] if rows else []
@@ -84,7 +84,7 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
         write_csv(table.rows, folder / f"{table.name}.csv")
     try:
         arrow = package("pyarrow", "table")
-    except OutputError:  # the page says so; CSV has the same numbers
+    except OutputError:  # reported on the page; CSV has the same numbers
         return ["csv"]
     import pyarrow.parquet as arrow_parquet
 
@@ -118,7 +118,7 @@ def _median(values: Floats) -> float:
 
 
 def _rms(vectors: Floats) -> float:
-    """Return the root of the mean squared length of vectors (N, 3); NaN where none is known."""
+    """Return the root of the mean squared length of vectors (N, 3); NaN if all are unknown."""
     known = vectors[np.isfinite(vectors).all(axis=1)]
     return float(np.sqrt((known**2).sum(axis=1).mean())) if len(known) else float("nan")
 

@@ -1,4 +1,4 @@
-"""Files and figures of a texture map: grey values, pictures per texel, all other results; content, displacement."""
+"""Files and figures of a texture map: grey values, pictures per texel, other results, displacement."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -31,7 +31,7 @@ from sphereorient.sphere.texture import seen_path, texel_areas
 from sphereorient.trajectory import Trajectory
 
 EXTENT = -180, 180, -90, 90  # of the axes of a map, degrees
-EXAMPLES = 6  # frames that are shown
+EXAMPLES = 6  # frames shown
 UNSEEN = "#C9B48A"  # sand colour: differs from any paint
 ARROW = "#D0021B"
 LEARNT = {  # tensors of a learnt map in its file, without a unit
@@ -39,7 +39,7 @@ LEARNT = {  # tensors of a learnt map in its file, without a unit
     "seen": "pictures that show the texel",
     "sigma": "standard deviation of the paint by noise alone; inf: never seen",
     "paint": "correlation of the paint in pictures held out of the map for it",
-    "jumps": "frames from which the ball turns unlike before and after",
+    "jumps": "frames with a rotation unlike those before and after",
     "fitted": "frames that the map was fitted to; the others follow them",
 }
 CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scale of the change
@@ -47,18 +47,18 @@ CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scal
 
 def write_texture(texture: Tensor, path: Path) -> None:
     """Write a texture map (H, 2 H), 0 .. 1 or NaN (mid-grey), as 8-bit picture; may raise OutputError."""
-    # Of texels that no picture shows, in the file.
+    # Grey of unseen texels in the file.
     grey = torch.where(torch.isfinite(texture), 255 * texture, float(128))
     write_picture(path, grey.round().clamp(0, 255).byte().numpy())
 
 
 def write_seen(seen: Tensor, texture: Path) -> None:
     """Write counts (H, 2 H) beside a texture map as 8-bit picture, limited to 255; may raise OutputError."""
-    write_picture(seen_path(texture), seen.clamp(0, 255).byte().numpy())  # counts beyond are written as this
+    write_picture(seen_path(texture), seen.clamp(0, 255).byte().numpy())  # larger counts are clipped
 
 
 def write_map(found: TextureMap, path: Path) -> None:
-    """Write a texture map, and beside it which texels are paint; may raise OutputError."""
+    """Write a texture map, and the seen texels beside it; may raise OutputError."""
     unseen = torch.zeros_like(found.grey, dtype=torch.bool) if found.unseen is None else found.unseen
     write_texture(found.grey, path)
     write_seen((~unseen).int(), path)
@@ -86,7 +86,7 @@ def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, 
 
 
 def shares_seen(seen: Tensor, counts: tuple[int, ...]) -> list[float]:
-    """Return the shares of the sphere that at least so many pictures show."""
+    """Return the shares of the sphere shown in at least so many pictures."""
     area = texel_areas(len(seen))
     return [float((area * (seen >= count)).sum() / area.sum()) for count in counts]
 
@@ -103,7 +103,7 @@ class MapExample:
 
 
 def compare_pictures(learnt: LearntMap, track: Trajectory, experiment: Experiment, texture: Path) -> list[MapExample]:
-    """Render frames spread over the movie, held out of the map where there are any, with a texture map file."""
+    """Render frames spread over the movie, held-out ones if any, with a texture map file."""
     compared = []
     column = {view.name: c for c, view in enumerate(learnt.views)}
     with ExitStack() as opened:
@@ -134,7 +134,7 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
     figure = new_figure(WIDTH_IN, 8.2)
     grid = figure.add_gridspec(4, EXAMPLES, height_ratios=[2.6, 1.0, 1.0, 1.0])
     top = grid[0, :].subgridspec(2, 2, width_ratios=[2, 1])
-    draw_map(figure.add_subplot(top[:, 0]), learnt.texture, "the map of the paint", interpolation="nearest")
+    draw_map(figure.add_subplot(top[:, 0]), learnt.texture, "texture map", interpolation="nearest")
     axes = figure.add_subplot(top[0, 1])
     most = max(int(learnt.seen.max()), 2)
     counts = torch.where(learnt.seen < 1, torch.nan, learnt.seen.double())
@@ -147,16 +147,16 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
     axes = figure.add_subplot(top[1, 1])
     moved = np.rad2deg([one.moved_rad for one in learnt.rounds])
     axes.semilogy(np.arange(1, len(moved) + 1), moved, color="black", marker="o")
-    axes.set(xlabel="round", ylabel="degrees", title="attitudes' moves, rms")
+    axes.set(xlabel="round", ylabel="degrees", title="change of orientation, rms")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     for column, chosen in enumerate(spread_frames(range(len(compared)), EXAMPLES)):
         _draw_example([figure.add_subplot(grid[row, column]) for row in (1, 2, 3)], compared[chosen], column == 0)
     note(
         figure,
-        "Map: longitude to the right, latitude upwards, as seen from outside; sand: no picture shows the place. "
-        "Examples: as filmed, as rendered with the map, and the difference, red where the picture is "
+        "Map: longitude to the right, latitude upwards, as seen from outside; sand: unseen. Examples: "
+        "as filmed, as rendered with the map, and the difference, red where the picture is "
         f"brighter; full colour is {RESIDUAL_REACH:g} of the step from black to white paint. Below: the correlation "
-        "of the paint, for which the picture was held out of the map.",
+        "of the paint in pictures held out of the map.",
     )
     return figure
 
@@ -189,15 +189,15 @@ def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
 
 @in_style
 def worn_figure(worn: Tensor, texture: Tensor | None) -> Figure:
-    """Draw where paint was not used, cells as of `worn_cells`, over the texture map (H, 2 H) if it is known."""
+    """Draw the unused paint, cells as of `worn_cells`, over the texture map (H, 2 H) if known."""
     whole = torch.full((360, 720), 0.6) if texture is None else texture
     unused = worn_texels(worn, len(whole))
     figure = new_figure(WIDTH_IN, 4.0)
     axes, title = figure.subplots(), f"{100 * worn_share(worn):.0f} % of the paint differs from the map"
     draw_map(axes, whole.masked_fill(unused, torch.nan), title)
     axes.set_ylabel("latitude (degrees)")
-    map_words = "" if texture is not None else " The map itself is not drawn: the report was made without --experiment."
-    note(figure, f"Sand: the paint that the pictures show is not that of the map, and was not used.{map_words}")
+    map_words = "" if texture is not None else " The map is not drawn: the report was made without --experiment."
+    note(figure, f"Sand: paint that differs from the map and was not used.{map_words}")
     return figure
 
 
@@ -218,7 +218,7 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
     if count := len(comparison.length_rad):
         rms, most = np.rad2deg([comparison.rms_rad, comparison.max_rad])
         sizes = f"{count} patches located: {rms:.2f}° rms, {most:.2f}° at most; arrows {times:g} times as long"
-    note(figure, f"{sizes}, from a patch's place in the old map to its place now. Sand: unknown.{words}")
+    note(figure, f"{sizes}, from a patch's position in the old map to the present one. Sand: unknown.{words}")
     return figure
 
 
@@ -230,9 +230,9 @@ def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
     longitude, latitude = torch.atan2(y, x), torch.asin(z.clamp(-1, 1))
     moved = torch.rad2deg(comparison.moved_rad[known])
     largest = float(moved.norm(dim=-1).quantile(0.95).clamp_min(1e-6))
-    # Length on the page of the largest arrow, in degrees of the map.
+    # Drawn length of the largest arrow, in degrees of the map.
     times = max([step for step in (1, 2, 5, 10, 20, 50) if step * largest <= 2 * 4.0], default=1)
-    # The map stretches longitudes away from the equator.
+    # The map stretches longitude away from the equator.
     along = moved[:, 0] / latitude.cos().clamp_min(0.1)
     style: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "color": ARROW, "width": 0.0022}
     place = (torch.rad2deg(part).numpy() for part in (longitude, latitude))

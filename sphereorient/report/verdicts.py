@@ -1,4 +1,4 @@
-"""The findings of a report in words."""
+"""The findings of a report as text."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from sphereorient.statistics.isotropy import anisotropic_frame
 from sphereorient.statistics.summary import Distributions
 from sphereorient.trajectory import Trajectory, span_words
 
-FEW_SEGMENTS = 20  # below, intervals and tests say little
-LOST_SHARE = 0.05  # of the frames: worth a look
+FEW_SEGMENTS = 20  # below, intervals and tests are weak
+LOST_SHARE = 0.05  # of the frames, for a doubt
 APART_DEG = 5.0  # median distance of the cameras; the paper's method reaches half of it (docs/paper.md)
 MORE = "pass more tracks, or cut a long record with --set statistics.max_duration_s=SECONDS"
 GAUSSIAN = 3.0  # flatness
-CLEAR, WEAK = 0.001, 0.05  # p-values below which a finding is clear, or worth a word: a report makes a dozen tests
+CLEAR, WEAK = 0.001, 0.05  # p-values below which a finding is clear, or weak: a report makes a dozen tests
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One sentence on the tracks, a doubt with what to do at its end; made by `verdicts`, printed on the page."""
+    """One sentence on the tracks; a doubt ends with what to do; made by `verdicts`, printed on the page."""
 
     title: str
     grade: Literal["good", "neutral", "doubt"]
@@ -39,7 +39,7 @@ def verdicts(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
 
 
 def _say(title: str, words: str, do: str = "", *, good: bool = False) -> Verdict:
-    """Return a verdict; with something to do it is a doubt."""
+    """Return a verdict; with `do` it is a doubt."""
     if do:
         return Verdict(title=title, grade="doubt", words=f"{words}; {do}")
     return Verdict(title=title, grade="good" if good else "neutral", words=words)
@@ -66,7 +66,7 @@ def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
         yield _say("Place", "the centre is fixed: this page reports the rotation only")
     remarks = dict.fromkeys(remark for track in tracks.values() for remark in track.provenance.get("remarks", ()))
     for remark in list(remarks)[:5]:
-        yield _say("Remark", str(remark), "if this is not meant, `sphereorient check` says what to do")
+        yield _say("Remark", str(remark), "if this is not intended, run `sphereorient check`")
 
 
 def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
@@ -74,10 +74,10 @@ def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Ve
     if not count:
         longest = max(int(np.bincount(track.segment + 1)[1:].max(initial=0)) for track in tracks.values())
         least = f"{summary.settings.min_frames} frames" + (f" and {least_s:.3g} s" if np.isfinite(least_s) else "")
-        words = f"none has {least} with a motion: all numbers are unknown; the longest has {longest} frames, and its "
-        words += "ends are lost to kernels"
+        words = f"none has {least} with a motion: all numbers are unknown; the longest has {longest} frames, and "
+        words += "kernels cut its ends"
         if not any(np.isfinite(track.velocity).any() for track in tracks.values()):
-            words = "no motion: nothing smoothed these poses, so velocities are unknown, as in a track of `live`"
+            words = "no motion: these poses were not smoothed, so velocities are unknown, as in a track of `live`"
         yield _say("Segments", words, "pass longer tracks, or lower statistics.min_frames")
         return
     if summary.distributions is None:
@@ -89,7 +89,7 @@ def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Ve
         whose = "flow" if summary.integral_time_s == summary.surroundings.integral_time_s else next(iter(summary.table))
         words += f", each longer than {least_s:.3g} s (integral time of the {whose} {summary.integral_time_s:.3g} s)"
     if count < FEW_SEGMENTS:
-        words += "; with so few, tails are not well known and intervals of the flatness are too narrow"
+        words += "; with so few, tails are uncertain and intervals of the flatness too narrow"
     yield _say("Segments", words, MORE if count < FEW_SEGMENTS else "")
 
 
@@ -113,10 +113,10 @@ def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:
             continue
         median, far = np.rad2deg(np.quantile(one.distance_rad, (0.5, 0.95)))
         names = " and ".join(one.cameras)
-        words = f"{names} by themselves differ by {median:.2g}\u00b0 (median), {far:.2g}\u00b0 (95 %)"
+        words = f"the orientations of {names} alone differ by {median:.2g}\u00b0 (median), {far:.2g}\u00b0 (95 %)"
         if one.uncorrected_rad is not None and len(one.uncorrected_rad):
             words += f"; without correction of perspective by {np.rad2deg(np.median(one.uncorrected_rad)):.2g}\u00b0"
-        do = "run `sphereorient check`: swapped cameras, movies out of step and a poor calibration look like this"
+        do = "run `sphereorient check`: cameras may be swapped, movies out of step, or the calibration poor"
         yield _say("Cameras", words, do if median > APART_DEG else "")
 
 
@@ -138,20 +138,20 @@ def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
 
 def _attitude(more: Distributions) -> Iterator[Verdict]:
     test = more.uniformity
-    how = f"p = {test.p_value:.2g}, as good as {test.effective:.0f} independent attitudes"
-    words, do = "nothing against all attitudes being equally likely", ""
+    how = f"p = {test.p_value:.2g}, worth {test.effective:.0f} independent orientations"
+    words, do = "consistent with all orientations equally likely", ""
     if test.p_value < CLEAR:
-        words = "not all attitudes are equally likely"
-        do = "see in the figure of the angles which are rare: too few tracks, lost attitudes or an uneven ball"
+        words = "not all orientations are equally likely"
+        do = "see the figure of the angles: too few tracks, lost orientations, or an uneven ball"
     elif test.p_value < WEAK:
-        words = "weak signs that not all attitudes are equally likely"
-    yield _say("Attitudes", f"{words} ({how})", do)
+        words = "weak signs that not all orientations are equally likely"
+    yield _say("Orientations", f"{words} ({how})", do)
 
 
 def _frames(more: Distributions) -> Iterator[Verdict]:
     for name, row in more.rows.items():
         own = name.removeprefix("omega_")
-        sizes = f"off the rotations by {100 * row.lab_residual:.3g} % in lab, {100 * row.body_residual:.3g} % in body"
+        sizes = f"off the rotations {100 * row.lab_residual:.3g} % in lab, {100 * row.body_residual:.3g} % in body"
         found, right = own if row.frame == "both" else row.frame, row.frame in (own, "both")
         words = "not in lab or body components" if found == "none" else f"written in {found} components"
         do = "" if right else "compute it again from the orientations, see docs/errata.md E6"
@@ -163,7 +163,7 @@ def _isotropy(more: Distributions) -> Iterator[Verdict]:
         "lab": "prefers directions of the lab and none of the body: the flow, or the forcing, has axes",
         "body": "prefers directions of the body and none of the lab: the sphere's own axes differ",
         "both": "prefers directions in lab and in body",
-        "neither": "nothing against isotropy in lab and in body",
+        "neither": "consistent with isotropy in lab and in body",
     }
     for stem in ("omega", "alpha"):
         lab, body = more.isotropies[f"{stem}_lab"], more.isotropies[f"{stem}_body"]
@@ -174,7 +174,7 @@ def _isotropy(more: Distributions) -> Iterator[Verdict]:
         clear, weak = (anisotropic_frame(lab, body, level) for level in (CLEAR, WEAK))
         words = meaning[clear]
         if clear == "neither" and weak != "neither":
-            words = f"weak signs only that it {meaning[weak].split(':')[0]}"
+            words = f"only weak signs that it {meaning[weak].split(':')[0]}"
         yield _say(f"Isotropy of {stem}", f"{words} ({p})")
 
 

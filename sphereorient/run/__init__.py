@@ -1,4 +1,4 @@
-"""One way through: run(request, store), stores that outlive a kill, executors, many experiments."""
+"""Run requests: run(request, store), stores to resume from, executors, many experiments."""
 
 from sphereorient.run.many import Outcome, run_many
 from sphereorient.run.stages import run, track_movies

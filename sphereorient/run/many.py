@@ -1,4 +1,4 @@
-"""Many experiments, or one long movie, on many workers: processes here, or a Dask cluster; some of them die."""
+"""Many experiments, or one long movie, on many workers that may die: local processes, or a Dask cluster."""
 
 import multiprocessing
 import os
@@ -26,12 +26,12 @@ from sphereorient.run.stages import Task, Work, check_method, check_out, opened,
 from sphereorient.run.store import FolderStore, Request
 from sphereorient.trajectory import Tracks
 
-POLL_S = 0.5  # between looks at what the workers have written
-DEATHS = 3  # of workers on one experiment without anything new being done
+POLL_S = 0.5  # between checks of the workers' progress
+DEATHS = 3  # of workers on one experiment without progress
 
 
 class ProcessExecutor:
-    """`size` worker processes, each in a pool of its own: one that dies does not stop the others."""
+    """`size` worker processes in separate pools, so that the death of one does not stop the others."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -76,9 +76,7 @@ def end_with_parent() -> None:
 
 
 class DaskExecutor:
-    """The workers of a Dask cluster (`distributed.Client`) with the same files; `cluster`: closed too, None: it goes
-    on.
-    """
+    """The workers of a Dask cluster (`distributed.Client`) with the same files; `cluster`: also closed, unless None."""
 
     def __init__(self, client: Any, cluster: Any = None) -> None:
         self._client, self.cluster = client, cluster
@@ -86,7 +84,7 @@ class DaskExecutor:
 
     @property
     def size(self) -> int:
-        """Number of tasks that the cluster does in parallel, at least one."""
+        """Number of parallel tasks, at least one."""
         threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
 
@@ -96,7 +94,7 @@ class DaskExecutor:
         return future
 
     def renew(self, worker: int) -> None:
-        """Do nothing: a cluster replaces its workers itself."""
+        """Do nothing: a cluster replaces its workers."""
 
     def close(self) -> None:
         """Disconnect."""
@@ -110,9 +108,7 @@ Executor = ProcessExecutor | DaskExecutor
 
 
 def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
-    """Connect to Dask: tcp://host:8786, its scheduler file (.json), or `local`. SettingsError: not installed, no
-    answer.
-    """
+    """Connect to Dask: tcp://host:8786, a scheduler's .json, or `local`. SettingsError: not installed, no answer."""
     distributed = package("distributed", "cluster", SettingsError)
     local = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
     try:
@@ -122,7 +118,7 @@ def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
         file = "scheduler_file" if cluster.endswith(".json") else "address"
         return DaskExecutor(distributed.Client(**{file: cluster}, timeout=20))
     except (OSError, TimeoutError, ValueError) as error:
-        do = "start one (docs/long-runs.md), and name its scheduler's address"
+        do = "start one (docs/long-runs.md), and give its scheduler's address"
         name, got = f"--cluster {cluster}", error_words(error)
         raise SettingsError(refusal(name, expected="a Dask scheduler", got=got, do=do)) from error
 
@@ -180,7 +176,7 @@ class _Job:
                 self.counts = end.value
 
 
-# Opening a run costs as much as hundreds of frames; `run_id` is new for each `run_many`, so no later run reuses it.
+# Opening a run costs as much as hundreds of frames; a new `run_id` per `run_many` prevents reuse by later runs.
 @lru_cache(maxsize=1)
 def _work(request: Request, run_id: str) -> tuple[Work, ExitStack]:
     stack = ExitStack()
@@ -279,7 +275,7 @@ def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker
     except SphereOrientError as error:
         job.error = job.error or str(error)
         return
-    except Exception as error:  # whatever stops a worker must not stop the other experiments
+    except Exception as error:  # a fault of a worker must not stop other experiments
         executor.renew(worker)
         done = job.done()[0]
         job.deaths = 1 if done > job.done_at_death else job.deaths + 1

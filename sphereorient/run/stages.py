@@ -1,4 +1,4 @@
-"""One way through a run, for every command, the Python API and the workers: learn, follow, join."""
+"""The stages of a run, for commands, Python API and workers: learn, follow, join."""
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,13 +28,13 @@ from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Tracks, Trajectory
 
 METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}  # of `track`, by name
-TASK_BATCHES = 16  # at most in one task of a worker; a worker that dies loses less than one batch
-TASKS_A_WORKER = 2  # of a short movie: so that no worker waits long for the last one
+TASK_BATCHES = 16  # most batches in a task; a worker that dies loses less than one batch
+TASKS_A_WORKER = 2  # of a short movie, so that workers end together
 
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of a run that one worker does."""
+    """A part of a run for one worker."""
 
     stage: str  # learn, follow or join
     batches: tuple[Batch, ...] = ()  # to follow
@@ -47,7 +47,7 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
 
 
 def run_tracks(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Tracks:
-    """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
+    """Track one experiment in this process; `progress` gets stage, frames done and all frames.
     `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
     Raises SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written.
     """
@@ -95,7 +95,7 @@ class Work:
 
     @cached_property
     def follower(self) -> Follower | None:
-        """What frames are measured with: known, or learnt and kept now; None: the method needs none."""
+        """The follower of frames: from kept results, or learnt and kept now; None: the method needs none."""
         known = self.job.given or self.store.known
         if known is not None and self.method.resume is not None:
             return self.method.resume(self.job, known)
@@ -126,7 +126,7 @@ class Work:
         """Join the measured batches to the track of each ball, write them, and empty the store."""
         measured = (self.store.read(batch) for batch in self.batches)
         self.progress("join", 0, 1)
-        with ThreadPoolExecutor(1) as pool:  # digests of movies leave the interpreter free
+        with ThreadPoolExecutor(1) as pool:  # digests of movies release the interpreter lock
             experiment, names = self.job.recording.experiment, list(self.job.recording.cameras)
             inputs = input_files(experiment, names)
             origin = pool.submit(provenance, inputs, experiment.folder, self.request.command)
@@ -169,10 +169,10 @@ def track_movies(
     progress: Progress = silent,
 ) -> Trajectory | Tracks:
     """Measure position (mm) and orientation of the sphere in every frame; see docs/data-format.md for the result.
-    `run` with a `Request` does the same from what another run learnt, and writes files.
+    `run` with a `Request` can also use learnt results of another run, and writes files.
     `experiment`: as loaded, or the path of its experiment.yaml; `method`: "precise", fitted poses with covariances, or
-    "paper", Zimmermann et al. 2011, corrected (docs/errata.md); `cameras`: their names, None: all; `device`: as torch
-    names it; `progress` gets stage, frames done and frames in all.
+    "paper", Zimmermann et al. 2011, corrected (docs/errata.md); `cameras`: their names, None: all; `device`: torch's
+    name; `progress` gets stage, frames done and all frames.
     Raises SphereOrientError: missing, unreadable or inconsistent inputs.
     """
     try:
@@ -195,7 +195,7 @@ def track_movies(
 def finished(
     track: Trajectory, job: Job, request: Request, known: Learnt | None, origin: Mapping[str, Any]
 ) -> Trajectory:
-    """Add the errors that the fits do not hold, and the provenance, of which `origin` is that of the whole run."""
+    """Add the errors that fits do not include, and the provenance; `origin`: that of the whole run."""
     recording, settings = job.recording, job.settings
     remarks = [*recording.remarks, *track.provenance.get("remarks", ()), *results.missed_text(track)]
     track, doubts = results.with_errors(track, recording, None if known is None else known.lasting, compared=True)
@@ -216,7 +216,7 @@ def with_proposer(settings: Settings | None, proposer: str | Path | None) -> Set
 def check_method(request: Request) -> Method:
     """Return the method of a request; raise SettingsError if it is unknown, or does not read the settings."""
     if request.method not in METHODS:
-        got, do = repr(request.method), "name one of these"
+        got, do = repr(request.method), "choose one of these"
         raise SettingsError(refusal("method", expected=" or ".join(METHODS), got=got, do=do))
     if request.learnt is not None and METHODS[request.method].resume is None:
         do = "leave it out, or use method precise"
@@ -226,7 +226,7 @@ def check_method(request: Request) -> Method:
 
 
 def check_out(request: Request) -> None:
-    """Check before starting that the outputs can be written and replace nothing of the user's; else OutputError."""
+    """Check before starting that outputs can be written and replace no file of the user; may raise OutputError."""
     if request.out is not None:
         check_folder(request.out, str(request.out))
     with writing_of(request):
@@ -240,6 +240,6 @@ def torch_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        got, do = f"'{name}': {error_words(error)}", "name cpu, or install torch for your GPU"
+        got, do = f"'{name}': {error_words(error)}", "choose cpu, or install torch for your GPU"
         raise SettingsError(refusal("device", expected="a device that torch can use", got=got, do=do)) from None
     return device

@@ -1,4 +1,4 @@
-"""The request of a run, and where it keeps intermediate results: in memory, or in a folder beside the track."""
+"""The request of a run, and the store of its intermediate results: memory, or a folder beside the track."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 
 LOCK, PROCESS = "lock", "process"  # files in the folder of a run
-TRACES = re.compile(rf"{LOCK}|{PROCESS}|\..*\.part.*")  # left by a run that was killed at its beginning
+TRACES = re.compile(rf"{LOCK}|{PROCESS}|\..*\.part.*")  # left by a run killed at its start
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class Request:
     settings: Settings = field(default_factory=Settings)
     cameras: tuple[str, ...] | None = None
     device: str = "cpu"
-    learnt: Path | Mapping[str, Learnt] | None = None  # what another run learnt, to measure with
+    learnt: Path | Mapping[str, Learnt] | None = None  # learnt results of another run, to use
     save_learnt: Path | None = None
     command: str = "sphereorient.run"
     force: bool = field(default_factory=is_forced)  # whether files without this program's mark may be replaced
@@ -54,7 +54,7 @@ class Request:
 
 @contextmanager
 def writing_of(request: Request) -> Iterator[None]:
-    """Within this context no input of the request is replaced."""
+    """Context in which no input of the request is replaced."""
     experiment = load_experiment(request.experiment)
     with writing([experiment.path, *(path for path, _ in _files(request, experiment))], force=request.force):
         yield
@@ -104,7 +104,7 @@ def _digest(text: str) -> str:
 class MemoryStore:
     """Keeps a run in this process."""
 
-    known: Mapping[str, Learnt] | None = None  # what was learnt of each ball before the first frame
+    known: Mapping[str, Learnt] | None = None  # learnt results of each ball before the first frame
     _poses: dict[int, Followed] = field(default_factory=dict)
 
     @contextmanager
@@ -113,7 +113,7 @@ class MemoryStore:
         yield
 
     def keep(self, learnt: Mapping[str, Learnt]) -> None:
-        """Keep what was learnt of each ball."""
+        """Keep the learnt results of each ball."""
         self.known = learnt
 
     def write(self, batch: Batch, poses: Followed) -> None:
@@ -135,7 +135,7 @@ class MemoryStore:
 
 @dataclass(frozen=True)
 class FolderStore:
-    """Keeps a run in a folder; every file appears whole or not at all."""
+    """Keeps a run in a folder; each file is written whole or not at all."""
 
     folder: Path
 
@@ -145,8 +145,8 @@ class FolderStore:
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
-        """Create the folder, or resume from it, and lock it against other runs. Raises TrackError: it belongs to a run
-        with other inputs or settings; OutputError: it cannot be written, is not of a run, or another run is writing it.
+        """Create the folder, or resume from it, and lock it. Raises TrackError: it is of a run with other inputs or
+        settings; OutputError: it cannot be written, is not of a run, or another run is writing it.
         """
         with self._locked():
             now, before = fingerprint(request), self._fingerprint()
@@ -161,17 +161,17 @@ class FolderStore:
                 yield
             finally:
                 if not any(self.folder.glob("*.h5")):
-                    self.remove()  # a run that came to nothing leaves nothing
+                    self.remove()  # an empty run leaves nothing
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Make the folder where there is none, refuse one that is not of a run, and lock it."""
+        """Make the folder if missing, refuse one that is not of a run, and lock it."""
         name, lock = str(self.folder), FileLock(self.folder / LOCK, blocking=False)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if self._fingerprint() is None and not all(TRACES.fullmatch(path.name) for path in self.folder.iterdir()):
                 expected, do = "the parts of a run, or no such folder", "move it away, or choose another --out"
-                raise OutputError(refusal(name, expected=expected, got="a folder of something else", do=do))
+                raise OutputError(refusal(name, expected=expected, got="another folder", do=do))
         except OSError as error:
             do = "check the space left and the permissions of the folder"
             raise OutputError(refusal(name, expected="a folder to write", got=error_words(error), do=do)) from error
@@ -181,14 +181,14 @@ class FolderStore:
         except Timeout:
             writer, do = self._writer(), "wait for it, or stop it"
             raise OutputError(f"{name} is being written by another run{writer}; {do}.") from None
-        except OSError:  # file systems without locks; a full one is told by the next file
+        except OSError:  # file systems without locks; a full one fails at the next file
             pass
         try:
             yield
         finally:
-            lock.release()  # first: Windows does not delete what is open
+            lock.release()  # first, as Windows does not delete open files
             if not self._run.exists():
-                with suppress(OSError):  # what is not of a run stays
+                with suppress(OSError):  # foreign files stay
                     (self.folder / LOCK).unlink(missing_ok=True)
                     (self.folder / PROCESS).unlink(missing_ok=True)
                     self.folder.rmdir()
@@ -214,15 +214,15 @@ class FolderStore:
 
     @property
     def known(self) -> Mapping[str, Learnt] | None:
-        """What was learnt of each ball before the first frame; None if the file is missing or damaged."""
+        """Learnt results of each ball before the first frame; None if the file is missing or damaged."""
         try:
             return load_learnt(self.folder / "learnt.h5")
         except TrackError:
             return None
 
     def keep(self, learnt: Mapping[str, Learnt]) -> None:
-        """Write what was learnt of each ball."""
-        with writing(force=True):  # over a damaged one, too: the folder is of this run
+        """Write the learnt results of each ball."""
+        with writing(force=True):  # also over a damaged file, as the folder is of this run
             save_learnt(learnt, self.folder / "learnt.h5")
 
     def write(self, batch: Batch, poses: Followed) -> None:
@@ -245,12 +245,12 @@ class FolderStore:
         return [batch for batch in batches if not self.poses(batch).is_file()]
 
     def remove(self) -> None:
-        """Remove what is of a run; `held` removes the empty folder."""
+        """Remove the files of a run; `held` removes the empty folder."""
         if self._fingerprint() is not None:
             known = (self.folder / name for name in ("learnt.h5", "map.h5"))
             for path in [*self.folder.glob("poses-*.h5"), *self.folder.glob(".*.part*"), *known]:
                 path.unlink(missing_ok=True)
-            self._run.unlink()  # last: it says whose folder it is
+            self._run.unlink()  # last, as it identifies the folder
 
 
 Store = MemoryStore | FolderStore

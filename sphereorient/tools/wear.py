@@ -1,4 +1,4 @@
-"""Wear of a ball from a series of its texture maps: the same worn places from map to map, and their figure."""
+"""Wear of a ball from a series of its texture maps: worn places followed from map to map, and their figure."""
 
 import math
 from collections.abc import Sequence
@@ -31,17 +31,17 @@ from sphereorient.sphere.compare import (
 )
 from sphereorient.sphere.texture import map_directions, texel_areas
 
-BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
-LEAST_DEG = 1.5  # radius of the smallest place that is reported
-SHOWN = 6  # maps that are drawn at most, spread over the series
-NAMED = 6  # places that have their number in the maps, and their own curve
+BEYOND = 5.0  # times the scatter of unworn texture, seldom exceeded by noise
+LEAST_DEG = 1.5  # radius of the smallest reported place
+SHOWN = 6  # most maps drawn, spread over the series
+NAMED = 6  # places with a number in the maps, and a curve
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Wear:
     """One map compared with the first of its series, in that one's body frame and size."""
 
-    comparison: MapComparison  # displacements, without patches whose texture changed
+    comparison: MapComparison  # displacements, without patches of changed texture
     change: Tensor  # (H, 2 H), -1 .. 1, negative where darker; NaN where either map is unknown
     scatter: float  # standard deviation of grey between the two maps where unworn, black to white being 1
     worn: Tensor  # (H, 2 H) bool: places whose change exceeds the scatter
@@ -56,9 +56,9 @@ class Wear:
 class WearFigures:
     """Wear of one map in figures; shares are of area, NaN where undefined."""
 
-    known: float  # share of the ball that this map and the first know
+    known: float  # share of the ball known in this map and the first
     worn: float  # of the known area
-    grown: float  # worn now less worn in the map before, of the area known in both; against the first map: `worn`
+    grown: float  # worn now minus worn in the map before, of the area known in both; for the first map: `worn`
     stays: float  # still worn, of the area worn in the map before and known now
 
 
@@ -66,7 +66,7 @@ class WearFigures:
 class WornPlace:
     """A connected place that is worn in some map of a series."""
 
-    longitude_deg: float  # of its middle, in the first map's body frame
+    longitude_deg: float  # of its centre, in the first map's body frame
     latitude_deg: float
     share: tuple[float, ...]  # of the ball's area, worn in each map but the first; NaN where hardly seen
 
@@ -88,7 +88,7 @@ class WearSeries:
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
     """Compare maps (H, 2 H), 0 black .. 1 white, NaN unknown, in time order with the first, in its body frame.
-    `turned`: find the rotations between body frames. Raise PaintError for other balls, ShapeError if not 2:1.
+    `turned`: estimate the rotations between body frames. Raises PaintError: other balls; ShapeError: not 2:1.
     """
     if len(maps) < 2:
         do = "give the maps in the order of their movies"
@@ -119,7 +119,7 @@ def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
     known = torch.isfinite(off)
     # The median ignores worn places and borders of displaced ones.
     scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
-    number = connected_places(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is in no place
+    number = connected_places(change.abs() > max(CHANGED, BEYOND * scatter))  # unknown texels are in no place
     large = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
     large[0] = False
     comparison = without_changed(comparison, change, CHANGED)
@@ -195,7 +195,7 @@ def wear_figure(first: Tensor, series: WearSeries, names: Sequence[str]) -> Figu
     _draw_growth(figure.add_subplot(grid[rows, :]), series, names)
     note(
         figure,
-        f"Change is what lies outside of all grey levels that the first map has within {RADIUS_DEG:g}°; 1 is the step "
+        f"Change: distance from the range of grey levels of the first map within {RADIUS_DEG:g}°; 1 is the step "
         "from black to white. Outlined: worn places, the largest ones numbered. Sand: unknown.",
     )
     return figure
@@ -219,7 +219,7 @@ def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
     for number, place in enumerate(series.places[:NAMED], start=1):
         axes.plot(at, 100 * np.array([0, *place.share]), marker=".", linewidth=0.9, label=f"place {number}")
     axes.set_xticks(at, list(names))
-    # Height of the smallest scale of the curve.
+    # Least height of the axis.
     axes.set(ylabel="worn (% of the ball)", ylim=(0, max(0.1, axes.get_ylim()[1])))
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.legend(loc="upper left")

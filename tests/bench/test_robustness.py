@@ -152,7 +152,7 @@ def test_there_is_a_scene_for_everything_and_always_the_same():
     [
         ({"degradations": ("defocuss",)}, "defocus"),
         ({"levels": (0,)}, "levels 1 .. 5"),
-        ({"levels": ()}, "one at least"),
+        ({"levels": ()}, "at least one"),
     ],
 )
 def test_plans_that_cannot_be_are_refused(wrong, words):

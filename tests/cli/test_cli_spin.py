@@ -99,7 +99,7 @@ def test_options_that_are_impossible_are_refused_in_one_line(flight, monkeypatch
 def test_too_few_photographs_and_missing_ones_are_refused(flight, monkeypatch, capsys):
     code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures" / "0.png", *options(flight))
     assert code == 2
-    assert "3 photographs at least, got 1" in err
+    assert "at least 3 photographs, got 1" in err
     code, _, err = command(
         monkeypatch, capsys, "spin", *(flight / "pictures" / f"{k}.png" for k in (0, 1, 9)), *options(flight)
     )

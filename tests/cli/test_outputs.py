@@ -68,7 +68,7 @@ def state(folder: Path) -> dict[str, bytes]:
         ("calibrate cameras.yaml --refine-with track.h5 --out cameras.yaml", "an input"),
         ("convert cam1.mkv cam1.mkv", "an input"),
         ("convert-cameras cameras.yaml --out cameras.yaml", "an input"),
-        ("report track.h5 --out . -q", "something else in it"),
+        ("report track.h5 --out . -q", "other files in it"),
     ],
 )
 def test_an_input_is_never_replaced(command, place, monkeypatch, words, got, force):

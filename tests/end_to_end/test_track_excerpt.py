@@ -154,7 +154,7 @@ def test_a_track_too_short_for_statistics_has_a_page_with_the_reason(tracked, tm
     assert "Warning" not in run.stderr
     page = (tmp_path / "r" / "index.html").read_text()
     assert "figure-track" in page
-    assert "No segment counts" in page
+    assert "No segment is usable" in page
 
 
 @pytest.mark.slow

@@ -154,7 +154,7 @@ def test_a_device_that_takes_another_value_is_told(alone, monkeypatch):
         {name: min(value, 100.0) if name == "ExposureTime" else value}
     )
     install("pylon:", [camera], monkeypatch)
-    with pytest.raises(MovieError, match=r"ExposureTime 400.0 \(it took 100.0\)"):
+    with pytest.raises(MovieError, match=r"ExposureTime 400.0 \(it is 100.0\)"):
         next(source_of("pylon:4711", print).frames(with_keys(alone, cam1=DeviceKeys(exposure_ms=0.4))))
 
 
@@ -178,10 +178,10 @@ def test_a_camera_that_vanishes_is_told_once_and_taken_up_again(maker, alone, mo
     assert all(a.time_s < b.time_s for a, b in pairwise(found)), "its clock began anew"
     name = maker.replace("maker.cti#", "") + "4711"
     assert [line.split(";")[0] for line in told] == [
-        f"{name}: expected a camera that works, got 'it was removed'",
-        f"{name}: pictures come again.",
+        f"{name}: expected a working camera, got 'it was removed'",
+        f"{name}: pictures arrive again.",
     ]
-    assert told[0].endswith("It is opened again each second.")
+    assert told[0].endswith("It is reopened each second.")
     assert camera.log.count("closed") == camera.log.count("opened") == 2
 
 
@@ -286,7 +286,7 @@ def test_two_cameras_film_in_step_and_what_lacks_is_told(maker, both, monkeypatc
     assert np.mean([at[k] == [k, k] for k in range(40, 90)]) > 0.7
     assert told[0] == "waiting for the first trigger."
     assert 1 < len(told) < 5
-    assert "pictures not used or not there so far" in told[1]
+    assert "unused or missing" in told[1]
     assert first.log[-1] == second.log[-1] == "closed"
 
 
@@ -302,7 +302,7 @@ def test_one_camera_goes_on_while_the_other_is_gone(maker, both, monkeypatch):
     feed.close()
     source.close()
     assert sum(one.pictures[0] is not None for one in found) > 30
-    assert any("It is opened again each second." in line for line in told)
+    assert any("It is reopened each second." in line for line in told)
 
 
 def test_a_fault_of_one_of_two_at_the_start_ends_both(maker, both, monkeypatch):
@@ -354,7 +354,7 @@ def test_a_camera_of_opencv_gives_grey_pictures_of_the_size_of_the_movie(alone, 
     with pytest.raises(MovieError, match="px"):
         list(source_of("camera:0", print).frames(alone))
     opencv(monkeypatch, Capture([], opens=False))
-    with pytest.raises(MovieError, match="none that opens"):
+    with pytest.raises(MovieError, match="expected a camera, got none"):
         list(source_of("camera:0", print).frames(alone))
     with pytest.raises(SettingsError, match="a device for each camera"):
         list(source_of("camera:0", print).frames(both))
@@ -388,12 +388,12 @@ def test_a_camera_of_opencv_that_ends_or_changes_its_pictures_is_told_once_and_t
     assert [one.number for one in found] == [0, 1, 2, 3, 4]
     assert all(a.time_s < b.time_s for a, b in pairwise(found))
     assert [line.split(";")[0] for line in told] == [
-        "camera:0: no picture comes any more. It is opened again each second.",
-        "camera:0: pictures come again.",
-        "camera:0: no picture comes any more. It is opened again each second.",
-        "camera:0: pictures come again.",
+        "camera:0: pictures have stopped. It is reopened each second.",
+        "camera:0: pictures arrive again.",
+        "camera:0: pictures have stopped. It is reopened each second.",
+        "camera:0: pictures arrive again.",
         "camera:0: expected 650 x 650 px uint8, got 650 x 649 px uint8",
-        "camera:0: pictures come again.",
+        "camera:0: pictures arrive again.",
     ]
     assert all(device.released for device in devices[:6])
 

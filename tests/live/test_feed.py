@@ -230,7 +230,7 @@ def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypat
         found.append(arrival.number)
     assert found == [0, 1, 2, 0, 1, 2]
     assert re.fullmatch(r"source: no frame for 0\.\d s; tracking waits\.", told[0])
-    assert re.fullmatch(r"source: frames come again, after 0\.\d s\.", told[1])
+    assert re.fullmatch(r"source: frames arrive again, after 0\.\d s\.", told[1])
     assert len(told) == 2
 
 

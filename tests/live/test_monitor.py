@@ -90,7 +90,7 @@ def test_a_source_that_goes_on_while_a_frame_is_searched_tells_how_long_that_too
         (Reason.LOW_SCORE, range(15), "partly hidden, the light or the focus has changed"),
         (Reason.OUTLINE, (), "sphere.diameter"),
         (Reason.DARK, (0,), "the lamp is off"),
-        (Reason.UNDECODABLE, (0,), "no picture can be used"),
+        (Reason.UNDECODABLE, (0,), "no picture is usable"),
     ],
 )
 def test_the_likely_cause_is_told(reason, found, cause):

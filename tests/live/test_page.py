@@ -173,7 +173,7 @@ def test_a_map_is_saved_where_one_is_learnt(served, recording, arrivals, tmp_pat
     (tmp_path / "other").mkdir()
     with shown(recording, arrivals, tmp_path / "other", 3) as seen:
         assert seen.page.look()["map"] is False
-        with pytest.raises(OutputError, match="learnt meanwhile"):
+        with pytest.raises(OutputError, match="learnt live"):
             seen.page.done(["save"], {})
 
 
@@ -209,7 +209,7 @@ def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, a
         page.process.kill()
         until(lambda: told)
         assert told == ["page: its process has ended; tracking goes on without the page."]
-        assert running.is_set(), "nobody could start it again"
+        assert running.is_set(), "else it could not be started again"
         page.saw(arrivals[1], next(poses()))
     finally:
         page.close()

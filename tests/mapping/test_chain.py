@@ -114,7 +114,7 @@ def refused(whole):
 
 
 def test_a_ball_that_never_turns_is_refused():
-    assert "a ball that turns" in refused(pictures(turning(6, 0.0)))
+    assert "a ball that rotates" in refused(pictures(turning(6, 0.0)))
 
 
 def test_one_frame_is_refused():

@@ -60,7 +60,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     out = scene / "learnt.png"
     code, said, err = run(monkeypatch, capsys, "map", rendered, "--out", out, *QUICK)
     assert code == 0, err
-    for words in ("seen:", "loops:", "iterations: 4", "correlation", "next: write texture: learnt.png"):
+    for words in ("seen:", "loops:", "iterations: 4", "correlation", "texture: learnt.png"):
         assert words in said
     texture, seen = load_texture(out), read_seen(seen_path(out))
     assert seen is not None
@@ -92,7 +92,7 @@ def test_an_old_map_is_corrected_and_keeps_its_frame_and_what_is_never_seen(copy
     code, said, err = run(monkeypatch, capsys, "map", copy, *options)
     assert code == 0, err
     assert "against" in said
-    assert "kept of the old map" in said
+    assert "from the old map" in said
     assert (folder / "new_moved.png").is_file()
     new, seen = load_texture(folder / "new.png"), read_seen(folder / "new_seen.png")
     assert seen is not None

@@ -72,7 +72,7 @@ def wandering(folder: Path, reach_px: float) -> Path:
 @pytest.mark.parametrize("reach_px", [4.0, 2.0])
 def test_a_ball_declared_fixed_that_wanders_is_refused(tmp_path, reach_px):
     """Before: exit 0, and attitudes wrong by up to 90 degrees in such a movie (median 44, rates 0.80 of the true)."""
-    words = r"stays in its place, got one that wanders by [1-6]\.\d px in cam1; write `fixed: sways`"
+    words = r"a fixed ball, got one that moves by [1-6]\.\d px in cam1; set `fixed: sways`"
     path = wandering(tmp_path / "scene", reach_px)
     with open_recording(path, ["cam1"], textured=False) as recording, pytest.raises(PaintError, match=words):
         take_crops(recording, QUICK, LocateSettings(), silent)

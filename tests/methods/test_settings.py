@@ -266,7 +266,7 @@ def test_the_file_of_the_other_method_is_left_aside_with_one_remark_and_refused_
     path = REPO / "configs" / f"{other}.yaml"
     settings, remarks = read_settings(path, [], method)
     assert settings == Settings()
-    assert remarks == [f"{path}: method {method} does not read {aside}: left aside"]
+    assert remarks == [f"{path}: method {method} does not read {aside}: ignored"]
     key, before, after = {
         "precise": ("search.step_deg", "step_deg: 12.0", "step_deg: 10.0"),
         "paper": ("orient.fine_step_deg", "fine_step_deg: 3.0", "fine_step_deg: 2.0"),

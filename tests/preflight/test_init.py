@@ -103,7 +103,7 @@ def test_the_look_knows_a_ball_that_stays(tmp_path):
     assert look.stays is True
     assert look.diameter_px == pytest.approx(60.0, rel=0.05)
     said = init(tmp_path / "cam1.mkv", "--out", tmp_path / "new.yaml")
-    assert "stays in its place" in said
+    assert "fixed, outline" in said
 
 
 def test_a_movie_without_a_ball_says_so(tmp_path):

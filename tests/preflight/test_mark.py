@@ -183,7 +183,7 @@ def test_a_person_draws_a_mask(marking, address, browser: Any, tmp_path: Path):
         page.get_by_text("show only circle, 200 px across").wait_for()
         page.get_by_role("button", name="find the ball").click()
         page.get_by_text("moves, found in").wait_for()
-        page.get_by_role("button", name="lay the map on it").click()
+        page.get_by_role("button", name="overlay the map").click()
         page.get_by_text("The map explains").wait_for()
         page.screenshot(path=str(tmp_path / "mark.png"))
         page.get_by_role("button", name="save mask").click()

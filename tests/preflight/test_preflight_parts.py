@@ -239,9 +239,9 @@ def scans_of(best: dict[str, float]) -> list[OffsetScan]:
 @pytest.mark.parametrize(
     ("late", "start"),
     [
-        ({"cam1": 0.0, "cam2": 0.02, "cam3": 1.01}, "write start: {cam1: 0, cam2: 0, cam3: 1}"),
-        ({"cam1": 0.0, "cam2": -1.02, "cam3": -1.01}, "write start: {cam1: 1, cam2: 0, cam3: 0}"),
-        ({"cam1": 0.0, "cam2": -2.0, "cam3": 0.01}, "write start: {cam1: 2, cam2: 0, cam3: 2}"),
+        ({"cam1": 0.0, "cam2": 0.02, "cam3": 1.01}, "set start: {cam1: 0, cam2: 0, cam3: 1}"),
+        ({"cam1": 0.0, "cam2": -1.02, "cam3": -1.01}, "set start: {cam1: 1, cam2: 0, cam3: 0}"),
+        ({"cam1": 0.0, "cam2": -2.0, "cam3": 0.01}, "set start: {cam1: 2, cam2: 0, cam3: 2}"),
     ],
     ids=["the last", "the first", "one that is early"],
 )

@@ -66,7 +66,7 @@ def test_more_and_fewer_disks_than_named_balls_are_told():
     assert "name the other balls" in first.advice
     first, second = disk_counts(seen, balls(a=14.0, b=14.0))
     assert (first.severity, second.severity) == (OK, WARNING)
-    assert "leave out of `spheres` what is not there" in second.advice
+    assert "remove absent balls" in second.advice
 
 
 def test_a_ball_that_is_never_found_is_a_fault_and_one_found_now_and_then_a_warning():

@@ -109,7 +109,7 @@ def test_a_ball_that_moves_is_refused(marking):
     marking.path.write_text(marking.path.read_text().replace("fixed: true", "fixed: false"))
     moves = MaskMarking(marking.path)
     assert moves.state()["tries"] is False
-    with pytest.raises(SphereOrientError, match="stays in its place"):
+    with pytest.raises(SphereOrientError, match="fixed ball"):
         moves.done(["track", "cam1"], NOTHING)
 
 

@@ -50,7 +50,7 @@ def test_every_kind_of_trouble_is_among_the_first():
     assert words[5] == "the orientation jumps"
     assert words[10] == "cameras 5.7° apart, usually 0°"
     assert words[15].startswith("cam2: score 0.600, usually 0.95")
-    assert "5.7° off the smooth motion" in words[20]
+    assert "5.7° from the smooth motion" in words[20]
     assert words[25] == "stated error of the orientation 1.1°, usually 0.057°"
 
 

@@ -218,7 +218,7 @@ def test_frames_of_doubt_are_marked(ready):
     assert (doubtful.draw(K, pictures)[corner] == DOUBT).all()
     assert (lost.draw(K, pictures)[corner] == LOST).all()
     assert not (plain[corner] == DOUBT).all()
-    assert "doubt: picture explained less well" in doubtful.balls[0].state(K)[0]
+    assert "doubt: fit worse than usual" in doubtful.balls[0].state(K)[0]
     assert "not valid" in lost.balls[0].state(K)[0]
 
 
@@ -330,7 +330,7 @@ def test_without_a_map_outline_and_axes_are_shown(tmp_path):
     assert page.balls[0].views[0].light is None
     drawn = page.draw(K, pictures)
     assert (np.abs(drawn.astype(int) - OUTLINE) < 40).all(-1).sum() > 300
-    assert page.balls[0].views[0].why_unlit == "no map of the paint"
+    assert page.balls[0].views[0].why_unlit == "no texture map"
 
 
 @pytest.mark.slow

@@ -639,10 +639,10 @@ def test_angles_have_densities_by_degree_beside_the_uniform_law():
 @pytest.mark.parametrize(
     ("p_value", "words"),
     [
-        (0.4, "nothing speaks against uniform attitudes: p = 0.40"),
-        (0.012, "the attitudes are not uniform: p = 0.012"),
-        (1e-5, "the attitudes are not uniform: p < 0.001"),
-        (np.nan, "uniformity of the attitudes could not be tested"),
+        (0.4, "the orientations agree with uniformity: p = 0.40"),
+        (0.012, "the orientations are not uniform: p = 0.012"),
+        (1e-5, "the orientations are not uniform: p < 0.001"),
+        (np.nan, "uniformity of the orientations could not be tested"),
     ],
 )
 def test_the_test_of_uniformity_is_told_in_words(p_value, words):

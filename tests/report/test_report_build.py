@@ -207,9 +207,9 @@ def test_a_file_of_the_users_in_a_report_stays(tmp_path, name):
     (out / "index.html").write_text('<!doctype html>\n<meta name="generator" content="made by sphereorient">')
     check_report_folder(out)
     (out / name).write_text("mine")
-    with pytest.raises(OutputError, match="got something else in it"):
+    with pytest.raises(OutputError, match="got other files in it"):
         check_report_folder(out)
     (out / name).unlink()
     (out / "index.html").write_text("<!doctype html>\n<p>my own page</p>")
-    with pytest.raises(OutputError, match="got something else in it"):
+    with pytest.raises(OutputError, match="got other files in it"):
         check_report_folder(out)

@@ -61,12 +61,12 @@ def test_tails_are_named_by_their_kind(lab):
 
 @pytest.mark.slow
 def test_attitudes_that_prefer_a_direction_are_told(lab):
-    assert said(lab)["Attitudes"].grade == "neutral"
+    assert said(lab)["Orientations"].grade == "neutral"
     still = np.tile(np.eye(3), (len(lab), 1, 1))
     biased = replace(lab, orientation_smooth=np.where((lab.segment % 4 == 0)[:, None, None], still, lab.orientation))
-    found = said(biased)["Attitudes"]
+    found = said(biased)["Orientations"]
     assert found.grade == "doubt"
-    assert found.words.startswith("not all attitudes are equally likely")
+    assert found.words.startswith("not all orientations are equally likely")
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_a_track_that_nothing_smoothed_has_no_motion_to_report(lab):
     rates = ("velocity", "acceleration", "omega_lab", "alpha_lab")
     nothing = {name: np.full_like(getattr(lab, name), np.nan) for name in rates}
     found = said(replace(lab, **nothing))
-    assert "no motion: nothing smoothed these poses" in found["Segments"].words
+    assert "no motion: these poses were not smoothed" in found["Segments"].words
 
 
 def test_rates_without_errors_are_named(lab):
@@ -130,4 +130,4 @@ def test_of_one_segment_it_is_said_what_to_do(lab):
     found = said(one)
     assert found["Segments"].grade == "doubt"
     assert "max_duration_s" in found["Segments"].words
-    assert "Attitudes" not in found
+    assert "Orientations" not in found

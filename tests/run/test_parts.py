@@ -45,7 +45,7 @@ def test_a_folder_of_the_users_is_refused_and_stays(tmp_path):
     for resume in (False, True):
         store = FolderStore(request.parts)
         with (
-            pytest.raises(OutputError, match="a folder of something else") as refused,
+            pytest.raises(OutputError, match="got another folder") as refused,
             store.held(request, resume=resume),
         ):
             pass

@@ -119,7 +119,7 @@ def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
         file.move("cameras/cam2", "cameras/left")
         file.attrs["cameras"] = ["cam1", "left"]
         file.attrs["sha256"] = digest(file)
-    with pytest.raises(TrackError, match="learnt of cam2"):
+    with pytest.raises(TrackError, match="learnt results of cam2"):
         tracked(request_of(tmp_path, learnt=other))
 
 

@@ -22,6 +22,6 @@ from sphereorient.report.plots.track import path_figure, track_figure, track_fig
 
 
 def report_figures(of: Reported) -> Iterator[Plan]:
-    """Yield the figures of a report in its order."""
+    """Yield the figures of a report in order."""
     for figures in (track_figures, quality_figures, distribution_figures):
         yield from figures(of)

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 FOUR = (*look.COMPONENTS, look.ALL)
 CURVE_POINTS = 401  # of a smooth curve
-SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or lags of the first zero
+SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags, in integral times or lags of the first zero
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
 
 
@@ -120,7 +120,7 @@ def increments_figure(distributions: Distributions, table: Mapping[str, Moments]
     right.set(xscale="log", xlabel="lag (ms)", ylabel="flatness of increments of ω, lab (–)")
     levels = {"Gaussian": (3.0, look.SECOND.line)}
     for name, key, line in (("ω lab", "omega_lab", (0, (1, 1.5))), ("α lab", "alpha_lab", (0, (8, 2)))):
-        if table and key in table:  # of the three components as one sample, each about its mean
+        if table and key in table:  # the three components as one sample, each about its mean
             var = table[key].rms.value[:3] ** 2
             levels[name] = float((table[key].flatness.value[:3] * var**2).mean() / var.mean() ** 2), line
     for name, (level, line) in levels.items():
@@ -140,8 +140,7 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
         density, factor = shown[lag], 10.0**k
         there = density.counts > 0
         pdf = density.pdf.part(there).scaled(factor)
-        # Bars that reach zero would cross the other curves.
-        # Bars of shifted PDFs end at this part of the value.
+        # Bars of shifted PDFs end at this part of the value: those down to zero would cross the other curves.
         look.points(axes, density.centres[there], replace(pdf, low=np.maximum(pdf.low, pdf.value / 4.0)), look.X)
         _gaussian(axes, density, factor)
         top = float(np.nanmax(density.pdf.value, initial=0.4))
@@ -177,7 +176,7 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
         look.curve(axes, lag_ms, correlation.value.part((slice(None), i)), style, label=f"{style.name}: {words}")
     for i, style in enumerate(FOUR):
         time = correlation.integral_time_s.part(i).scaled(1e3)
-        place = np.array([-0.05 * (1 + i)])  # one below the other, since they are close together
+        place = np.array([-0.05 * (1 + i)])  # one below the other, as they are close
         axes.plot([float(time.value)], place, marker=style.marker, linestyle="none", color=style.colour, label="_")
         axes.hlines(place, [float(time.low)], [float(time.high)], color=style.colour, linewidth=0.9)
     below = np.flatnonzero((correlation.value.value <= 0).any(1))

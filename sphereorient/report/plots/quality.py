@@ -1,4 +1,4 @@
-"""Figures of isotropy and of what limits the measurement: orientations, noise, kernel widths, camera distances."""
+"""Figures of isotropy and quality: orientations, noise, kernel widths, camera distances."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -39,7 +39,7 @@ def quality_figures(of: look.Reported) -> Iterator[look.Plan]:
         return
     caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
     yield "kernel_widths", "Kernel widths", caption, partial(widths_figure, more.widths)
-    caption = "Euler angles against the law of uniform attitudes."
+    caption = "Euler angles against the law of uniform orientations."
     yield "angles", "Angles (Figure 10 of the paper)", caption, partial(angles_figure, more.angles, more.uniformity)
     caption = "Shares of the components in the variance, in the lab and in the body."
     yield "isotropy", "Isotropy", caption, partial(isotropy_figure, more.isotropies)
@@ -58,12 +58,12 @@ def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Fig
         axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=ticks, xlabel=rf"$\theta_{angle.name[-1]}$ (degrees)")
     panels[0].set(ylabel="PDF (1/degree)", ylim=(0.0, None))
     bins = look.PLAIN.handle("bins with intervals", marker="o", linestyle="none")
-    look.legend_of_figure(figure, [bins, look.SECOND.handle("all attitudes equally likely")], ncols=2)
-    words, of = "uniformity of the attitudes could not be tested", uniformity
+    look.legend_of_figure(figure, [bins, look.SECOND.handle("all orientations equally likely")], ncols=2)
+    words, of = "uniformity of the orientations could not be tested", uniformity
     if np.isfinite(of.p_value):
-        found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
+        found = "the orientations agree with uniformity" if of.uniform else "the orientations are not uniform"
         words = f"{found}: {look.p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames "
-        words += f"in {of.segments:,} segments, worth {of.effective:,.0f} independent attitudes"
+        words += f"in {of.segments:,} segments, worth {of.effective:,.0f} independent orientations"
     look.note(figure, words)
     return figure
 
@@ -158,7 +158,7 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     if (curve.noise_share.value > 0).any():
         share.set_yscale("log")
         look.plain_logarithms(share.yaxis)
-    rms.set(ylim=(0.0, None), ylabel=f"rms of {symbol} ({unit})")  # a plateau looks level only above zero
+    rms.set(ylim=(0.0, None), ylabel=f"rms of {symbol} ({unit})")  # from zero, so that a plateau looks level
     flatness.set_ylabel(f"flatness of {symbol} (–)")
     share.set(xlabel="kernel width σ (ms)", ylabel=f"noise in the variance of {symbol} (%)")
 

@@ -26,7 +26,7 @@ from sphereorient.trajectory.trajectory import COLOURS
 Floats = NDArray[np.float64]
 Plan = tuple[str, str, str, Callable[[], Figure]]  # a figure of a report: name, title, caption, function
 ByFile = Mapping[str, Trajectory]  # tracks by the name of their file
-Reported = tuple[Summary, ByFile, Sequence[CameraDistance]]  # what a report is of
+Reported = tuple[Summary, ByFile, Sequence[CameraDistance]]  # the input of a report
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
@@ -34,7 +34,7 @@ DPI = 150  # of the PNG
 AXIS_COLOURS = COLOURS["x"], COLOURS["y"], COLOURS["z"]
 BLACK = "#000000"
 GREY = "#666666"
-SHADE = "#BBBBBB"  # of what does not count
+SHADE = "#BBBBBB"  # of unused frames
 BAND = 0.2  # opacity
 SYMBOLS = {
     "velocity": "v",
@@ -48,7 +48,7 @@ SYMBOLS = {
 
 @dataclass(frozen=True, kw_only=True)
 class LineStyle:
-    """How one component is drawn; components differ in colour and, for grey print, in line, marker and hatch."""
+    """Style of one component; components differ in colour and, for grey print, in line, marker and hatch."""
 
     name: str
     colour: str
@@ -73,11 +73,11 @@ Z = LineStyle(name="z", colour=AXIS_COLOURS[2], line=(0, (6, 1.5, 1.2, 1.5)), ma
 ALL = LineStyle(name="all", colour=BLACK, line="-", marker="D", width=1.7)
 BALLS = "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7B4173"  # of the second ball and more; no hues of the axes
 SECOND = LineStyle(name="second", colour=BLACK, line=(0, (3, 2)), marker="x")  # a law, or a reference
-PLAIN = LineStyle(name="", colour=GREY, line="-", marker="o")  # of legends that hold for all components
+PLAIN = LineStyle(name="", colour=GREY, line="-", marker="o")  # of legends for all components
 COMPONENTS = (X, Y, Z)
 
 
-# Decorates functions that draw: in the style of the reports, independent of the user's matplotlibrc.
+# Decorator of drawing functions: style of the reports, independent of the user's matplotlibrc.
 in_style = matplotlib.style.context(["default", Path(__file__).with_name("report.mplstyle")])
 
 
@@ -110,7 +110,7 @@ def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ..
     for each in paths:
         with put_aside(each) as aside:
             figure.savefig(aside, dpi=dpi, metadata=undated.get(each.suffix.lower()))
-        figure.set_layout_engine("none")  # laid out once, for all files alike
+        figure.set_layout_engine("none")  # one layout for all files
     return paths
 
 
@@ -137,7 +137,7 @@ def curve(axes: Axes, x: Floats, of: Interval, style: LineStyle, **more: Any) ->
 
 
 def legend_above(axes: Axes, ncols: int = 1, handles: Sequence[Any] | None = None, title: str | None = None) -> None:
-    """Put the legend above the axes, where it covers no data."""
+    """Put the legend above the axes."""
     handles = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
     if handles:
         place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "alignment": "left"}
@@ -152,8 +152,8 @@ def legend_of_figure(figure: Figure, handles: Sequence[Any], ncols: int) -> None
 
 def note(figure: Figure, words: str) -> None:
     """Write a note below all panels, with line breaks."""
-    letters = round(15 * figure.get_figwidth())  # of a note; narrow enough for wide letters
-    figure.supxlabel(textwrap.fill(words, letters), fontsize=8.0)  # of all text, as in report.mplstyle
+    letters = round(15 * figure.get_figwidth())  # per line, narrow enough for wide letters
+    figure.supxlabel(textwrap.fill(words, letters), fontsize=8.0)  # as in report.mplstyle
 
 
 def plain_logarithms(axis: Axis) -> None:
@@ -166,13 +166,13 @@ def plain_logarithms(axis: Axis) -> None:
 
 
 def say_empty(axes: Any, words: str = "nothing measured") -> None:
-    """Write into an empty panel why it is empty."""
+    """Write the reason into an empty panel."""
     write = axes.text2D if hasattr(axes, "text2D") else axes.text
     write(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
 
 
 def of_tracks(names: Iterable[str], tracks: ByFile) -> str:
-    """Return the label of some of the tracks in a title; empty if there is only one."""
+    """Return the label of some tracks in a title; empty if there is only one track."""
     return "" if len(tracks) == 1 else f" of {', '.join(names)}"
 
 
@@ -193,7 +193,7 @@ def interval_text(of: Interval, unit: str = "", factor: float = 1.0) -> str:
 
 
 def superscript(units: str) -> str:
-    """Return units with a square as people write it."""
+    """Return units with a superscript 2."""
     return units.replace("^2", "\u00b2")
 
 

@@ -18,12 +18,12 @@ from sphereorient.trajectory import Trajectory, runs_of
 from sphereorient.trajectory.datasets import in_length
 from sphereorient.trajectory.rotations import Floats, tait_bryan, tait_bryan_sigma
 
-MOST_FRAMES = 2000  # more are not distinguishable on a page
+MOST_FRAMES = 2000  # more are indistinguishable on a page
 GAP = 1.5  # typical steps: a longer one is a gap
 SIGMAS = 2.0  # half width of the bands
 NOT_VALID: Final[dict[str, Any]] = {"facecolor": "#E8E8E8", "edgecolor": look.SHADE, "hatch": "//////", "linewidth": 0}
-LATE_S, LONG_S = 10.0, 2.0  # from here on times are given in seconds
-WRAP_DEG = 90.0  # no sphere turns so far from frame to frame: the angle has wrapped, or passed its pole
+LATE_S, LONG_S = 10.0, 2.0  # from here on times are in seconds
+WRAP_DEG = 90.0  # a larger step between frames means that the angle wrapped, or passed its pole
 RATES = {
     "velocity": "velocity, lab (m/s)",
     "omega_lab": "ω, lab (rad/s)",
@@ -52,8 +52,8 @@ class TrackPart:
     """Frames of a track that are drawn; made by `shown_part`."""
 
     track: Trajectory  # these frames only
-    words: str  # names the part; empty for the whole track
-    broken: NDArray[np.bool_]  # (n - 1,), interrupt the line between a frame and the next
+    words: str  # name of the part; empty for the whole track
+    broken: NDArray[np.bool_]  # (n - 1,), whether the line to the next frame is interrupted
 
 
 @look.in_style
@@ -137,7 +137,7 @@ def path_figure(*tracks: Trajectory) -> Figure:
 
 
 def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> TrackPart:
-    """Return the whole track, or the `most` consecutive frames of its longest segment that have the most valid ones."""
+    """Return the whole track, or the `most` consecutive frames of its longest segment with the most valid ones."""
     rows, words = np.arange(len(track)), ""
     if len(track) > most:
         which = "none of them in a segment"
@@ -184,7 +184,7 @@ def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDA
 
 
 def _limit(axes: Axes, values: Floats, sigma: Floats) -> None:
-    """Limit an axis to values: bands are far wider at the ends of segments."""
+    """Limit an axis by the values: bands widen at the ends of segments."""
     known, errors = values[np.isfinite(values)], sigma[np.isfinite(sigma)]
     if len(known):
         rest = 0.05 * float(np.ptp(known)) + (SIGMAS * float(np.median(errors)) if len(errors) else 0.0)
@@ -216,9 +216,9 @@ def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float
 
 
 def _equal_scale(axes: Any, position_mm: Floats, size: float) -> None:
-    """Give all axes the same scale; the box is as long as the path, and not too thin."""
+    """Give all axes the same scale; the box fits the path, and is not too thin."""
     low, high = position_mm.min(0) - size, position_mm.max(0) + size
-    # Of the largest extent: the least length of the box's shortest side.
+    # Least length of the box's shortest side, as a share of the largest extent.
     extent = np.maximum(high - low, 0.35 * (high - low).max())
     middle = (low + high) / 2
     axes.set_box_aspect(tuple(extent), zoom=0.95)  # a tuple: it scales an array in place

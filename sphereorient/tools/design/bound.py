@@ -12,10 +12,10 @@ from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.renderer import orthographic_camera
 
 STEP_PX = 0.1  # of central differences, as motion on the picture: their error is 0.5 % of the bound at 0.6 px of blur
-ROUNDING = 1e-6  # share of the greatest information below which an unknown's own information is rounding error
-DETERMINED = 1e-3  # least eigenvalue, each unknown's own information 1, that differences of sampled pictures resolve
+ROUNDING = 1e-6  # share of the greatest information; less is rounding error
+DETERMINED = 1e-3  # least eigenvalue (own information of each unknown: 1) resolved by differences of sampled pictures
 OPEN_SHARE = 1e-3  # an unknown is open if this share of it lies along open directions
-ATTITUDES = 16  # whose derivatives are held at once
+ATTITUDES = 16  # per batch of derivatives
 SAMPLING = Sampling(supersampling=6)
 
 
@@ -81,7 +81,7 @@ def cramer_rao_bound(
     numbers = {"diameter_px": diameter_px, "noise_share": noise_share, "supersampling": sampling.supersampling}
     for name, value in numbers.items():
         if not value > 0:
-            do = "pass what the picture has"
+            do = "pass the picture's value"
             raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do=do))
     render = disk_renderer(texture.to(R_view_body), diameter_px, sampling)
     flat = R_view_body.reshape(-1, 3, 3)
@@ -99,7 +99,7 @@ def disk_renderer(texture: Tensor, diameter_px: float, sampling: Sampling = SAMP
 
 
 def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
-    """Return derivatives (K, S^2, 6) by `Bound`'s unknowns, by central differences: kinks disturb automatic ones."""
+    """Return derivatives (K, S^2, 6) by `Bound`'s unknowns, by central differences, as kinks disturb automatic ones."""
     step = STEP_PX * R_view_body.new_tensor([1 / render.radius_mm] * 3 + [1.0] * 3)
     both = torch.cat([torch.diag(step), -torch.diag(step)])  # (12, 6)
     R = so3.exp(both[:, :3]) @ R_view_body[:, None]
@@ -111,10 +111,10 @@ def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
 def _inverse(information: Tensor, count: int = 6) -> Tensor:
     """Invert information (..., 6, 6) of the first `count` unknowns, the others known; infinity: undetermined."""
     own = information.diagonal(dim1=-2, dim2=-1).clamp_min(0)
-    # Compare with all unknowns: the first `count` may all be undetermined.
+    # Compare with all unknowns, as the first `count` may all be undetermined.
     greatest = own.amax(-1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
     own, information = own[..., :count], information[..., :count, :count]
-    # Scale each unknown's own information to 1: rad and px cannot be compared.
+    # Scale each unknown's own information to 1, as rad and px are not comparable.
     unit = torch.where(own > ROUNDING * greatest, own, greatest).rsqrt()
     value, axis = torch.linalg.eigh(information * unit[..., None] * unit[..., None, :])
     open_ = value < DETERMINED

@@ -21,11 +21,11 @@ from sphereorient.sphere import sample_texture
 
 GORES = (4, 48)
 DIAMETERS_MM = (2.0, 500.0)
-STEP_MM = 0.1  # of the lattice on which borders are followed, at most
-STEP_RAD = math.radians(0.5)  # and on the ball
+STEP_MM = 0.1  # largest step of the lattice for borders
+STEP_RAD = math.radians(0.5)  # likewise on the ball
 MM = 1 / 25.4  # inches
-MARGIN_MM = 12.0  # of the sheet, for the printer and the line below
-RULE_MM = (10.0, 50.0)  # lengths of the line to check the scale by, for small and for large balls
+MARGIN_MM = 12.0  # of the sheet, for the printer and the scale line
+RULE_MM = (10.0, 50.0)  # lengths of the scale line, for small and large balls
 CUT = "#C000C0"
 FOLD: dict[str, Any] = {"color": "#00A0A0", "linewidth": 0.3, "linestyle": (0, (6, 4))}
 
@@ -84,7 +84,7 @@ def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Te
 
 @in_style
 def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
-    """Draw the strips at true size; not `filled`: only the borders between black and white, to be cut out or traced."""
+    """Draw the strips at true size; not `filled`: only the borders of the colours, to cut out or trace."""
     (width, height), (equator, meridian) = gores.sheet_mm, gores.size_mm
     figure = Figure(figsize=(width * MM, height * MM))
     axes = figure.add_axes((0, 0, 1, 1), xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2))
@@ -128,7 +128,7 @@ def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
 def instructions(gores: Gores) -> str:
     """Return the text page for the strips, from the template gores.txt."""
     (width, height), sheet = gores.size_mm, gores.sheet_mm
-    slope = math.pi / gores.count * math.sin(math.pi / 4)  # of a strip's edge against its middle, at latitude 45
+    slope = math.pi / gores.count * math.sin(math.pi / 4)  # of a strip's edge to its centre line, at latitude 45
     sizes = {"width": width, "height": height, "sheet_width": sheet[0], "sheet_height": sheet[1]}
     errors = {"stretch": 100 * (math.hypot(1, slope) - 1), "turn": math.degrees(math.atan(slope))}
     text = Path(__file__).with_name("gores.txt").read_text(encoding="utf-8")

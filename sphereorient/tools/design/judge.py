@@ -1,4 +1,4 @@
-"""Judge how precisely a texture map determines the orientation, draw it; search for one to paint by hand."""
+"""Judge and draw how precisely a texture map determines the orientation; search for one to paint by hand."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -25,11 +25,11 @@ from sphereorient.tools.design import patterns
 from sphereorient.tools.design.bound import cramer_rao_bound
 
 SEARCH = GreySearchSettings()  # normalisation and size of the views, as in the search on grey values
-ALIKE_STEP_DEG = 12.0  # of the first comparison: every view is within 14.5 degrees of the grid
-CLOSER_DEG = (5.0, 2.5)  # steps of the comparisons about the most similar views
-CLOSEST = 24  # most similar views that are compared again
+ALIKE_STEP_DEG = 12.0  # of the first comparison; the grid is within 14.5 degrees of every view
+CLOSER_DEG = (5.0, 2.5)  # steps of comparisons near the most similar views
+CLOSEST = 24  # number of most similar views to compare again
 RENDERED = 512  # views at once
-FEW_VIEWS, FINALISTS = 24, 3  # of the first judgement in a search, and maps that are judged in full
+FEW_VIEWS, FINALISTS = 24, 3  # of the first judgement in a search, and maps to judge in full
 WHITE_SHARE = (0.15, 0.85)  # of a view, in a search
 SIDE_PX = 96  # of the drawn views
 WORST, BEST, ALIKE = "#B42318", "#1A7F37", "#0072B2"  # colours of the figure
@@ -59,7 +59,7 @@ class Judgement:
 
     @property
     def margin(self) -> float:
-        """1 less the similarity of the most similar views."""
+        """1 minus the similarity of the most similar views."""
         return 1.0 - self.alike
 
     def as_dict(self) -> dict[str, Any]:
@@ -155,12 +155,12 @@ def design_texture(
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Tensor, Judgement, str]:
     """Return the paintable map (512, 1024) with the best worst view, its judgement and its description.
-    Of each of the `kinds` (of `PATTERNS`) so many `tries` are drawn, with sizes of 1.5 to 5 times the brush, whose
-    width is at least `stroke` degrees; of the best few, the least bound / margin wins: precise, hard to confuse. Raise
-    PaintError if no map can be painted with such a brush.
+    Draws `tries` maps of each of the `kinds` (of `PATTERNS`), with sizes of 1.5 to 5 times the brush, whose width is at
+    least `stroke` degrees; of the best few, the least bound / margin wins. Raises PaintError: no map can be painted
+    with such a brush.
     """
     settings = DesignSettings() if settings is None else settings
-    # The ratio of bounds hardly depends on the diameter: the first judgement is for a small one.
+    # The first judgement uses a small diameter, as the ratio of bounds hardly depends on it.
     small = settings.model_copy(update={"diameter_px": min(40.0, settings.diameter_px)})
     R, (low, high) = patterns.facing(patterns.view_directions(FEW_VIEWS)), WHITE_SHARE
     found: list[tuple[float, str, float, int]] = []

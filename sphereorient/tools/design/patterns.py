@@ -13,12 +13,12 @@ from sphereorient.errors import PaintError, refusal
 from sphereorient.sphere import sample_texture
 from sphereorient.sphere.texture import fibonacci_directions, map_directions, random_directions
 
-POINTS = 40_000  # at which a map is sampled: 1 degree apart
-CIRCLES, AROUND = 400, 1440  # great circles on which borders are counted, and points of each
-LOST_SHARE = 0.02  # of the sphere, the corners of patches, that a round brush may miss
-BRUSHES_DEG = tuple(float(width) for width in range(2, 61))  # widths that are tried
+POINTS = 40_000  # samples of a map, 1 degree apart
+CIRCLES, AROUND = 400, 1440  # great circles for counting borders, and points of each
+LOST_SHARE = 0.02  # of the sphere (corners of patches) that a round brush may miss
+BRUSHES_DEG = tuple(float(width) for width in range(2, 61))  # trial widths
 WAVES = 60  # of a random function
-SIZES_DEG = (3.0, 60.0)  # smallest and largest patches
+SIZES_DEG = (3.0, 60.0)  # smallest and largest patch
 
 
 def view_directions(count: int) -> Tensor:
@@ -27,7 +27,7 @@ def view_directions(count: int) -> Tensor:
 
 
 def facing(direction_body: Tensor) -> Tensor:
-    """Return R_view_body (..., 3, 3) that turn directions (..., 3) to the camera, north (at a pole: +x) up."""
+    """Return R_view_body (..., 3, 3) that rotate directions (..., 3) to the camera, north (at a pole: +x) up."""
     outward = torch.nn.functional.normalize(direction_body, dim=-1)
     x, y, _ = outward.unbind(-1)
     polar = torch.hypot(x, y) < 1e-9
@@ -51,7 +51,7 @@ def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) 
 
 
 def stroke_deg(texture: Tensor) -> float:
-    """Return the width, whole degrees, of the widest round brush that paints both colours but for 2 % of the sphere.
+    """Return the width, whole degrees, of the widest round brush that paints both colours except 2 % of the sphere.
 
     White is above one half; 0: no brush. Source: opening by a disk, Matheron 1975.
     """

@@ -1,4 +1,4 @@
-"""Photographs without a background picture: their files, and disks of the ball, grey by its own colour."""
+"""Photographs without a background picture: files, and disks of the ball, grey relative to its colour."""
 
 import csv
 import io
@@ -28,16 +28,16 @@ Photograph = NDArray[Any]
 
 MOST_PIXELS = 50_000_000  # of a photograph
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-MOST_PHOTOGRAPHS = 1000  # at once: all are held in memory
-FINER = 4  # times: the outline is followed on a lattice finer than the pixels
-CORNER = 0.08  # of the shorter side: squares in the corners that show the scene
-RIM = (0.85, 0.95)  # of the radius: the outline is half as bright as this
-SPECK = 3  # px, median that removes noise before the outline is followed
-RADIUS_MIN_PX = 6.0  # below this a disk shows next to no texture
+MOST_PHOTOGRAPHS = 1000  # all in memory
+FINER = 4  # lattice of the outline, times finer than pixels
+CORNER = 0.08  # of the shorter side: squares in the corners, for the scene
+RIM = (0.85, 0.95)  # of the radius: the outline has half the brightness of this ring
+SPECK = 3  # px, median filter against noise
+RADIUS_MIN_PX = 6.0  # a smaller disk shows hardly any texture
 ROUND_SHARE = 0.6  # of the outline's points that must lie on the circle
-ON_CIRCLE = 0.06  # distance from the circle, of its radius, up to which they do
+ON_CIRCLE = 0.06  # largest distance of these from the circle, of its radius
 STEPS = 12  # of the circle's robust fit
-PICTURES_MIN = 3  # two fit any spin
+PICTURES_MIN = 3  # any spin fits two
 NO_CIRCLE = math.nan, math.nan, math.nan, 0.0
 
 
@@ -53,7 +53,7 @@ class BallOutline:
 def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
     """Find the ball, whole or cut, in a photograph (H, W) or (H, W, 3) with a free corner; else raise PaintError."""
     levels = _channels(picture, name)
-    # Each pixel's distance from the corners' median colour; the ball may fill a corner.
+    # Each pixel's distance from the corners' median colour, as the ball may fill a corner.
     side = max(2, round(CORNER * min(levels.shape[:2])))
     ends = (slice(None, side), slice(-side, None))
     corners = [levels[rows, columns].reshape(-1, levels.shape[2]).mean(0) for rows in ends for columns in ends]
@@ -62,17 +62,17 @@ def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
     scale = 255 / max(float(difference.max()), 1e-6)
     inside = difference > cv2.threshold((difference * scale).astype(np.uint8), 0, 255, cv2.THRESH_OTSU)[0] / scale
     if not inside.any():
-        raise _nothing(name, "nothing that stands out")
+        raise _nothing(name, "nothing unlike the scene")
     fine = np.asarray(cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR), np.float32)
     rough = _outlined(fine, 0.5 * float(np.median(difference[inside])))
-    # A lit ball is dimmer at its rim: the border lies at half of the level just inside.
+    # A lit ball is dimmer at its rim: the border is at half of the level just inside.
     row, column = np.ogrid[: fine.shape[0], : fine.shape[1]]
     away = np.hypot(row - rough[1], column - rough[0]) / max(rough[2], 1.0)
     rim = fine[(away > RIM[0]) & (away < RIM[1])]
     u, v, radius, share = _outlined(fine, 0.5 * float(np.median(rim))) if len(rim) else rough
     radius = (radius + 0.5) / FINER  # the outline runs through the outermost cells' middles
     if not radius >= RADIUS_MIN_PX or share < ROUND_SHARE or radius > max(picture.shape[:2]):
-        raise _nothing(name, "nothing round that stands out")
+        raise _nothing(name, "nothing round unlike the scene")
     return BallOutline(u_px=(u + 0.5) / FINER - 0.5, v_px=(v + 0.5) / FINER - 0.5, radius_px=radius)
 
 
@@ -83,13 +83,13 @@ class Photographs:
     pictures: Sequence[Photograph]  # (H, W) or (H, W, 3) each, sizes may differ
     time_s: Tensor  # (F,) float64, from any origin, all different
     names: Sequence[str] = ()  # for messages
-    balls: Sequence[BallOutline] | None = None  # where the ball is; None: it is searched
+    balls: Sequence[BallOutline] | None = None  # outlines; None: to be found
 
     def __post_init__(self) -> None:
         count, finite = len(self.pictures), bool(self.time_s.isfinite().all())
         do = "give one time in seconds for each photograph"
         if count < PICTURES_MIN:
-            expected = f"{PICTURES_MIN} photographs at least"
+            expected = f"at least {PICTURES_MIN} photographs"
             raise PaintError(refusal("spin", expected=expected, got=str(count), do="add pictures of the same flight"))
         if self.time_s.shape != (count,) or not finite:
             got = f"{tuple(self.time_s.shape)} times" if finite else "a time that is no number"
@@ -109,7 +109,7 @@ class Photographs:
 
 
 def _own_grey(levels: NDArray[np.float32], ball: BallOutline) -> NDArray[np.float32]:
-    """Return the share of the ball's mean colour in each pixel (H, W): white is bright whatever the ball's colour."""
+    """Return the share of the ball's mean colour in each pixel (H, W): white is bright for any colour of the ball."""
     row, column = np.ogrid[: levels.shape[0], : levels.shape[1]]
     inside = np.hypot(row - ball.v_px, column - ball.u_px) < ball.radius_px
     colour = levels[inside].mean(0) if inside.any() else np.ones(levels.shape[2], np.float32)
@@ -118,14 +118,14 @@ def _own_grey(levels: NDArray[np.float32], ball: BallOutline) -> NDArray[np.floa
 
 def _channels(picture: Photograph, name: str) -> NDArray[np.float32]:
     if picture.ndim not in (2, 3) or min(picture.shape[:2]) < 2 * RADIUS_MIN_PX or picture.shape[2:] not in ((), (3,)):
-        expected, do = "(H, W) or (H, W, 3), 12 px at least", "pass pictures as arrays, colours in the last axis"
+        expected, do = "(H, W) or (H, W, 3), at least 12 px", "pass pictures as arrays, colours in the last axis"
         raise PaintError(refusal(name, expected=expected, got=str(picture.shape), do=do))
     levels = picture.astype(np.float32)
     return levels[..., None] if picture.ndim == 2 else levels
 
 
 def _outlined(fine: NDArray[np.float32], level: float) -> tuple[float, float, float, float]:
-    """Fit a circle to the border of the largest region above a level, where the picture does not cut it."""
+    """Fit a circle to the border of the largest region above a level, without parts cut by the picture."""
     outlines, _ = cv2.findContours((fine > level).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not outlines:
         return NO_CIRCLE
@@ -149,8 +149,8 @@ def _circle(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
 
 
 def _nothing(name: str, got: str) -> PaintError:
-    do = "crop the picture about the ball so that a corner shows the scene, or give the outline (balls=)"
-    return PaintError(refusal(name, expected="one ball before a scene unlike it", got=got, do=do))
+    do = "crop the picture to the ball and a corner of scene, or give the outline (balls=)"
+    return PaintError(refusal(name, expected="one ball before an unlike scene", got=got, do=do))
 
 
 def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
@@ -175,9 +175,9 @@ def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
     if path.suffix.lower() not in (".csv", ".txt"):
         return load_texture(path)
     text = read_text(path, TABLE_BYTES, "a table of dots", PaintError, "name a file that exists")
-    do = "write x,y,z of one dot a line, without a head"
+    do = "write x,y,z of one dot per line, without a header"
     try:
-        with warnings.catch_warnings(action="ignore"):  # of an empty table, which is refused below
+        with warnings.catch_warnings(action="ignore"):  # of an empty table, refused below
             rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)
     except ValueError as error:
         raise PaintError(refusal(str(path), expected="a table of numbers", got=error_words(error), do=do)) from None
@@ -193,7 +193,7 @@ def _times(times: str, files: Sequence[Path]) -> Tensor:
     except ValueError:
         return _table_times(Path(times), files)
     if not 0 < rate_hz < math.inf:
-        do = "give the number of pictures a second"
+        do = "give the number of pictures per second"
         raise PaintError(refusal("--times", expected="a rate above 0", got=times, do=do))
     return torch.arange(len(files), dtype=torch.float64) / rate_hz
 
@@ -202,7 +202,7 @@ def _table_times(path: Path, files: Sequence[Path]) -> Tensor:
     text = read_text(path, TABLE_BYTES, "a table of times", PaintError, "name a file that exists")
     table = csv.DictReader(io.StringIO(text))
     if not {"file", "t_s"} <= set(table.fieldnames or ()):
-        got, do = ", ".join(table.fieldnames or ()) or "nothing", "write a head with file,t_s"
+        got, do = ", ".join(table.fieldnames or ()) or "nothing", "write a header with file,t_s"
         raise PaintError(refusal(str(path), expected="the columns file and t_s", got=got, do=do))
     found = {str(row["file"]): str(row["t_s"]) for row in table}
     missing = [file.name for file in files if file.name not in found]
@@ -222,7 +222,7 @@ def _picture(path: Path) -> Photograph:
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as picture:
             if picture.width * picture.height > MOST_PIXELS:
-                got, do = f"{picture.width} x {picture.height}", "crop it about the ball"
+                got, do = f"{picture.width} x {picture.height}", "crop it to the ball"
                 expected = f"a picture of at most {MOST_PIXELS / 1e6:g} million pixels"
                 raise PaintError(refusal(str(path), expected=expected, got=got, do=do))
             return np.asarray(picture.convert("RGB"))

@@ -15,14 +15,14 @@ from sphereorient.sphere.texture import map_directions
 
 HEIGHT = 256  # of maps: 0.7 degree
 LENGTH_TOLERANCE = 0.05  # of the directions of a table
-LIMB = 0.6  # cosine between a dot and the line of sight below which its picture is too narrow to be measured
+LIMB = 0.6  # least cosine between a measured dot and the line of sight
 BIN_RAD = math.radians(1.0)  # of the profile
-REACH = 3.0  # radii of the first guess to which the profile goes; the white around begins at 2
+REACH = 3.0  # length of the profile in radii of the first guess; white begins at 2
 EVEN = 0.6  # radii of the disk, standard deviation of the neighbourhood that removes the light; dots are smaller
 RADII_DEG = (0.5, 45.0)  # of dots
-DARKEST = 0.97  # share of a disk's pixels that are brighter than a dot's middle
-CORE, SOFT = 0.8, 0.2  # of a dot's measured radius: where darkness is expected, and the width of this border
-UNKNOWN = 0.25  # weight of dark that is not in the table over that of a missing dot
+DARKEST = 0.97  # share of a disk's pixels brighter than a dot's centre
+CORE, SOFT = 0.8, 0.2  # of a dot's measured radius: extent of expected darkness, and width of its border
+UNKNOWN = 0.25  # weight of unexpected dark over that of a missing dot
 DOT_SEARCH = GreySearchSettings(score_min=0.05, peaks=24, finalists=16)
 
 
@@ -32,8 +32,8 @@ class DotTable:
     Raise PaintError for no dots, lengths over 5 % from 1, or a radius out of range; ShapeError if not (D, 3).
     """
 
-    direction_body: Tensor  # (D, 3), middles of the dots
-    radius_deg: float = 6.0  # angle at the ball's centre between a dot's middle and its border
+    direction_body: Tensor  # (D, 3), centres of the dots
+    radius_deg: float = 6.0  # angle at the ball's centre between a dot's centre and border
 
     def __post_init__(self) -> None:
         check_tail("direction_body", self.direction_body, 3)
@@ -45,7 +45,7 @@ class DotTable:
         low, high = RADII_DEG
         if not low <= self.radius_deg <= high:
             expected, got = f"{low:g} .. {high:g} degrees", f"{self.radius_deg:.3g}"
-            do = "give the angle at the ball's centre between a dot's middle and its border"
+            do = "give the angle at the ball's centre between a dot's centre and border"
             raise PaintError(refusal("radius of dots", expected=expected, got=got, do=do))
 
     def unit(self) -> Tensor:
@@ -77,16 +77,16 @@ class DotTable:
         profile = torch.bincount(bins, even[used]) / torch.bincount(bins).clamp_min(1)
         outer = profile[round(2 * guess_deg) :]
         half = 0.5 * float(profile[0] + outer.median()) if len(outer) else -math.inf
-        k = int((profile > half).long().argmax()) if len(profile) else 0  # the first that is brighter
+        k = int((profile > half).long().argmax()) if len(profile) else 0  # the first brighter one
         if k == 0:
-            do = "check that the attitudes and the table belong to the pictures"
-            raise PaintError(refusal("dots", expected="dark dots where the table has them", got="none", do=do))
+            do = "check that orientations and table belong to the pictures"
+            raise PaintError(refusal("dots", expected="dark dots at the table's directions", got="none", do=do))
         low, high = float(profile[k - 1]), float(profile[k])
         return replace(self, radius_deg=math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low)))
 
 
 class DotSearch(Proposer):
-    """Search all of SO(3) for a table of dots: the grey search proposes; missing dots count, other dark hardly."""
+    """Search of all SO(3) for a table of dots, among candidates of the grey search; other dark has little weight."""
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class DotSearch(Proposer):
         self._radius = math.radians(table.radius_deg) * CORE
 
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
-        """Propose attitudes; see `GreySearch.propose`.
+        """Propose orientations; see `GreySearch.propose`.
 
         Returns:
             Candidates, best first; the score is 1 where all dark is dots and all dots are visible, 1/2 where a ball

@@ -11,18 +11,18 @@ from torch import Tensor
 
 from sphereorient import so3
 
-ANCHORS = 40  # pairs of neighbouring pictures from which spins are guessed, evenly spread
+ANCHORS = 40  # evenly spread pairs of neighbouring pictures, for guesses of the spin
 PER_PICTURE = 6  # candidates of a picture in these guesses
-KEPT = 256  # guesses that are refined
-FIRST_SPAN = 2.6  # median steps to each side of a guess's pair that it is compared with first
-GROWTH = 1.6  # of the span: errors of a fit fall faster than that
-LOOSE_RAD, TIGHT_RAD = math.radians(12.0), math.radians(1.0)  # scatter of right candidates: at first, at least
+KEPT = 256  # guesses to refine
+FIRST_SPAN = 2.6  # median steps to each side of a guess's pair, in the first comparison
+GROWTH = 1.6  # of the span; errors of a fit fall faster
+LOOSE_RAD, TIGHT_RAD = math.radians(12.0), math.radians(1.0)  # scatter of right candidates: initial, least
 ITERATIONS = 3  # of each fit while the span grows
 LAST_ITERATIONS = 12
-STRAYS = 0.2  # share of pictures, at first guess, without a right candidate
-SAME_RAD = math.radians(6.0)  # spins whose orientations at all pictures' times are this near are the same
-PRIOR = 1e-6  # information of the unknowns before any picture, so that undetermined ones do not move
-ALIAS_SCATTER = 3.0  # initial scatter of an alias over that of the best spin: times are multiples but for jitter
+STRAYS = 0.2  # initial share of pictures without a right candidate
+SAME_RAD = math.radians(6.0)  # spins are equal if their orientations at all pictures' times differ by less
+PRIOR = 1e-6  # prior information, so that undetermined unknowns do not move
+ALIAS_SCATTER = 3.0  # initial scatter of an alias over that of the best spin, as times jitter
 REPORTED = 32  # spins at most
 
 
@@ -90,7 +90,7 @@ def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
     spins = _guesses(seen, omega_max_rad_s)
     if not len(spins):
         return spins
-    # From a few pictures about each guess to all; only the better guesses continue.
+    # From a few pictures near each guess to all; only the better guesses continue.
     usual = float(seen.time_s.sort().values.diff().median())
     spans = [FIRST_SPAN * max(usual, seen.step_s)]
     while spans[-1] < float(seen.time_s.max() - seen.time_s.min()):
@@ -138,12 +138,12 @@ def refine_spins(seen: PictureCandidates, spins: Spins, *, iterations: int, span
 
 
 def evidence_of(seen: PictureCandidates, spins: Spins) -> Tensor:
-    """Return each picture's part of the evidence, (K, F): below 0 if no candidate is near."""
+    """Return each picture's evidence, (K, F): below 0 if no candidate is near."""
     return _matched(seen, spins)[2]
 
 
 def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Return spins through two candidates of neighbouring pictures, with any number of whole turns between them."""
+    """Return spins through two candidates of neighbouring pictures, with any number of revolutions between them."""
     order = seen.time_s.argsort(stable=True)
     gap = seen.time_s[order].diff()
     usable = torch.nonzero(gap > 0)[:, 0]
@@ -176,8 +176,8 @@ def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
 
 
 def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Return a spin with whole turns per step added, in both directions, up to the limit."""
-    # Move R0 to the time of a picture: only there do all aliases agree.
+    """Return a spin with whole revolutions per step added, in both directions, up to the limit."""
+    # Move R0 to the time of a picture, where all aliases agree.
     nearest = (seen.time_s - best.time0_s).abs().argmin()[None]
     best = replace(best, R0_view_body=best.R_view_body(seen.time_s)[:, nearest[0]], time0_s=seen.time_s[nearest])
     rate = float(best.omega_view_rad_s.norm())

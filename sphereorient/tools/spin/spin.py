@@ -1,4 +1,4 @@
-"""The spin of a ball from a few photographs: orientations from each alone, then one uniform spin."""
+"""The spin of a ball from a few photographs: orientations in each alone, then a uniform spin."""
 
 import math
 from collections.abc import Sequence
@@ -23,30 +23,30 @@ from sphereorient.tools.spin.dots import DOT_SEARCH, DotSearch, DotTable
 from sphereorient.tools.spin.fit import PictureCandidates, Spins
 
 FINEST = 0.05  # detail of the last fit, radii: a pixel of a disk of 40
-FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own orientation may lie from the spin's
-AS_EVIDENT = 6.0  # difference of evidence (log) below which pictures do not distinguish two spins
-AT_ONCE = 4  # photographs between two reports of progress
-COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: in a row, and altogether, the first ones
+FOLLOWED_RAD = math.radians(20.0)  # largest angle between a picture's own orientation and the spin's
+AS_EVIDENT = 6.0  # difference of evidence (log); below, pictures do not distinguish two spins
+AT_ONCE = 4  # photographs per report of progress
+COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: per row, and in all
 
 
 class SpinSettings(BaseModel, frozen=True, extra="forbid"):
     """How a spin is searched in photographs."""
 
     omega_max_rad_s: float = Field(2 * math.pi * 300, gt=0, description="rad/s; all aliases below it are reported")
-    search: GreySearchSettings = Field(DOT_SEARCH, description="of attitudes in each photograph alone")
+    search: GreySearchSettings = Field(DOT_SEARCH, description="of orientations in each photograph alone")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpinEstimate:
     """A spin from F photographs, with K - 1 aliases; view frame: x right, y down, z from the camera to the ball."""
 
-    spins: Spins  # those that the pictures do not distinguish first, by rate; then by evidence
-    ambiguous: int  # number of spins that the pictures do not distinguish; 1: the first is the only one
+    spins: Spins  # first indistinguishable ones, by rate; then by evidence
+    ambiguous: int  # number of indistinguishable spins; 1: unambiguous
     evidence: Tensor  # (K, F), of each picture for each spin, log
     mirrored_evidence: float  # of the best spin of the mirrored texture
-    alone: Candidates  # attitudes from each picture alone, best first
-    R_view_body: Tensor  # (F, 3, 3), each picture's own attitude near the first spin's, else that spin's
-    residual_rad: Tensor  # (F,), between the two; NaN where the picture has none
+    alone: Candidates  # orientations from each picture alone, best first
+    R_view_body: Tensor  # (F, 3, 3), each picture's own orientation near the first spin's, else that spin's
+    residual_rad: Tensor  # (F,), between the two; NaN: no own orientation
     score: Tensor  # (F,), share of the picture's variance that the texture explains there
     balls: tuple[BallOutline, ...]
     disks: Tensor  # (F, S, S), grey levels
@@ -59,7 +59,7 @@ def spin_of(
     progress: Progress = silent,
 ) -> SpinEstimate:
     """Find the uniform spin of a ball of known texture from photographs of a far, uncalibrated camera.
-    Times at multiples of one step allow several spins, whole turns per step apart: all below the limit are returned.
+    Times at multiples of one step allow several spins, whole revolutions per step apart: returns all below the limit.
     `texture` is the map (H, 2 H), 0 black .. 1 white, or a table of dots. Raise PaintError for no ball, no spin better
     than chance, or a mirrored texture that fits better.
     """
@@ -120,7 +120,7 @@ def _check_evidence(best: float, mirrored: float) -> None:
     got = f"evidence {best:.0f}, and {mirrored:.0f} for its mirror image"
     if mirrored > best + AS_EVIDENT:
         do = "flip the map left to right, or change the sign of one column of the table"
-        raise PaintError(refusal("texture", expected="that of the ball, not of its mirror image", got=got, do=do))
+        raise PaintError(refusal("texture", expected="the ball's, not its mirror image", got=got, do=do))
     if mirrored > best - AS_EVIDENT:
         do = "check that texture, times and pictures belong together and that the ball spins uniformly, or add pictures"
         raise PaintError(refusal("spin", expected="one that explains more than chance", got=got, do=do))
@@ -155,6 +155,6 @@ def spin_figure(found: SpinEstimate, texture: Tensor, time_s: Tensor, names: Seq
         filmed.imshow(disk.numpy(), cmap="gray", interpolation="nearest")
         drawn.imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
         off = float(found.residual_rad[k])
-        words = f"{math.degrees(off):.1f}° off" if math.isfinite(off) else "no attitude"
+        words = f"{math.degrees(off):.1f}° off" if math.isfinite(off) else "no orientation"
         filmed.set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
     return figure

@@ -138,7 +138,7 @@ def test_a_mirrored_table_is_refused():
     omega = 0.3 * TURN * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     time_s = STEP * torch.arange(12, dtype=torch.float64)
     photographs, _, table = filmed(omega, time_s, mirror=True)
-    with pytest.raises(PaintError, match="not of its mirror image"):
+    with pytest.raises(PaintError, match="not its mirror image"):
         spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
 
 
