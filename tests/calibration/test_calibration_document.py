@@ -67,7 +67,7 @@ FAULTS = [
     (clicked([[1, 2]]), r"clicked, cam1: expected two or three pairs u, v: origin, \+x, \+y, got \["),
     (clicked([[1, 2], [3, 4, 5]]), r"pictures.0.clicked.cam1.1"),
     (clicked([[1, 2], [3, float("nan")]]), r"pictures.0.clicked.cam1.1.1.*finite number"),
-    (clicked([[1, 2], [480.0, 4]]), r"0, clicked, cam1, \+x: expected a place inside 480 x 400 px, got \[480.0, 4.0\]"),
+    (clicked([[1, 2], [480.0, 4]]), r"0, clicked, cam1, \+x: expected a point inside 480 x 400 px, got \[480.0, 4.0\]"),
     (clicked([[1, 2], [3, 4]], "cam2"), r"pictures, 0, clicked: expected one of cam1, got 'cam2'"),
     (
         clicked([[1, 2], [3, 4]]) | {"plate": {"type": "chessboard", "columns": 9, "rows": 6, "pitch": 8.0}},

@@ -94,7 +94,7 @@ def test_a_strong_distortion_that_rises_everywhere_never_folds():
     ids=["k1", "k3", "p1"],
 )
 def test_a_distortion_that_folds_inside_the_picture_is_refused(changes):
-    with pytest.raises(CameraError, match=r"k, p: expected a distortion that can be undone .* folds before \(") as no:
+    with pytest.raises(CameraError, match=r"k, p: expected a distortion that is invertible .* folds before \(") as no:
         brown(**changes)
     assert "\n" not in str(no.value)
 

@@ -170,7 +170,7 @@ def test_without_addpar_there_is_no_distortion(tmp_path):
 
 def test_a_scale_of_unknown_origin_is_read_with_a_warning(tmp_path):
     ori, addpar, par = files(tmp_path, addpar="0 0 0 0 0 1.01 0")
-    with pytest.warns(UserWarning, match=r"scx = 1.01 is read as x' = scx x, y' = y"):
+    with pytest.warns(UserWarning, match=r"scx = 1.01 was read"):
         camera = load_openptv(ori, load_ptv_par(par), addpar)
     # 100 px to the right of the middle of the sensor and 100 px below it
     assert_close(camera.distort(f64((739.5, 611.5))), f64((740.5, 611.5)), atol=1e-9)

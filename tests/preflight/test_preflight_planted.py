@@ -109,7 +109,7 @@ def test_a_turned_camera_is_named_with_its_angle(clean, tmp_path, name):
     turned(tmp_path, name, 1.5)
     found = of(preflight(path), "cameras agree")
     assert found.severity is FAULT
-    assert f"{name} turned by 1.5 degrees" in found.advice
+    assert f"{name} rotated by 1.5 degrees" in found.advice
 
 
 @pytest.mark.slow
