@@ -277,7 +277,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "no rotation": (replacing("cameras.yaml", "0.998022948172868", "0.9"), ["cameras.yaml", "cam1", "rotation"]),
     "unknown key": (replacing("experiment.yaml", "frame_rate", "framerate"), ["framerate", "frame_rate"]),
     "masks": (adding("masks: {cam1: m.png}"), ["m.png", "no such file", "hides the ball"]),
-    "fixed": (fixed, ["a ball that turns in its place"]),
+    "fixed": (fixed, ["a ball that rotates in its place"]),
     "no ball": (no_ball, ["sphere in some frame", "not_found"]),
 }
 
