@@ -68,7 +68,7 @@ def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark
 
 
 def test_frames_beyond_all_movies_are_refused(folder):
-    with pytest.raises(MovieError, match="expected 16 frames as frames: says, got 15"):
+    with pytest.raises(MovieError, match="expected 16 frames, by frames:, got 15"):
         line(folder, BOTH + "frames: [0, 16]\n")
 
 
