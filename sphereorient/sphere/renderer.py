@@ -68,7 +68,7 @@ class SphereRenderer(nn.Module):
 
     Args:
         texture: (H, 2 H), 0 black .. 1 white; NaN: unknown paint, shown as grey. An `nn.Parameter` is trained, anything
-        else becomes a buffer.
+            else becomes a buffer.
         radius_mm: sphere radius.
         camera: camera of the picture; None for the orthographic view along z (x right, y down).
         size_px: side of the orthographic picture, filled by a sphere at the origin.
