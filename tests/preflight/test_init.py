@@ -386,7 +386,7 @@ def test_init_replaces_its_own_file_until_somebody_changes_it(clean, tmp_path):
     second = out.read_text()
     assert second != first
     out.write_text(second.replace("diameter: 18", "diameter: 19"))
-    with pytest.raises(SphereOrientError, match=r"of `sphereorient init` that was changed since; .*--force"):
+    with pytest.raises(SphereOrientError, match=r"a changed draft of `sphereorient init`; .*--force"):
         init(*movies, "--out", out)
     assert "diameter: 19" in out.read_text()
     assert not has_mark(out)
@@ -470,7 +470,7 @@ def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(clean, tmp_path
     init(*movies, "--out", out)
     text = out.read_text()
     out.write_text(text.partition("\n")[2] if change == "first line" else change.format(text), newline="\r\n")
-    with pytest.raises(SphereOrientError, match=r"of `sphereorient init` that was changed since"):
+    with pytest.raises(SphereOrientError, match=r"a changed draft of `sphereorient init`"):
         init(*movies, "--out", out)
 
 
