@@ -1,6 +1,4 @@
-"""Disagreement of the cameras about the sphere, each measured alone, and its likely causes of few parameters, fitted
-robustly.
-"""
+"""Disagreement of the cameras about the sphere, each measured alone, and its likely causes of few parameters."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

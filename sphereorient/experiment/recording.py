@@ -1,6 +1,4 @@
-"""Experiments with open movies: a camera with its pictures (of its movie, its scene and its mask), and the recording of
-all cameras.
-"""
+"""Experiments with open movies: a camera with its pictures (movie, scene, mask), and the recording of all cameras."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor

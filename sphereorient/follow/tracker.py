@@ -48,9 +48,7 @@ class Tracker:
     def track(
         self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
     ) -> Iterator[dict[str, Poses]]:
-        """Yield the poses of each ball in a batch's frames: shots of each view, lengths of the chunks, times of all
-        frames.
-        """
+        """Yield the poses of each ball in a batch's frames: shots of each view, lengths of chunks, times."""
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = {name: [Chunk(first, time_s) for first in firsts] for name in self.balls}
         found: dict[int, dict[str, Poses]] = {}

@@ -159,9 +159,7 @@ def match_disks(disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -
 
 
 def assigned(cost: NDArray[np.float64], matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """Return pairs (ball, match) with the least sum of costs (n, N), each ball and each disk at most once; only pairs
-    of cost below 0.
-    """
+    """Return pairs (ball, match) of least sum of costs (n, N), below 0; each ball and each disk at most once."""
     ball, match = np.nonzero(cost < 0)
     if not len(ball):
         return []

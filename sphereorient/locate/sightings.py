@@ -85,9 +85,7 @@ def ball_at(
     diameter_px: float,
     settings: LocateSettings,
 ) -> Found:
-    """Return the outline of one of the blobs, best first, of a frame (H, W) and its `difference` from the background;
-    see `find_ball`.
-    """
+    """Return the outline of a blob, best first, of a frame (H, W) and its `difference` from the background."""
     best: Outline | None = None
     likeliest = (False, 0.0)  # painted and supported ones first, then the largest coverage
     for blob in blobs:

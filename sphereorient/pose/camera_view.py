@@ -171,9 +171,7 @@ class Optics:
 def level_of(
     base: TextureTable, blur_px: float, extra_px: float, radius_px: float, limb_blur_px: float | None = None
 ) -> PyramidLevel:
-    """Return the level at which `extra_px` of blur are added to pictures of blur `blur_px`; `limb_blur_px` as in
-    `Optics`.
-    """
+    """Return the level with `extra_px` of blur added to pictures of blur `blur_px`; limb as in `Optics`."""
     limb_px = math.hypot(blur_px if limb_blur_px is None else limb_blur_px, extra_px)
     paint = base.blurred(math.hypot(blur_px, extra_px) / radius_px)
     return PyramidLevel(extra_px=extra_px, blur_px=limb_px, paint=paint)

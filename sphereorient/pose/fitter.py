@@ -88,9 +88,7 @@ class Fitter:
     def left(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
     ) -> float:
-        """Return the mean of `logs_left` after a new fit; a mean of logarithms, since cameras' residuals may differ
-        tenfold.
-        """
+        """Return the mean of `logs_left` after a new fit: cameras' residuals may differ tenfold."""
         begin = PoseStart(fit.position_lab_mm, fit.R_lab_body, use)
         return float(logs_left(self.fit(pixels, begin, level or self.optics.fine, iterations), use).mean())
 

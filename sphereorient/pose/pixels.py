@@ -190,9 +190,7 @@ class Stencil:
 
 @lru_cache(maxsize=64)
 def disk_stencil(radius_px: float, step_px: int = 1, blur_px: float = 0.0) -> Stencil:
-    """Return all places within a radius, `step_px` apart. Tiles are as wide as model errors of paint with blur
-    `blur_px`; every disk has several.
-    """
+    """Return all places within a radius, `step_px` apart, with several tiles, by the blur, on every disk."""
     tile_px = max(round(min(TILE_BLURS * blur_px, radius_px / FEWEST_TILES)), TILE_PX, step_px)
     reach = math.ceil(radius_px)
     at = np.arange(-reach, reach + 1)

@@ -43,9 +43,7 @@ def _of(*shape: int) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FittedPoses:
-    """Poses fitted to the pictures of C cameras, with covariance; float64, of any leading shape.
-    Compiled code writes the parts in this order.
-    """
+    """Fitted poses of C cameras, float64, of any leading shape; compiled code writes the parts in this order."""
 
     position_lab_mm: Tensor = field(metadata=_of(3))
     R_lab_body: Tensor = field(metadata=_of(3, 3))

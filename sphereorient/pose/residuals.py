@@ -54,9 +54,7 @@ class Residuals:
 
 
 def disk_sums(at: Residuals) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the linear problem of L disks as sums, float64, light coefficients eliminated as in `without_light`; of
-    delta (rad) and position (mm).
-    """
+    """Return the problem as sums, float64, without light coefficients (`without_light`); of delta (rad) and mm."""
     weighted = at.design * (at.weight / at.variance)[:, None]
     return without_light((weighted @ at.design.mT).double(), (weighted @ at.residual[..., None])[..., 0].double())
 

@@ -134,9 +134,7 @@ class Proposer(nn.Module, ABC):
 
     @abstractmethod
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
-        """Propose orientations for (F, S, S) float32 grey disks, independently of each other. `least`: instead of
-        `score_min` of templates.
-        """
+        """Propose orientations for (F, S, S) float32 grey disks, one by one. `least`: instead of `score_min`."""
 
     def rough(self, disks: Tensor) -> Candidates:
         """Return the starts of the refinement in `propose`: right to the step of its grid, in a quarter of the time."""

@@ -160,10 +160,9 @@ def expose(scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Ten
 def exposures(
     scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> Iterator[Exposure]:
-    """Yield N exposures of K balls without noise.
-    `position_lab_mm` (K, N, E, 3) and `R_lab_body` (K, N, E, 3, 3) are the poses at the E instants of each exposure.
-    Nearer balls cover those behind them; balls cast no shadows.
-    Raises CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
+    """Yield N exposures of K balls without noise. `position_lab_mm` (K, N, E, 3) and `R_lab_body` (K, N, E, 3, 3) are
+    the poses at the E instants of each exposure. Nearer balls cover those behind them; balls cast no shadows. Raises
+    CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     size, blur_px = camera.image_size[::-1], scenes[0].settings.blur_px
     radii_mm = position_lab_mm.new_tensor([scene.settings.diameter_mm / 2 for scene in scenes])[:, None, None]

@@ -307,9 +307,7 @@ class Trajectory:
         return np.asarray(~self.valid & none.any(0) & (none | unknown).all(0))
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `frames`, `valid`, `no_ball`, and `lost`: the rest by camera and reason, frequent ones
-        first.
-        """
+        """Return the numbers of `frames`, `valid`, `no_ball`, and `lost` frames, these by camera and reason."""
         lost, none = {}, self.without_ball
         for name, camera in self.cameras.items():
             reasons = (why for why, absent in zip(camera.reason, none, strict=True) if not absent)

@@ -63,12 +63,11 @@ class FoundCamera:
 
 
 def load_camera_files(paths: Sequence[Path | str], image_size: tuple[int, int] | None = None) -> list[FoundCamera]:
-    """Read cameras whose lens is OpenCV's; the first pixel's centre is (0, 0), T is taken as mm.
-    A file is OpenCV's YAML, XML or JSON, ROS' camera_info, anipose's TOML, COLMAP's cameras.txt, or any YAML, JSON or
-    TOML with keys of `KEYS`: of one camera, of several by name, or of a stereo pair (M1, D1, M2, D2, R, T). A file of R
-    and T alone belongs to the one before. `image_size` (W, H), px, is for files without it.
-    Raises CameraError: another file, a missing or impossible key, shear, a lens other than k1, k2, p1, p2, k3 or
-    cv2.fisheye's k1 to k4.
+    """Read cameras whose lens is OpenCV's; the first pixel's centre is (0, 0), T is taken as mm. A file is OpenCV's
+    YAML, XML or JSON, ROS' camera_info, anipose's TOML, COLMAP's cameras.txt, or any YAML, JSON or TOML with keys of
+    `KEYS`: of one camera, of several by name, or of a stereo pair (M1, D1, M2, D2, R, T). A file of R and T alone
+    belongs to the one before. `image_size` (W, H), px, is for files without it. Raises CameraError: another file, a
+    missing or impossible key, shear, a lens other than k1, k2, p1, p2, k3 or cv2.fisheye's k1 to k4.
     """
     trees: list[tuple[Path, Tree]] = []
     for path in map(Path, paths):

@@ -47,11 +47,10 @@ def estimate_appearance(
     following: Following | None = None,
     among: Among | None = None,
 ) -> Appearance:
-    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
-    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`,
-    motion during the exposure counts as blur. `among`: known poses of several balls; then cameras that see another ball
-    do not disagree.
-    Raises ExperimentError: no frame has a pose, or none is better than wrong poses.
+    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies. `first`
+    finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`, motion
+    during the exposure counts as blur. `among`: known poses of several balls; then cameras that see another ball do not
+    disagree. Raises ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
     search, found, sample, odds = _chosen(for_blur(first), frames, among)
     given = settings.blur_px is not None
@@ -122,9 +121,7 @@ def _chosen(
 
 
 def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
-    """Return a search with the blur that was found; None if the first guess is near it, or motion during the exposure
-    counts as blur.
-    """
+    """Return a search with the blur that was found; None if the first guess was near, or blur holds the motion."""
     fitter, blur_px = search.fitter, studied.fitter.optics.blur_px
     if abs(blur_px / fitter.optics.blur_px - 1) <= BLUR_FAR_OFF or darkest_white(studied.fitter) is not None:
         return None

@@ -129,9 +129,7 @@ def check_white(fitter: Fitter) -> None:
 
 
 def without_occluders(studied: Studied) -> Studied:
-    """Estimate light and poses without what covers the ball; if most of the ball is hidden in most pictures, disable
-    the search for occluders.
-    """
+    """Estimate light and poses without occluders; if most of the ball is usually hidden, seek no occluders."""
     fitter, fit, use = studied.fitter, studied.fit, studied.use
     free = enough_of(fitter.unoccluded(studied.whole, fit.position_lab_mm, fit.R_lab_body))
     hidden = 1.0 - free.inside.sum(-1) / studied.pixels.inside.sum(-1).clamp_min(1)

@@ -60,9 +60,8 @@ class MapOdds:
 
 def pose_log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor:
     """Return the log odds (...), at least 0, of a pose against another one, by their scores; `greatest`: most a wrong
-    pose reaches.
-    The best of N independent views of a wrong map leaves the share V of the variance, with V ** (-n / 2) = N for n
-    independent pixels. A pose that leaves U has the odds (V / U) ** (n / 2) = N ** (log U / log V - 1).
+    pose reaches. The best of N independent views of a wrong map leaves the share V of the variance, with V ** (-n / 2)
+    = N for n independent pixels. A pose that leaves U has the odds (V / U) ** (n / 2) = N ** (log U / log V - 1).
     """
     gain, chance = (
         -(1 - one.clamp(CHANCE, most)).clamp_min(LEAST_LEFT).log() for one, most in ((score, 1.0), (other, greatest))

@@ -94,9 +94,7 @@ def nothing(found: Sequence[Poses]) -> ExperimentError:
 
 
 def with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use: Tensor) -> list[CameraView]:
-    """Return the views with the least merit of a blob that is examined for the sphere; `use` (n, C): the cameras that
-    show it in n frames.
-    """
+    """Return the views with the least merit of an examined blob; `use` (n, C): cameras that show the sphere."""
     views = []
     for camera, view in enumerate(search.fitter.views):
         seeing = zip(frames, use[:, camera].tolist(), strict=True)
@@ -106,9 +104,7 @@ def with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use
 
 
 def second_ball(search: Initialiser, frames: Sequence[Sequence[Frame]], studied: int) -> bool:
-    """Return whether two disks fit the map in so many of the frames, of all `studied` ones, that there is a second
-    ball.
-    """
+    """Return whether so many of the `studied` frames have two disks that fit the map that there are two balls."""
     claimed = sum(count > 1 for count in side_by_side(search.claimants, frames))
     return claimed >= max(2, RIVALS * studied)
 

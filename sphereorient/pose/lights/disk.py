@@ -79,9 +79,7 @@ class DiskLight(Light):
     def learnt(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
     ) -> "DiskLight":
-        """Estimate light and noise anew; see `Light.learnt`. Poses are fitted with the light: a light at fixed poses
-        would favour them, even wrong ones.
-        """
+        """Estimate light and noise anew, with the poses, see `Light.learnt`: fixed poses would be favoured."""
         cameras = use.shape[1]
         at = fitted_residuals(pixels, fit, model)
         stray = learn_stray(at, pixels, use, self.stray)
