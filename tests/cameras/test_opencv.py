@@ -97,7 +97,7 @@ FAULTS = {
     "no rotation": ({"R": 2 * np.eye(3), "T": np.zeros(3)}, "R_cam_lab: expected a rotation"),
     "R without T": ({"R": np.eye(3)}, "R, T: expected both or none"),
     "T without R": ({"tvec": np.zeros(3)}, "R, T: expected both or none"),
-    "fold": ({"distortion_coefficients": np.array([-1.5, 0, 0, 0, 0])}, "k, p: expected a distortion that can be"),
+    "fold": ({"distortion_coefficients": np.array([-1.5, 0, 0, 0, 0])}, "k, p: expected a distortion"),
     "flag": ({"fisheye_model": "maybe"}, "fisheye_model: expected 0 or 1"),
 }
 

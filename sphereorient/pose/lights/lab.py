@@ -41,7 +41,7 @@ GRID = 360  # rows of latitude from which the look-up maps are interpolated: hal
 ROUNDS, AGAIN = 5, 1  # Gauss-Newton steps from an even light, from a light in the lab
 AT_ONCE = 4  # poses whose products are summed in single precision
 INDEPENDENT = 0.1  # share of independent pixels, as errors of neighbours are correlated; other frames fit best with it
-# Prior standard deviations. Of harmonics of degree l, times 1 + l, in units of white less black paint:
+# Prior standard deviations. For harmonics of degree l, to be divided by 1 + l, in units of white less black paint:
 LEVEL, SLOPES, GLOSS = 3.0, 0.2, 3.0  # the mean, all others, mirrored light: lamps are brighter than paint
 THROUGH, FACE = 0.2, 0.3  # of the cover's two functions at a knot, the second one relative
 TINT = (0.15, 0.08, 0.08)  # of a frame's own light, relative, by order
