@@ -297,7 +297,7 @@ def _texture_path(experiment: Experiment, sphere: Sphere) -> Path:
     if sphere.texture_path is not None:
         return sphere.texture_path
     key, name = (f"spheres.{sphere.name}", f", ball {sphere.name}") if sphere.name else ("sphere", "")
-    do = f"learn it with `sphereorient map`, then write its file as {key}.texture:"
+    do = f"learn it with `sphereorient map`, then write its file as {key}.texture"
     raise refused(f"{experiment.path}{name}", "a texture", "none", do)
 
 

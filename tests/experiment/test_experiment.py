@@ -301,7 +301,7 @@ def test_textures_of_several_balls_are_read_once_a_file(folder, monkeypatch):
         with pytest.raises(ExperimentError, match="expected one ball"):
             _ = opened.texture
     with (
-        pytest.raises(ExperimentError, match=r"ball a: expected a texture, got none; .*write spheres\.a\.texture"),
+        pytest.raises(ExperimentError, match=r"ball a: expected a texture, got none; .*spheres\.a\.texture"),
         recording.open_recording(load_experiment(written(folder, text.replace(", texture: other.png", "")))),
     ):
         pass
