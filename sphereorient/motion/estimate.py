@@ -20,7 +20,7 @@ FAR_MOVED = 100.0  # sigmas; after a larger displacement of the reference the es
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
 POLES = (0.02, 6.0)  # per frame, limits of the prior's band; at 6 the rates of frames are independent
 UNSURE = 0.5  # prior standard deviation of the log of the scale, which fast changing rates do not determine
-# Pole per frame above which frames hardly predict each other, as for a ball turned by an animal. There the scale is 1:
+# Pole per frame above which frames hardly predict each other, as for a ball under an animal. There the scale is 1:
 # otherwise the motion counts as error and is smoothed away.
 FORGOTTEN = 1.5
 SPREADS = (1e-3, 1e5)  # of the rate per frame, in sigmas of a measurement

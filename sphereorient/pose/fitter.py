@@ -32,7 +32,7 @@ from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import TextureTable
 
 CPU = torch.device("cpu")
-LEAST_LEFT = 1e-6  # share of a picture's variance; rounding alone leaves more
+LEAST_LEFT = 1e-6  # least unexplained share of a picture's variance; rounding alone leaves more
 DISK_PX = 32  # diameter of the disk on which the share of known paint is measured
 
 

@@ -106,7 +106,7 @@ def _spoilt_before(disks: DiskPlaces, neighbours: Neighbours, camera: int) -> tu
     blur = disks.blur_px * pitch[of, which] / radius_mm[of, which]
 
     def limit_mm2(edge: float) -> Floats:
-        # Half of a blur on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+        # The limb is curved: a blur is half covered blur^2 / 2 radii inside it.
         limit: Floats = (radius_mm[of, which] * (1.0 - 0.5 * blur**2 - edge * blur).clip(0.0))[:, None] ** 2
         return limit
 

@@ -24,7 +24,7 @@ OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  
 # with 6); least number across half a disk.
 TILE_PX, TILE_BLURS, FEWEST_TILES = 6, 10.0, 3
 BACKWARD = -0.17  # least cosine of a line of sight to the axis: beyond it a disk is twice as wide as high
-INNER = 0.67  # of a stencil's radius: well inside the limb, also of a smaller disk
+INNER = 0.67  # of a stencil's radius: nearer places are well inside the limb, also of a smaller disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -87,7 +87,7 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
-    # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+    # The limb is curved: an aperture is half covered blur^2 / 2 radii inside it.
     edge = (1.0 - 0.5 * blur * blur - q0) / blur
     coverage, density, pull, variance = limb_shape(edge)
     q = (q0 - blur * pull).clamp(0.0, 1.0)

@@ -17,7 +17,7 @@ from sphereorient.pose.fitter import LEAST_LEFT, Fitter
 from sphereorient.pose.poses import Poses, PoseStart, poses_of
 
 BETTER = 0.1  # least excess of a proven pose's score over that of wrong poses
-NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
+NO_BETTER = 0.05  # the map is refused if its best score exceeds that of wrong poses by less than this
 TELLING = 2.0  # unless wrong poses have this many times the unexplained variance per picture; wrong maps: 1.6 at most
 LOOK_ALIKE = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
 SELDOM = 0.25  # share of the frames with poses; fewer proven frames may be chance

@@ -18,7 +18,7 @@ from sphereorient.pose.poses import FittedPoses, Poses, PoseStart
 from sphereorient.pose.worn import worn_share
 from sphereorient.sphere.texture_table import TextureTable
 
-ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: never; the texture locates the sphere
+ALWAYS = 1.0  # score_min for blurred pictures: no outline is trusted, the texture locates the sphere
 CLEAR = 3.0  # times the unexplained variance of the typical right pose
 MUCH_WORN = 0.2  # share of the ball: errors were 0.9 times the stated ones at 0.11, 3 times at 0.29
 ENOUGH = 1400  # pixels used of each disk; more changed nothing
